@@ -327,31 +327,6 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """LERF's negative prompts."""
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
-
-
-class RuleSettings(NamedTuple):
-    """Constants of a relevancy rule; its formula is in `core.relevancy` for torch and in `quick` for numpy."""
-
-    threshold: float
-    """Relevancy above which a Gaussian is selected."""
-    compares: bool
-    """True if the rule needs negative prompts."""
-    least: float
-    """Relevancy of a Gaussian without a direction, which no threshold selects."""
-    faintest: float
-    """Lower end of the color scale: renders do not distinguish smaller relevancies."""
-    present: float | None
-    """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
-
-
-RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
-    # The threshold suits the color encoder, and queries without further information: see `question.make_question`.
-    "cosine": RuleSettings(0.5, compares=False, least=0.0, faintest=0.0, present=None),
-    # At the threshold, prompt and negative are equally similar.
-    "lerf": RuleSettings(0.5, compares=True, least=0.0, faintest=0.0, present=0.62),
-    # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
-    "margin": RuleSettings(0.02, compares=True, least=-2.0, faintest=-0.1, present=math.log(0.62 / (1 - 0.62)) / 10),
-}
 VoteKind = Literal["paper", "posterior"]
 """Weighting of a Gaussian's own evidence against its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]

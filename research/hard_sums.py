@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from normlift_ns import Evidence, Lifted, RefineConfig, lift, nearest_neighbors, refine
+from normlift_ns.analysis.objects import best_prompt
 from normlift_ns.core.lowrank import basis_of_rank, half_precision_error, spectral_table, store_directions
 from normlift_ns.core.partition import SINGLE_PROCESS, Partition
-from normlift_ns.core.relevancy import best_prompt
 from normlift_ns.core.sparse import SparseRows
 from research.hard_case import Case, Setting
 from tests.scenes import generator, unit_rows

@@ -26,9 +26,9 @@ from prompt_toolkit.output import DummyOutput
 from normlift_ns import InputError, SemanticField, open_run
 from normlift_ns.cli import query
 from normlift_ns.cli.repl import answer_lines, run_repl
-from normlift_ns.core.relevancy import RELEVANCY_FORMULAS
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.io.field import read_field
-from normlift_ns.options import RELEVANCY_RULES, RelevancyRule
+from normlift_ns.options import RelevancyRule
 from normlift_ns.query import arrays, engine
 from normlift_ns.query.question import Query
 from tests.core.test_field import FORMS, D, example
@@ -55,13 +55,15 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     expected = engine.run_query(field, means, question)
     with tempfile.TemporaryDirectory() as folder:
         field.save(folder)
-        found = arrays.query_arrays(read_field(Path(folder)), question)
+        stored = arrays.ArrayField(*read_field(Path(folder)))
+        found = engine.run_query(stored, stored.arrays["means"], question)
+    assert all(isinstance(x, np.ndarray) for x in (found.relevancy, found.valid, found.selected, found.mask))
     np.testing.assert_allclose(found.relevancy, expected.relevancy.numpy(), rtol=0, atol=2e-6)
     assert np.array_equal(found.valid, expected.valid.numpy())
     near = np.abs(expected.relevancy.numpy() - 0.1) < 2e-6
     assert np.array_equal(found.selected | near, expected.selected.numpy() | near)
     if not near.any():
-        for ours, theirs in zip(found.summarize(), engine.summarize_result(expected), strict=True):
+        for ours, theirs in zip(found.to_json(), expected.to_json(), strict=True):
             assert set(ours) == set(theirs)
             bins, same = ours.pop("histogram"), theirs["histogram"]
             assert (bins is None) == (same is None)
@@ -71,12 +73,12 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
                 assert value == (pytest.approx(theirs[name], abs=1e-5) if value is not None else None), name
 
 
-def test_every_rule_has_both_formulas_and_vectors_of_another_encoder_are_refused(tmp_path):
-    assert set(RELEVANCY_FORMULAS) == set(arrays.NUMPY_FORMULAS) == set(RELEVANCY_RULES) == set(get_args(RelevancyRule))
+def test_every_rule_is_in_the_table_and_vectors_of_another_encoder_are_refused(tmp_path):
+    assert set(RELEVANCY_RULES) == set(get_args(RelevancyRule))
     lifted, means, source = example()
     SemanticField.build(lifted, means, source).save(tmp_path)
     with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
-        arrays.query_arrays(read_field(tmp_path), Query(("a",), np.ones((1, 3), np.float32)))
+        arrays.ArrayField(*read_field(tmp_path)).query(np.ones((1, 3), np.float32))
 
 
 BLOCK = """
@@ -107,7 +109,7 @@ def test_answers_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
     rows = json.loads((tmp_path / "a.json").read_text())["queries"]
     run = open_run(lifted)
     expected = run.ask("red", "sky blue")
-    for row, other in zip(rows, engine.summarize_result(expected), strict=True):
+    for row, other in zip(rows, expected.to_json(), strict=True):
         bins, same = row.pop("histogram"), other.pop("histogram")
         assert sum(bins.pop("counts")) == sum(same.pop("counts"))
         assert bins == pytest.approx(same, abs=1e-5)

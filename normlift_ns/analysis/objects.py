@@ -16,7 +16,6 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.relevancy import best_prompt
 from normlift_ns.errors import InputError
 from normlift_ns.options import FLOATER_THRESHOLD, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, check_number
 
@@ -246,6 +245,20 @@ class Instances:
                 for number, class_id in enumerate(self.classes, 1)
             },
         }
+
+
+def best_prompt(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
+    """Return the index of the selected prompt with the largest relevancy, or -1 if none is selected.
+
+    Ties go to the first prompt.
+
+    >>> best_prompt(torch.tensor([[0.3, 0.9], [0.1, 0.2]]), torch.tensor([[True, True], [False, False]]))
+    tensor([ 1, -1], dtype=torch.int32)
+    """
+    if relevancy.shape[1] == 0:
+        return torch.full((len(relevancy),), -1, dtype=torch.int32, device=relevancy.device)
+    best = relevancy.where(selected, -torch.inf).argmax(dim=1)
+    return best.where(selected.any(dim=1), -1).int()
 
 
 def find_instances(

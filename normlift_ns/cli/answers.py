@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,10 +33,6 @@ from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, SegmentationResult, 
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import unique_file_names
 from normlift_ns.segmentation.checkpoint import TEXT_PROMPT_FAMILIES, check_sam_checkpoint
-
-if TYPE_CHECKING:
-    from normlift_ns.query.arrays import QuickAnswer
-
 
 _MAX_ROWS = 40
 """Largest number of objects in the table."""
@@ -98,7 +94,7 @@ IMAGES_PER_GROUP = 3
 _LARGEST_WEIGHT = "weighs most"
 
 
-def explain_answer(config: Path, data: Path | None, answer: QuickAnswer) -> tuple[LiftedRun, list[Why | None]]:
+def explain_answer(config: Path, data: Path | None, answer: Answer) -> tuple[LiftedRun, list[Why | None]]:
     """Open the whole run, and explain the selection of every prompt by the votes of its images.
 
     Returns:
@@ -107,7 +103,7 @@ def explain_answer(config: Path, data: Path | None, answer: QuickAnswer) -> tupl
         FileNotFoundError, ValueError: Same as in `open_run` and `LiftedRun.why`.
     """
     run, refined = open_run(config, data=data), answer.question.refined
-    masks = torch.from_numpy(answer.selected).T
+    masks = torch.as_tensor(answer.selected).T
     return run, [run.votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
 
 
@@ -187,7 +183,7 @@ def explanation_table(
 
 
 def segment_with_sam3(
-    config: Path, data: Path | None, answer: QuickAnswer, *, model: str, views: int, device: str
+    config: Path, data: Path | None, answer: Answer, *, model: str, views: int, device: str
 ) -> tuple[SegmentationResult, list[dict[str, Any]]]:
     """Segment training views with SAM 3 for the prompts of an answer, and lift the masks.
 
@@ -211,7 +207,7 @@ def segment_with_sam3(
     cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
     kwargs = {"views": views, "min_reliability": min_reliability, "settings": settings, "device": device}
     segmented = query_sam3(run.scene, cached.find, answer.question.texts, **kwargs)
-    rows = segmented.summarize(run.scene.gaussians.means, torch.from_numpy(answer.selected))
+    rows = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(answer.selected))
     return segmented, [{"model": model, **row} for row in rows]
 
 

@@ -19,7 +19,8 @@ from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
 
 if TYPE_CHECKING:
-    from normlift_ns.query.arrays import QuickAnswer, QuickRun
+    from normlift_ns.query.arrays import QuickRun
+    from normlift_ns.query.engine import Answer
     from normlift_ns.query.question import Query
 
 
@@ -85,8 +86,7 @@ class NormLiftQuery:
         """Run the query, write files, print the table and return its rows."""
         self._check()
         info_opening(self.load_config)
-        from normlift_ns.cli.repl import answer_lines, print_answer, run_repl  # noqa: PLC0415
-        from normlift_ns.query.question import save_query  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.cli.repl import answer_lines, run_repl  # noqa: PLC0415 (--help should not wait for NumPy)
 
         run = self._open()
         if self.stdin:
@@ -95,11 +95,18 @@ class NormLiftQuery:
         if self.interactive:
             run_repl(run, self.ask.rules(), keep_history=self.history)
             return []
+        return self._answer(run)
+
+    def _answer(self, run: QuickRun) -> list[dict[str, Any]]:
+        """Answer --text, write files, print the table and return its rows."""
+        from normlift_ns.cli.repl import print_answer  # noqa: PLC0415
+        from normlift_ns.query.question import save_query  # noqa: PLC0415 (--help should not wait for NumPy)
+
         result = run.ask(self.text, **self.ask.rules())
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
-        rows = result.summarize()
+        rows = result.to_json()
         show_why = self._explain(result, rows) if self.why else None
-        sam3_arrays = self._segment(result, rows) if self.segment is not None else {}
+        sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
         show_objects = self._list_objects(result.question) if self.objects else None
         if self.json is not None:
             _write_json(self.json, rows, result.question, self.overwrite)
@@ -111,11 +118,7 @@ class NormLiftQuery:
         folders = (self.render_dir, self.why_dir, self.objects_dir)
         written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
         print_answer(rows, result.question)
-        if self.segment is not None:
-            from normlift_ns.cli.answers import print_sam3_table  # noqa: PLC0415 (already imported)
-
-            print_sam3_table(self.text, [row["segment"] for row in rows])
-        for print_table in (show_why, show_objects):
+        for print_table in (show_sam3, show_why, show_objects):
             if print_table is not None:
                 print_table()
         if len(written) > 0:
@@ -155,7 +158,7 @@ class NormLiftQuery:
         settings = RasterSettings.recorded(run.field.manifest)
         return lambda: save_overlays(run.scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
 
-    def _explain(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
+    def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Add an explanation to every row, write the images, and return a function that prints the explanations."""
         from normlift_ns.cli.answers import explain_answer, explanation_to_json, print_explanations, save_vote_images  # noqa: PLC0415
 
@@ -166,15 +169,15 @@ class NormLiftQuery:
             save_vote_images(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
         return lambda: print_explanations(run, self.text, reasons)
 
-    def _segment(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
-        """Add SAM 3's answer to every row, and return its arrays."""
-        from normlift_ns.cli.answers import sam3_arrays, segment_with_sam3  # noqa: PLC0415 (as above)
+    def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
+        """Add SAM 3's answer to every row, and return its arrays and a function that prints it."""
+        from normlift_ns.cli.answers import print_sam3_table, sam3_arrays, segment_with_sam3  # noqa: PLC0415
 
         kwargs = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
         segmented, summaries = segment_with_sam3(self.load_config, self.data, result, **kwargs)
         for row, summary in zip(rows, summaries):
             row["segment"] = summary
-        return sam3_arrays(segmented)
+        return sam3_arrays(segmented), lambda: print_sam3_table(self.text, summaries)
 
     def _list_objects(self, question: Query) -> Callable[[], None]:
         """Find objects, write their files, and return a function that prints them."""
@@ -216,6 +219,14 @@ class NormLiftQuery:
         for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
             if flags != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
+        self._check_dependent_options()
+        if self.interactive and not sys.stdin.isatty():
+            raise InputError(
+                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
+            )
+        check_prompt_list("text", self.text)
+
+    def _check_dependent_options(self) -> None:
         if len(self.render_views) > 0 and self.render_dir is None:
             raise InputError("--render-views has no effect without --render-dir; give the folder for the renders")
         if self.why_dir is not None and not self.why:
@@ -227,11 +238,6 @@ class NormLiftQuery:
             if getattr(self, name) is not None and not self.objects:
                 flag = f"--{name.replace('_', '-')}"
                 raise InputError(f"{flag} has no effect without --objects True; add that flag")
-        if self.interactive and not sys.stdin.isatty():
-            raise InputError(
-                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
-            )
-        check_prompt_list("text", self.text)
 
     def _existing_renders(self) -> list[Path]:
         """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""
@@ -246,12 +252,12 @@ def _write_json(path: Path, rows: list[dict[str, Any]], question: Query, overwri
     write_text_file(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, result: QuickAnswer, extra: dict[str, Any], overwrite: bool) -> None:
+def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
     arrays: dict[str, Any] = {
         "relevancy": result.relevancy,
-        "reliability": result.field.arrays["reliability"],
+        "reliability": result.field.scalars.reliability,
         "valid": result.valid,
         **extra,
     }

@@ -49,7 +49,7 @@ def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> 
         except (InputError, OSError, MemoryError) as error:
             print_error(str(error))
         else:
-            print_answer(answer.summarize(), answer.question)
+            print_answer(answer.to_json(), answer.question)
 
 
 def _history_file() -> Path | None:
@@ -86,7 +86,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         total += 1
         try:
             answer = run.ask([text], **rules)
-            (row,) = answer.summarize()
+            (row,) = answer.to_json()
             output = {**row, "rule": answer.question.rule, "threshold": answer.question.threshold}
         except InputError as error:
             failed += 1
@@ -127,7 +127,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
     """Return a table with one row per prompt.
 
     Args:
-        rows: Rows of `QuickAnswer.summarize`.
+        rows: Rows of `Answer.to_json`.
         rule: Selection rule for the title, such as lerf > 0.5.
         threshold: Threshold that each histogram marks with a bar |.
         narrow: Leave out the histograms.

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
@@ -27,12 +28,12 @@ from normlift_ns.core.lowrank import (
     store_evidence,
 )
 from normlift_ns.core.partition import SINGLE_PROCESS, Partition
-from normlift_ns.core.relevancy import relevancy
+from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_tensors
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
 from normlift_ns.io.manifest import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
-from normlift_ns.options import RELEVANCY_RULES, RelevancyRule, Storage
+from normlift_ns.options import RelevancyRule, Storage
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,9 @@ class SemanticField:
         mask = self.scalars.norm > 0
         return mask[self.source.long()] if refined else mask
 
-    def query(self, text_vectors: Float[Tensor, "q d"], *, refined: bool = True) -> Float[Tensor, "n q"]:
+    def query(
+        self, text_vectors: Float[Tensor, "q d"] | Float[np.ndarray, "q d"], *, refined: bool = True
+    ) -> Float[Tensor, "n q"]:
         """Return the cosine of every Gaussian's direction to Q vectors of any length > 0.
 
         The cosine is 0 for Gaussians without a direction.
@@ -183,7 +186,7 @@ class SemanticField:
                 f"text vectors must be [Q, {self.dimension}] like the field's features, got "
                 f"{tuple(text_vectors.shape)}; use the encoder that made them"
             )
-        vectors = text_vectors.to(self.scalars.norm.device, torch.float64)
+        vectors = torch.as_tensor(text_vectors).to(self.scalars.norm.device, torch.float64)
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
             raise InputError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
@@ -209,8 +212,7 @@ class SemanticField:
         cosine = self.query(
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
         )
-        values = relevancy(cosine[:, :count], cosine[:, count:], rule=rule)
-        return torch.where(self.valid(refined=refined)[:, None], values, RELEVANCY_RULES[rule].least)
+        return gaussian_relevancy(cosine[:, :count], cosine[:, count:], self.valid(refined=refined), rule)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""

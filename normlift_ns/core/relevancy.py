@@ -1,42 +1,90 @@
-"""Relevancy of Gaussians or pixels to text, by three common rules."""
+"""Relevancy of Gaussians or pixels to text: a table of rules, for torch tensors and NumPy arrays.
+
+This module does not need torch.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
-import torch
-from jaxtyping import Bool, Float, Int32
-from torch import Tensor
+import numpy as np
+from jaxtyping import Bool, Float
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import CANONICAL_NEGATIVES, RELEVANCY_RULES, RelevancyRule
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule
+
+ArrayT = TypeVar("ArrayT", bound=Any)
+"""torch.Tensor or numpy.ndarray."""
+TEMPERATURE = 10.0
+"""Factor of the cosines inside LERF's softmax."""
+_PRESENT = 0.62
+"""Relevancy of rule lerf that objects in a scene usually reach."""
 
 
-def _margin(positive: Tensor, negative: Tensor) -> Tensor:
-    return positive - negative.max(dim=-1, keepdim=True).values
+class RuleSettings(NamedTuple):
+    """Formula and constants of a relevancy rule."""
+
+    formula: Callable[[Any, Any, float], Any]
+    """Relevancy from cosines to prompts [..., Q] and to negatives [..., B], and the temperature."""
+    threshold: float
+    """Relevancy above which a Gaussian is selected."""
+    compares: bool
+    """True if the rule needs negative prompts."""
+    least: float
+    """Relevancy of a Gaussian without a direction, which no threshold selects."""
+    faintest: float
+    """Lower end of the color scale: renders do not distinguish smaller relevancies."""
+    present: float | None
+    """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
 
 
-RELEVANCY_FORMULAS: dict[RelevancyRule, Callable[[Tensor, Tensor, float], Tensor]] = {
-    "cosine": lambda positive, negative, temperature: positive,
+def _sigmoid(values: Any) -> Any:
+    return 1 / (1 + _namespace(values).exp(-values))
+
+
+def _margin(positive: Any, negative: Any) -> Any:
+    return positive - _namespace(negative).amax(negative, -1, keepdims=True)
+
+
+def _namespace(array: Any) -> Any:
+    """Return the library of an array: numpy or torch. Both have the functions that this module calls."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch  # noqa: PLC0415 (a command-line query does not need it)
+
+    return torch
+
+
+RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
+    # The threshold suits the color encoder, and queries without further information: see `query.question.make_query`.
+    "cosine": RuleSettings(lambda positive, _, __: positive, 0.5, False, least=0.0, faintest=0.0, present=None),
     # A softmax over two values is a sigmoid of their difference. It falls as the negative rises, so the minimum is at
-    # the largest negative.
-    "lerf": lambda positive, negative, temperature: torch.sigmoid(temperature * _margin(positive, negative)),
-    "margin": lambda positive, negative, temperature: _margin(positive, negative),
-}
-"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `quick` has the same formulas for numpy."""
+    # the largest negative. At the threshold, prompt and negative are equally similar.
+    "lerf": RuleSettings(
+        lambda positive, negative, temperature: _sigmoid(temperature * _margin(positive, negative)),
+        0.5, True, least=0.0, faintest=0.0, present=_PRESENT,
+    ),
+    # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
+    "margin": RuleSettings(
+        lambda positive, negative, _: _margin(positive, negative),
+        0.02, True, least=-2.0, faintest=-0.1, present=math.log(_PRESENT / (1 - _PRESENT)) / TEMPERATURE,
+    ),
+}  # fmt: skip
 
 
 def relevancy(
-    positive: Float[Tensor, "*n q"],
-    negative: Float[Tensor, "*n b"] | None = None,
+    positive: Float[ArrayT, "*n q"],
+    negative: Float[ArrayT, "*n b"] | None = None,
     *,
     rule: RelevancyRule = "cosine",
-    temperature: float = 10.0,
-) -> Float[Tensor, "*n q"]:
+    temperature: float = TEMPERATURE,
+) -> Float[ArrayT, "*n q"]:
     """Compute the relevancy of Q prompts from cosines.
 
     Args:
-        positive: cosine to each prompt.
+        positive: cosine to each prompt, as tensor or NumPy array.
         negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
         rule: "cosine" is the cosine itself, in -1..1. "lerf" is the softmax of the prompt against one negative, in
             0..1, at its minimum over the negatives; 0.5 is a draw (LERF, section 3.4). "margin" is the cosine minus
@@ -50,26 +98,23 @@ def relevancy(
     >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """
-    if rule not in RELEVANCY_FORMULAS:
-        raise InputError(f"rule must be one of {', '.join(RELEVANCY_FORMULAS)}; got {rule!r}")
-    negative = positive[..., :0] if negative is None else negative
-    if RELEVANCY_RULES[rule].compares and negative.shape[-1] == 0:
+    if rule not in RELEVANCY_RULES:
+        raise InputError(f"rule must be one of {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if RELEVANCY_RULES[rule].compares and (negative is None or negative.shape[-1] == 0):
         raise InputError(
             f'rule "{rule}" compares with negative prompts; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
         )
-    return RELEVANCY_FORMULAS[rule](positive, negative, temperature)
+    return RELEVANCY_RULES[rule].formula(positive, negative, temperature)
 
 
-def best_prompt(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
-    """Return the index of the selected prompt with the largest relevancy, or -1 if none is selected.
+def gaussian_relevancy(
+    positive: Float[ArrayT, "n q"], negative: Float[ArrayT, "n b"], valid: Bool[ArrayT, " n"], rule: RelevancyRule
+) -> Float[ArrayT, "n q"]:
+    """Compute the relevancy of Gaussians; those without a direction (not `valid`) get the smallest value of the rule.
 
-    Ties go to the first prompt.
-
-    >>> best_prompt(torch.tensor([[0.3, 0.9], [0.1, 0.2]]), torch.tensor([[True, True], [False, False]]))
-    tensor([ 1, -1], dtype=torch.int32)
+    Raises:
+        ValueError: as `relevancy`.
     """
-    if relevancy.shape[1] == 0:
-        return torch.full((len(relevancy),), -1, dtype=torch.int32, device=relevancy.device)
-    best = relevancy.where(selected, -torch.inf).argmax(dim=1)
-    return best.where(selected.any(dim=1), -1).int()
+    values = relevancy(positive, negative, rule=rule)
+    return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].least)

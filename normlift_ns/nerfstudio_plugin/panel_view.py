@@ -21,13 +21,14 @@ from torch import Tensor
 from normlift_ns.analysis.vote_records import RecordedVotes
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder
-from normlift_ns.options import RELEVANCY_RULES, RasterizeMode
+from normlift_ns.options import RasterizeMode
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import load_query, save_query
 from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors

@@ -1,33 +1,56 @@
-"""Queries of a semantic field: relevancy and selection of every Gaussian for each prompt, with summary numbers."""
+"""Queries of a semantic field: relevancy and selection of every Gaussian for each prompt, with summary numbers.
+
+One implementation serves fields of torch tensors on any device (`SemanticField`), and fields of NumPy arrays for the
+command line (`query.arrays.ArrayField`). This module does not need torch.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-import torch
+import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
-from normlift_ns.analysis.objects import SceneObject, find_objects
-from normlift_ns.core.field import SemanticField
-from normlift_ns.options import RELEVANCY_RULES
-from normlift_ns.query.histogram import (
-    Histogram,
-    SelectionStats,
-    presence_limit,
-    relevancy_histogram,
-    suggest_threshold,
-)
-from normlift_ns.query.question import Query
-from normlift_ns.query.text_encoder import encoder_name
+from normlift_ns.core.relevancy import RELEVANCY_RULES, gaussian_relevancy
+from normlift_ns.query.histogram import Histogram, presence_limit, relevancy_histogram, suggest_threshold
+from normlift_ns.query.question import Query, as_numpy
+from normlift_ns.query.text_encoder import HasManifest, encoder_name
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from normlift_ns.analysis.objects import SceneObject
+    from normlift_ns.core.field import SemanticField
+
+_CENTRAL = (0.05, 0.95)
+"""Quantiles of the selected centers that bound their extent."""
+
+
+class QueryField(HasManifest, Protocol):
+    """A semantic field of N Gaussians that queries can run on: see `SemanticField`."""
+
+    @property
+    def scalars(self) -> Any:
+        """Numbers of the Gaussians, with `reliability` and `weight`, as in `core.lift.Scalars`."""
+        ...
+
+    def valid(self, *, refined: bool = True) -> Any:
+        """Return a mask of the Gaussians with a direction."""
+        ...
+
+    def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Any:
+        """Return the cosine of every Gaussian's direction to Q vectors."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Answer:
     """Result of a query with Q prompts. `answer["fox"]` is the result for one prompt; see `Finding`.
+
+    Its arrays are those of the field: torch tensors on its device, or NumPy arrays on the command line.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -60,7 +83,12 @@ class Answer:
     @property
     def mask(self) -> Bool[Tensor, " n"]:
         """Gaussians that any of the prompts selects."""
-        return self.selected.any(dim=1)
+        return self.selected.any(1)
+
+    @property
+    def suggested_threshold(self) -> float | None:
+        """One threshold for all prompts, which their relevancies suggest; None if no Gaussian has a direction."""
+        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid))
 
     def __len__(self) -> int:
         return len(self.texts)
@@ -86,6 +114,10 @@ class Answer:
                 f"{text!r} is not a prompt of this query; its prompts are {', '.join(map(repr, self.texts))}"
             )
         return Finding(self, self.texts.index(text))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Return the numbers of every prompt as plain Python types."""
+        return [finding.to_json() for finding in self]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,8 +188,8 @@ class Finding:
         """Histogram of the relevancies, with the threshold; None if no Gaussian has a direction."""
         question = self.answer.question
         limit = presence_limit(question.rule, encoder_name(self.answer.field))
-        arrays = (self.relevancy.cpu().numpy(), self.answer.valid.cpu().numpy())
-        return relevancy_histogram(*arrays, threshold=question.threshold, limit=limit)
+        relevancy, valid = as_numpy(self.relevancy), as_numpy(self.answer.valid)
+        return relevancy_histogram(relevancy, valid, threshold=question.threshold, limit=limit)
 
     @property
     def suggested_threshold(self) -> float | None:
@@ -187,7 +219,24 @@ class Finding:
     @property
     def objects(self) -> list[SceneObject]:
         """Objects of the selection (connected components), by descending size."""
+        from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
+
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers as plain Python types."""
+        return {
+            "text": self.text,
+            "fraction": self.fraction,
+            "centroid": self.centroid,
+            "extent": self.extent,
+            "peak": self.peak,
+            "mean_reliability": self.mean_reliability,
+            "stands_out": self.stands_out,
+            "nearest": self.nearest,
+            "suggested_threshold": self.suggested_threshold,
+            "histogram": None if self.histogram is None else self.histogram.to_json(),
+        }
 
     @cached_property
     def _selection(self) -> SelectionStats:
@@ -195,62 +244,86 @@ class Finding:
 
     def _select(self, mask: Bool[Tensor, " n"]) -> SelectionStats:
         scalars = self.answer.field.scalars
-        arrays = (self.answer.means, scalars.reliability, scalars.weight)
-        return SelectionStats(len(mask), *(x[mask].cpu().numpy() for x in arrays))
+        return SelectionStats.of(mask, self.answer.means, scalars.reliability, scalars.weight)
 
 
-def run_query(field: SemanticField, means: Float[Tensor, "n 3"], question: Query) -> Answer:
+@dataclass(frozen=True, eq=False)
+class SelectionStats:
+    """Summary numbers of M selected Gaussians of N.
+
+    Positions are in units of the scene, and None if nothing is selected. Means are weighted by W_j, the total weight of
+    Gaussian j over all views.
+    """
+
+    total: int
+    """N, the number of Gaussians of the scene."""
+    means: Float[np.ndarray, "m 3"]
+    reliability: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]
+    """W_j of the selected Gaussians."""
+
+    @staticmethod
+    def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:
+        """Select from arrays or tensors of all Gaussians by a mask."""
+        return SelectionStats(len(mask), *(as_numpy(x[mask]) for x in (means, reliability, weight)))
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of all Gaussians that is selected, in 0..1."""
+        return len(self.means) / self.total
+
+    @property
+    def centroid(self) -> list[float] | None:
+        """Weighted mean of the selected centers, [x, y, z]."""
+        return (self._normalized_weight @ self.means.astype(np.float64)).tolist() if len(self.means) > 0 else None
+
+    @property
+    def extent(self) -> list[float] | None:
+        """Size of the box that holds the central 90 % of the selected centers along each axis."""
+        if len(self.means) == 0:
+            return None
+        low, high = np.quantile(self.means.astype(np.float64), _CENTRAL, axis=0)
+        return (high - low).tolist()
+
+    @property
+    def mean_reliability(self) -> float | None:
+        """Weighted mean of R over the selected Gaussians."""
+        return float(self._normalized_weight @ self.reliability.astype(np.float64)) if len(self.means) > 0 else None
+
+    @cached_property
+    def _normalized_weight(self) -> Float[np.ndarray, " m"]:
+        weight = self.weight.astype(np.float64) + 1e-12
+        return weight / weight.sum()
+
+
+def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     """Compute relevancy and selection of every Gaussian for each prompt.
 
     If the query asks for a suggested threshold, the query in the result has that threshold.
 
     Args:
-        means: centers of the Gaussians.
+        means: centers of the Gaussians, as tensor or array like the field.
     Raises:
         ValueError: the embeddings have a different dimension than the field, or the rule needs negatives and there are
             none.
     """
-    negatives = question.negative_vectors if RELEVANCY_RULES[question.rule].compares else None
-    relevancy = field.relevancy(
-        torch.from_numpy(question.vectors),
-        None if negatives is None else torch.from_numpy(negatives),
-        rule=question.rule,
-        refined=question.refined,
-    )
-    valid = field.valid(refined=question.refined)
-    question = resolve_threshold(question, relevancy, valid)
-    result = Answer(question, field, means.detach(), relevancy, valid, relevancy.new_empty(0, 0).bool())
-    return apply_threshold(result, question.threshold, question.min_reliability)
+    vectors, count = question.vectors, len(question.vectors)
+    if RELEVANCY_RULES[question.rule].compares and question.negative_vectors is not None:
+        vectors = np.concatenate([vectors, question.negative_vectors])
+    valid, cosine = field.valid(refined=question.refined), field.query(vectors, refined=question.refined)
+    relevancy = gaussian_relevancy(cosine[:, :count], cosine[:, count:], valid, question.rule)
+    means = means if isinstance(means, np.ndarray) else means.detach()
+    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected=relevancy[:0] > 0)
+    return apply_threshold(unselected, question)
 
 
-def resolve_threshold(question: Query, relevancy: Float[Tensor, "n q"], valid: Bool[Tensor, " n"]) -> Query:
-    """Return the query with a fixed threshold: the suggested one if it asks for that, otherwise its own."""
-    if not question.suggest:
-        return question
-    suggested = suggest_threshold(relevancy.cpu().numpy(), valid.cpu().numpy())
-    return replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
+def apply_threshold(answer: Answer, question: Query) -> Answer:
+    """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
 
-
-def apply_threshold(result: Answer, threshold: float, min_reliability: float) -> Answer:
-    """Return the result with the selection for a different threshold and minimum reliability."""
-    reliable = result.valid & (result.field.scalars.reliability >= min_reliability)
-    question = replace(result.question, threshold=threshold, min_reliability=min_reliability)
-    return replace(result, question=question, selected=(result.relevancy > threshold) & reliable[:, None])
-
-
-def summarize_result(result: Answer) -> list[dict[str, Any]]:
-    """Return the numbers of every `Finding` as plain Python types."""
-    names = (
-        "text", "fraction", "centroid", "extent", "peak", "mean_reliability", "stands_out", "nearest",
-        "suggested_threshold",
-    )  # fmt: skip
-    return [
-        {name: getattr(finding, name) for name in names}
-        | {"histogram": None if finding.histogram is None else finding.histogram.to_json()}
-        for finding in result
-    ]
-
-
-def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w q"]:
-    """Normalize rendered relevancies by opacity; return 0 for pixels that are (almost) empty."""
-    return torch.where(alpha[:, :, None] > 0.05, values / alpha[:, :, None].clamp(min=1e-6), 0.0)
+    If the query asks for a suggested threshold, the query in the result has that threshold.
+    """
+    if question.suggest:
+        suggested = answer.suggested_threshold
+        question = replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
+    reliable = answer.valid & (answer.field.scalars.reliability >= question.min_reliability)
+    return replace(answer, question=question, selected=(answer.relevancy > question.threshold) & reliable[:, None])

@@ -16,11 +16,17 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.manifest import MANIFEST_FILE, read_manifest
-from normlift_ns.options import RELEVANCY_RULES, RelevancyRule, check_bool, check_number, short_repr
+from normlift_ns.options import RelevancyRule, check_bool, check_number, short_repr
 from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
+
+
+def as_numpy(array: Any) -> np.ndarray:
+    """Return a NumPy array, or a tensor on any device, as a NumPy array."""
+    return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +56,8 @@ class Query:
     def __post_init__(self) -> None:
         for name in ("vectors", "negative_vectors"):
             value = getattr(self, name)
-            if value is not None and not isinstance(value, np.ndarray):  # a tensor on any device
-                object.__setattr__(self, name, value.detach().cpu().numpy())
+            if value is not None:
+                object.__setattr__(self, name, as_numpy(value))
 
 
 def make_query(
@@ -80,12 +86,7 @@ def make_query(
     Raises:
         ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
-    if negatives is not None and not isinstance(negatives, Sequence):
-        raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
-    if isinstance(negatives, str):
-        raise InputError(
-            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
-        )
+    _check_negatives(negatives)
     if rule not in ("auto", *RELEVANCY_RULES):
         raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
     min_reliability = check_number("min_reliability", min_reliability)
@@ -114,6 +115,15 @@ def make_query(
         refined=refined,
         encoder=encoder_digest(field.manifest),
     )
+
+
+def _check_negatives(negatives: object) -> None:
+    if negatives is not None and not isinstance(negatives, Sequence):
+        raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
+    if isinstance(negatives, str):
+        raise InputError(
+            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
+        )
 
 
 # Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.

@@ -31,7 +31,7 @@ from normlift_ns.encoders.base import joint_partition
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.options import BackendName, RasterizeMode
-from normlift_ns.query.histogram import SelectionStats
+from normlift_ns.query.engine import SelectionStats
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -202,8 +202,7 @@ class SegmentationResult(NamedTuple):
     def _row(self, text: int, means: Tensor, other: Bool[Tensor, " n"]) -> dict[str, Any]:
         answer = self.answers[text]
         mask, scalars = self.selected(text).cpu(), answer.scalars
-        arrays = (means, scalars.reliability, scalars.weight)
-        selection = SelectionStats(len(mask), *(x.detach().cpu()[mask].numpy() for x in arrays))
+        selection = SelectionStats.of(mask, *(x.cpu() for x in (means, scalars.reliability, scalars.weight)))
         union = int((mask | other).sum())
         weight = scalars.weight.cpu()[mask].double()
         agreement = float((weight * scalars.c_inter.cpu()[mask]).sum() / weight.sum()) if bool(mask.any()) else None

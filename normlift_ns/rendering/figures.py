@@ -16,12 +16,13 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
-from normlift_ns.options import RELEVANCY_RULES, WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer, Finding, pixel_relevancy
+from normlift_ns.options import WEAK_RELIABILITY
+from normlift_ns.query.engine import Answer, Finding
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.colors import (
@@ -132,6 +133,11 @@ def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float
     """Return a scale from the threshold to the largest relevancy in the scene, at least 0.05 wide."""
     peak = float(relevancy.max()) if len(relevancy) > 0 else threshold
     return threshold, max(peak, threshold + _MIN_SPAN)
+
+
+def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w q"]:
+    """Normalize rendered relevancies by opacity; return 0 for pixels that are (almost) empty."""
+    return torch.where(alpha[:, :, None] > 0.05, values / alpha[:, :, None].clamp(min=1e-6), 0.0)
 
 
 def map_scale(answer: Answer) -> tuple[float, float]:

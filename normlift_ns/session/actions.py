@@ -14,7 +14,7 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Finding
-from normlift_ns.query.histogram import Histogram, suggest_threshold
+from normlift_ns.query.histogram import Histogram
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click, join_prompts
@@ -76,12 +76,10 @@ def _warning(finding: Finding, histogram: Histogram) -> str:
 
 def threshold_suggestion(state: State) -> float | None:
     """Return the threshold suggested by the histogram of the prompts that select; None without a suggestion."""
-    answer = state.answer
-    if answer is None:
+    if state.answer is None:
         return None
-    if state.shown is not None:
-        return Finding(answer, state.shown).suggested_threshold
-    return suggest_threshold(answer.relevancy.cpu().numpy(), answer.valid.cpu().numpy())
+    result = state.answer if state.shown is None else Finding(state.answer, state.shown)
+    return result.suggested_threshold
 
 
 def carry_threshold(state: State, question: Query) -> Query:

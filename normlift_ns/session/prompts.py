@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
-from normlift_ns.options import RELEVANCY_RULES, RelevancyRule
+from normlift_ns.options import RelevancyRule
 from normlift_ns.query.question import Query, make_query
 from normlift_ns.query.text_encoder import HasManifest
 

@@ -18,7 +18,7 @@ from normlift_ns.analysis.objects import connected_components
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.options import OBJECT_MAX_GAP
-from normlift_ns.query.engine import Answer, apply_threshold, resolve_threshold, run_query
+from normlift_ns.query.engine import Answer, apply_threshold, run_query
 from normlift_ns.query.question import Query
 from normlift_ns.session.prompts import CLICK_THRESHOLD
 
@@ -49,7 +49,7 @@ class SelectionContext:
         return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
 
     def answer(self, question: Query) -> Answer:
-        """Answer a query as `asking.answer` does; the relevancies of the last four queries are cached.
+        """Answer a query as `run_query` does; the relevancies of the last four queries are cached.
 
         Raises:
             ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
@@ -63,8 +63,7 @@ class SelectionContext:
             self._answers[key] = result
             while len(self._answers) > _CACHED_ANSWERS:
                 self._answers.popitem(last=False)
-        question = resolve_threshold(question, result.relevancy, result.valid)
-        return apply_threshold(result, question.threshold, question.min_reliability)
+        return apply_threshold(result, question)
 
     def alike(
         self, vector: Float[Tensor, " d"], least: float = CLICK_THRESHOLD, *, refined: bool = True

@@ -1,8 +1,12 @@
+from typing import get_args
+
+import numpy as np
 import pytest
 import torch
 
 from normlift_ns import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
-from normlift_ns.core.relevancy import best_prompt
+from normlift_ns.analysis.objects import best_prompt
+from normlift_ns.options import RelevancyRule
 from tests.scenes import generator
 
 POSITIVE = torch.rand(50, 3, generator=generator(0), dtype=torch.float64) * 2 - 1
@@ -27,6 +31,12 @@ def test_cosine_is_itself_and_images_work_too():
     assert torch.equal(relevancy(POSITIVE), POSITIVE)
     image = relevancy(POSITIVE.view(5, 10, 3), NEGATIVE.view(5, 10, 4), rule="lerf")
     assert torch.equal(image.view(50, 3), relevancy(POSITIVE, NEGATIVE, rule="lerf"))
+
+
+def test_arrays_have_the_relevancy_of_tensors():
+    for rule in get_args(RelevancyRule):
+        values = relevancy(POSITIVE.numpy(), NEGATIVE.numpy(), rule=rule)
+        np.testing.assert_allclose(values, relevancy(POSITIVE, NEGATIVE, rule=rule).numpy(), rtol=1e-14)
 
 
 def test_forms_that_compare_need_negatives():

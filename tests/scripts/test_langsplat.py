@@ -17,7 +17,7 @@ from normlift_ns import Scene, open_run, render
 from normlift_ns.cli import lift, query
 from normlift_ns.cli.demo import iou_per_class
 from normlift_ns.encoders.text_files import TextEmbeddingFile
-from normlift_ns.query.engine import pixel_relevancy
+from normlift_ns.rendering.figures import pixel_relevancy
 from tests.captures import SHARED, clip_vectors, needs_shared
 from tests.scripts.conftest import run_entry
 
