@@ -15,6 +15,7 @@ from torch import Tensor
 
 from normlift_ns.analysis.objects import Instances, find_instances
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.data.splat import check_ply_header
 from normlift_ns.errors import InputError
@@ -23,11 +24,9 @@ from normlift_ns.options import LABEL_ARRAY_FILES, OBJECT_MAX_GAP, OBJECT_MIN_GA
 from normlift_ns.query.engine import Answer
 
 MIN_OPACITY_LOGIT = -5.5373
-"""logit(1 / 255): Gaussians with a lower opacity are never rendered, and ns-export leaves them out."""
+"""Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
 _MAX_COMMENT_LENGTH = 60
-_SH_C0 = 0.28209479177387814
-"""sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 
 
 def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> dict[str, np.ndarray]:
@@ -41,7 +40,7 @@ def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool
     """
     values = {name: value.detach().float().cpu() for name, value in parameters.items()}
     means, rest = values["means"], values["features_rest"]
-    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / _SH_C0
+    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
     columns = {name: means[:, i] for i, name in enumerate("xyz")}
     columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{i}": constant[:, i] for i in range(3)}
@@ -311,13 +310,16 @@ def label_cloud(
         columns: labels of these Gaussians, by property name.
         most: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
-        ValueError: there are no Gaussians, or as in `write_cloud`.
+        ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
         raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
-    limit = most * float(spacing[spacing.isfinite()].median())
+    spacing = spacing[spacing.isfinite()]
+    if len(spacing) == 0:
+        raise InputError("the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing")
+    limit = most * float(spacing.median())
     nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
     labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
     write_cloud(path, cloud, labels, overwrite=overwrite)

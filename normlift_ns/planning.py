@@ -514,7 +514,7 @@ def _free_memory() -> int | None:
 
 
 Clock = Callable[[], float]
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 _MAX_VIEWS = 4
 """Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
 _MAX_LOAD_S = 3.0
@@ -590,7 +590,7 @@ def measure_capture(
     batch = segmentation_workers(source)
     encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
     observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
-    cached_s = observe(list(cached)[:_MAX_LOOKUPS], cached_source).seconds / len(cached) if len(cached) > 0 else None
+    cached_s = observe(list(cached), cached_source).seconds / len(cached) if len(cached) > 0 else None
     block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
         rasterize = partial(_evidence, gaussians, block, scene, options, drawing, Path(folder))
@@ -690,7 +690,7 @@ def _device_name(device: str) -> str:
     return torch.cuda.get_device_name(device)
 
 
-def _seconds(work: Callable[[], Result], *, clock: Clock, device: str) -> tuple[float, Result]:
+def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple[float, _Result]:
     """Return the duration of some work, until the GPU is done if there is one, and its result."""
     start = clock()
     result = work()
