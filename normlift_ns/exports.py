@@ -318,7 +318,9 @@ def label_cloud(
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     spacing = spacing[spacing.isfinite()]
     if len(spacing) == 0:
-        raise InputError("the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing")
+        raise InputError(
+            "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
+        )
     limit = most * float(spacing.median())
     nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
     labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}

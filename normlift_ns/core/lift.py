@@ -210,9 +210,7 @@ def lift(
     return Lifted(scalars, evidence, table)
 
 
-def reliability(
-    norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float
-) -> Float[Tensor, "*n"]:
+def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float) -> Float[Tensor, "*n"]:
     """Return R_j, equation 8 of the paper; 0 without evidence.
 
     Args:

@@ -587,8 +587,7 @@ def suggest_poses(
         center = torch.tensor(target, dtype=torch.float64)
         positions = positions_around(space, center)
         candidates += [
-            look_at(positions[i], center, space.up, cameras[0])
-            for i in sample_evenly(len(positions), _MAX_CANDIDATES)
+            look_at(positions[i], center, space.up, cameras[0]) for i in sample_evenly(len(positions), _MAX_CANDIDATES)
         ]
     if len(candidates) == 0:
         return []
