@@ -24,7 +24,7 @@ from normlift_ns.analysis.vote_records import RecordedVotes
 from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.exports import write_splat_ply
+from normlift_ns.exports import TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.query.engine import Answer
@@ -460,13 +460,9 @@ class Run:
         """
         if not bool(mask.any()):
             raise InputError("Nothing is selected; there is nothing to export.")
-        how: dict[str, Any] = {
-            "spherical_harmonics": self.scene.has_harmonics,
-            "rasterize_mode": self.scene.rasterize_mode,
-        }
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"{safe_file_name(name)}.ply"
-            rows = write_splat_ply(path, self.scene.parameters, self.space.field, answer, keep=mask, **how)
+            rows = write_splat_ply(path, TrainedSplat.of(self.scene), self.space.field, answer, keep=mask)
             content = path.read_bytes()
         faint = int(mask.sum()) - len(rows)
         why = f" {faint:,} more are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
