@@ -1,9 +1,13 @@
-"""Export of Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties."""
+"""Exports of a lifted run: PLY files of Gaussians, masks, label arrays and labeled point clouds."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,21 +17,28 @@ from jaxtyping import Bool, Float, Float64, Int64
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from normlift_ns.analysis.catalogue import SimilarityTransform
 from normlift_ns.analysis.objects import Instances, find_instances
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.scene import Scene
 from normlift_ns.data.splat import check_ply_header
-from normlift_ns.errors import InputError
+from normlift_ns.encoders.registry import summarize_error
+from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.io.atomic import atomic_file, atomic_files
 from normlift_ns.options import LABEL_ARRAY_FILES, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, RasterizeMode
 from normlift_ns.query.engine import Answer
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.figures import write_masks
+
+# Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties.
+
 
 MIN_OPACITY_LOGIT = -5.5373
-"""logit(1 / 255): Gaussians with a lower opacity are never rendered, and ns-export leaves them out."""
+"""Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
 _MAX_COMMENT_LENGTH = 60
-_SH_C0 = 0.28209479177387814
-"""sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 
 
 def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> dict[str, np.ndarray]:
@@ -41,7 +52,7 @@ def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool
     """
     values = {name: value.detach().float().cpu() for name, value in parameters.items()}
     means, rest = values["means"], values["features_rest"]
-    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / _SH_C0
+    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
     columns = {name: means[:, i] for i, name in enumerate("xyz")}
     columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{i}": constant[:, i] for i in range(3)}
@@ -81,21 +92,33 @@ def exportable_rows(columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"])
     return np.flatnonzero(finite & (columns["opacity"] >= MIN_OPACITY_LOGIT) & keep.cpu().numpy())
 
 
-def visible_rows(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> Int64[np.ndarray, " m"]:
-    """Return indices of the Gaussians that ns-export would write."""
-    columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
-    return exportable_rows(columns, torch.ones(len(columns["x"]), dtype=torch.bool))
+class TrainedSplat(NamedTuple):
+    """Trained Gaussians, and how to render them."""
+
+    parameters: Mapping[str, Tensor]
+    """As in `Scene.parameters`."""
+    spherical_harmonics: bool
+    """False if colors do not depend on the view (sh_degree 0) and are stored as logits."""
+    rasterize_mode: RasterizeMode
+    """Mode that the scene was trained with."""
+
+    @staticmethod
+    def of(scene: Scene) -> TrainedSplat:
+        """Return the Gaussians of a scene."""
+        return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return `splat_columns`."""
+        return splat_columns(self.parameters, spherical_harmonics=self.spherical_harmonics)
 
 
 def write_splat_ply(
     path: Path,
-    parameters: Mapping[str, Tensor],
+    splat: TrainedSplat,
     field: SemanticField,
     answer: Answer | None,
     *,
     keep: Bool[Tensor, " n"],
-    spherical_harmonics: bool,
-    rasterize_mode: RasterizeMode,
     instances: Instances | None = None,
     objects: Mapping[str, Any] | None = None,
     overwrite: bool = False,
@@ -106,9 +129,7 @@ def write_splat_ply(
 
     Args:
         path: path of the PLY file.
-        parameters, spherical_harmonics: as in `splat_columns`.
-        rasterize_mode: mode that the scene was trained with. The file records "antialiased", because other tools
-            assume "classic" by default.
+        splat: the Gaussians. The file records the mode "antialiased", because other tools assume "classic" by default.
         keep: Gaussians to write; those that ns-export would leave out are skipped, see `exportable_rows`.
         instances: classes and objects of the answer (default: those of `answer_instances`).
         objects: content of <stem>_objects.json. None: no such file, and `overwrite` removes that of an earlier export.
@@ -120,46 +141,52 @@ def write_splat_ply(
         ValueError: there is no Gaussian to write, or `objects` cannot be encoded as JSON.
         OSError: a file cannot be written, for instance because the disk is full.
     """
-    from plyfile import PlyData, PlyElement  # noqa: PLC0415 (every ns-* command imports this module)
-
-    columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
-    rows = exportable_rows(columns, keep)
-    if len(rows) == 0:
-        if not bool(keep.any()):
-            raise InputError(f"{path} is not written: no Gaussian is selected")
-        raise InputError(
-            f"{path} is not written: all {int(keep.sum()):,} selected Gaussians are invisible (opacity below 1/255, or "
-            "parameters that are not finite)"
-        )
+    columns = splat.columns()
+    rows = _written_rows(path, columns, keep)
     if answer is not None and instances is None:
         instances = answer_instances(answer)
     columns |= semantic_columns(field, answer, instances)
-    table = np.empty(len(rows), [(name, "<u4" if name in INSTANCE_PROPERTIES else "<f4") for name in columns])
+    vertices = np.empty(len(rows), [(name, "<u4" if name in INSTANCE_PROPERTIES else "<f4") for name in columns])
     for name, column in columns.items():
-        table[name] = column[rows]
-    texts = () if answer is None else answer.texts
-    comments = ["Written by normlift_ns", "Vertical Axis: z"]
-    if rasterize_mode == "antialiased":
-        comments.append("SplatRenderMode: mip")
-    comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
-    ply, indices, *json_files = export_paths(path)
-    contents = (None if instances is None else instances.to_json(), objects)
-    try:
-        documents = {
-            file: json.dumps(content, indent=2, allow_nan=False) + "\n"
-            for file, content in zip(json_files, contents)
-            if content is not None
-        }
-    except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"objects cannot be encoded as JSON: {error}") from None
-    stale = [file for file in json_files if file not in documents] if overwrite else []
+        vertices[name] = column[rows]
+    comments = _comments(splat.rasterize_mode, () if answer is None else answer.texts)
+    ply, indices, names_file, objects_file = export_paths(path)
+    contents = {names_file: None if instances is None else instances.to_json(), objects_file: objects}
+    documents = {file: _to_json(content) for file, content in contents.items() if content is not None}
+    stale = [file for file in contents if file not in documents] if overwrite else []
     with atomic_files(ply, indices, *documents, overwrite=overwrite, remove=stale) as drafts:
         with drafts[0].open("wb") as file:
-            PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
+            PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(file)
         np.save(drafts[1], rows)
         for draft, text in zip(drafts[2:], documents.values()):
             draft.write_text(text, "utf8")
     return rows
+
+
+def _written_rows(path: Path, columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:
+    """Return `exportable_rows`; raise ValueError if there are none."""
+    rows = exportable_rows(columns, keep)
+    if len(rows) == 0 and not bool(keep.any()):
+        raise InputError(f"{path} is not written: no Gaussian is selected")
+    if len(rows) == 0:
+        raise InputError(
+            f"{path} is not written: all {int(keep.sum()):,} selected Gaussians are invisible (opacity below 1/255, or "
+            "parameters that are not finite)"
+        )
+    return rows
+
+
+def _comments(rasterize_mode: RasterizeMode, texts: Sequence[str]) -> list[str]:
+    mode = ["SplatRenderMode: mip"] if rasterize_mode == "antialiased" else []
+    prompts = [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
+    return ["Written by normlift_ns", "Vertical Axis: z", *mode, *prompts]
+
+
+def _to_json(content: Any) -> str:
+    try:
+        return json.dumps(content, indent=2, allow_nan=False) + "\n"
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"objects cannot be encoded as JSON: {error}") from None
 
 
 def export_paths(path: Path) -> tuple[Path, Path, Path, Path]:
@@ -224,6 +251,16 @@ class NearestGaussians(NamedTuple):
     row: Int64[np.ndarray, " p"]
     near: Bool[np.ndarray, " p"]
     """Whether that Gaussian is within the maximum distance."""
+
+
+class CloudTransfer(NamedTuple):
+    """A point cloud to label, and the rule for it."""
+
+    cloud: PlyData
+    max_distance: float
+    """Maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians."""
+    to_cloud: SimilarityTransform | None
+    """Transform from the coordinates of the Gaussians to those of the cloud; None if they are the same."""
 
 
 class LabelTransfer(NamedTuple):
@@ -311,13 +348,18 @@ def label_cloud(
         columns: labels of these Gaussians, by property name.
         most: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
-        ValueError: there are no Gaussians, or as in `write_cloud`.
+        ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
         raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
-    limit = most * float(spacing[spacing.isfinite()].median())
+    spacing = spacing[spacing.isfinite()]
+    if len(spacing) == 0:
+        raise InputError(
+            "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
+        )
+    limit = most * float(spacing.median())
     nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
     labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
     write_cloud(path, cloud, labels, overwrite=overwrite)
@@ -344,3 +386,145 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
     labeled = PlyData(elements, byte_order="<", comments=cloud.comments, obj_info=cloud.obj_info)
     with atomic_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
         labeled.write(file)
+
+
+# Exporters of ns-normlift-export, by kind of output. Other packages register theirs as entry points.
+
+
+EXPORTER_GROUP = "normlift_ns.exporters"
+"""Entry point group of exporters."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExportJob:
+    """Gaussians of a lifted run to export, and everything that an exporter may write about them."""
+
+    scene: Scene
+    field: SemanticField
+    keep: Bool[Tensor, " n"]
+    """Gaussians to export, of which exporters leave out invisible ones; see `rows`."""
+    answer: Answer | None = None
+    instances: Instances | None = None
+    """Classes and objects of the answer; None without an answer."""
+    objects: Mapping[str, Any] | None = None
+    """Table of these objects, with JSON types only."""
+    rest: bool = False
+    """Whether `keep` is the rest of the scene, without the selection of the answer."""
+    transfer: CloudTransfer | None = None
+    overwrite: bool = False
+    """Replace existing files."""
+
+    @cached_property
+    def rows(self) -> Int64[np.ndarray, " m"]:
+        """Indices of the visible Gaussians to export."""
+        return exportable_rows(TrainedSplat.of(self.scene).columns(), self.keep)
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """Writer of one kind of output; the object that an entry point of the group `normlift_ns.exporters` names."""
+
+    write: Callable[[ExportJob, Path], Sequence[str]]
+    """Writes all files of the output or none, and returns the lines that report them. It raises FileExistsError if a
+    file exists and `overwrite` of the job is False."""
+    suffix: str = ""
+    """Suffix of the output, such as ".csv"; "": the output is a folder."""
+    needs_answer: bool = True
+    """Whether the job must have an answer."""
+
+
+def transfer_labels(
+    scene: Scene, field: SemanticField, answer: Answer, instances: Instances, transfer: CloudTransfer, path: Path,
+    *, overwrite: bool = False,
+) -> LabelTransfer:  # fmt: skip
+    """Write a cloud with the relevancies, class and object of the nearest visible Gaussians; see `label_cloud`."""
+    columns = TrainedSplat.of(scene).columns()
+    rows = exportable_rows(columns, torch.ones(len(field), dtype=torch.bool))
+    means = scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
+    means = means if transfer.to_cloud is None else transfer.to_cloud.points(means)
+    labels = semantic_columns(field, answer, instances)
+    labels = {name: x[rows] for name, x in labels.items() if name not in ("reliability", "n_eff")}
+    return label_cloud(transfer.cloud, path, means, labels, transfer.max_distance, overwrite=overwrite)
+
+
+def _export_ply(job: ExportJob, path: Path) -> list[str]:
+    rows = write_splat_ply(
+        path,
+        TrainedSplat.of(job.scene),
+        job.field,
+        job.answer,
+        keep=job.keep,
+        instances=job.instances,
+        objects=job.objects,
+        overwrite=job.overwrite,
+    )
+    return [f"{len(rows):,} of {len(job.field):,} Gaussians in {path}"]
+
+
+def _export_masks(job: ExportJob, folder: Path) -> list[str]:
+    assert job.answer is not None
+    settings = RasterSettings.recorded(job.field.manifest)
+    kwargs = {"rest": job.rest, "settings": settings, "overwrite": job.overwrite}
+    lines = [f"{len(write_masks(job.scene, job.answer.mask, folder, **kwargs))} masks in {folder}"]
+    with suppress(FileNotFoundError, InputError):  # the first image may be missing
+        if job.scene.train[0].original is not None:
+            lines.append(
+                "The masks fit the undistorted images that the scene was trained with, not the original images of the "
+                "capture."
+            )
+    return lines
+
+
+def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
+    assert job.instances is not None
+    write_label_arrays(folder, job.scene.gaussians.means, job.instances, job.rows, overwrite=job.overwrite)
+    return [f"Labels of {len(job.rows):,} Gaussians in {folder}"]
+
+
+def _export_cloud(job: ExportJob, path: Path) -> list[str]:
+    if job.transfer is None:
+        raise InputError("there is no point cloud to label; give one with --transfer")
+    assert job.answer is not None and job.instances is not None
+    labeled = transfer_labels(
+        job.scene, job.field, job.answer, job.instances, job.transfer, path, overwrite=job.overwrite
+    )
+    within = f"{labeled.share:.1%} of them within {labeled.limit:.3g} of a Gaussian"
+    return [f"{labeled.points:,} points in {path}, {within}"]
+
+
+EXPORTERS = {
+    "ply": Exporter(_export_ply, ".ply", needs_answer=False),
+    "masks": Exporter(_export_masks),
+    "arrays": Exporter(_export_arrays),
+    "cloud": Exporter(_export_cloud, ".ply"),
+}
+"""Exporters of this package, in the order in which a command runs them."""
+
+
+def find_exporter(name: str) -> Exporter:
+    """Return the exporter of a name. Other packages cannot take the name of one in `EXPORTERS`.
+
+    Raises:
+        InputError: the name is unknown, two packages claim it, or the exporter of another package cannot be loaded.
+    """
+    if name in EXPORTERS:
+        return EXPORTERS[name]
+    points = {point.value: point for point in entry_points(group=EXPORTER_GROUP, name=name)}
+    if len(points) == 0:
+        known = ", ".join(sorted({*EXPORTERS, *entry_points(group=EXPORTER_GROUP).names}))
+        raise InputError(f"unknown exporter {truncate_text(name)!r}; --exporters takes {known}")
+    if len(points) > 1:
+        raise InputError(f"exporter {name!r} is claimed by {' and '.join(points)}; uninstall one of the two")
+    (value,) = points
+    try:
+        exporter = points[value].load()
+    except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
+        raise InputError(
+            f"exporter {name!r} cannot be loaded from {value} ({summarize_error(error)}); repair or uninstall that "
+            "package"
+        ) from error
+    if not isinstance(exporter, Exporter):
+        raise InputError(
+            f"exporter {name!r} is invalid: {value} is of type {type(exporter).__name__}, expected Exporter"
+        )
+    return exporter

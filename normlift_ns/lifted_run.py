@@ -26,13 +26,13 @@ from normlift_ns.data.transforms import capture_transforms
 from normlift_ns.encoders.registry import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.exports import (
+    CloudTransfer,
     LabelTransfer,
+    TrainedSplat,
     answer_instances,
     export_paths,
-    label_cloud,
     read_cloud,
-    semantic_columns,
-    visible_rows,
+    transfer_labels,
     write_splat_ply,
 )
 from normlift_ns.io.atomic import refuse_run_files
@@ -199,12 +199,10 @@ class LiftedRun:
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return write_splat_ply(
             path,
-            self.scene.parameters,
+            TrainedSplat.of(self.scene),
             self.field,
             answer,
             keep=keep,
-            spherical_harmonics=self.scene.has_harmonics,
-            rasterize_mode=self.scene.rasterize_mode,
             instances=instances,
             objects=objects,
             overwrite=overwrite,
@@ -283,34 +281,11 @@ class LiftedRun:
                 f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
-        return self.transfer_to(
-            read_cloud(check_path("cloud", cloud)),
-            path,
-            answer,
-            answer_instances(answer),
-            distance=transfer_distance,
-            coordinates=coordinates,
-            overwrite=overwrite,
+        points = read_cloud(check_path("cloud", cloud))
+        rule = CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
+        return transfer_labels(
+            self.scene, self.field, answer, answer_instances(answer), rule, path, overwrite=overwrite
         )
-
-    def transfer_to(
-        self,
-        cloud: Any,
-        path: Path,
-        answer: Answer,
-        instances: Instances,
-        *,
-        distance: float,
-        coordinates: Literal["capture", "scene"],
-        overwrite: bool,
-    ) -> LabelTransfer:
-        """Run `transfer` with a cloud that has been read and objects that have been found."""
-        rows = visible_rows(self.scene.parameters, spherical_harmonics=self.scene.has_harmonics)
-        means = self.scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
-        means = self.to_capture.points(means) if coordinates == "capture" else means
-        columns = semantic_columns(self.field, answer, instances)
-        columns = {name: x[rows] for name, x in columns.items() if name not in ("reliability", "n_eff")}
-        return label_cloud(cloud, path, means, columns, distance, overwrite=overwrite)
 
     @cached_property
     def votes(self) -> RecordedVotes:

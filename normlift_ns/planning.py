@@ -411,10 +411,7 @@ def diagnose_device(device: str) -> Diagnostic:
 
 def diagnose_versions() -> Diagnostic:
     """Check which packages are installed."""
-    required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()  # none in a source tree
-    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
-    names = ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
-    missing = [name for name in names if _version(name) is None]
+    missing = [name for name in _required_packages() if _version(name) is None]
     message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
         return Diagnostic(
@@ -427,6 +424,13 @@ def diagnose_versions() -> Diagnostic:
     return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
+def _required_packages() -> list[str]:
+    """Return the names of the packages that normlift_ns requires; none in a source tree."""
+    required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()
+    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
+    return ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
+
+
 def _version(name: str) -> str | None:
     try:
         return version(name)
@@ -436,24 +440,18 @@ def _version(name: str) -> str | None:
 
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
     """Describe the network weights that the options need and this machine does not have."""
+    if options.features != "none":
+        return []
     missing = []
-    if options.features == "none" and (kind := resolve_regions(options, device)) in ("sam", "sam3"):
+    if (kind := resolve_regions(options, device)) in ("sam", "sam3"):
         model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
         if not has_local_sam_weights(model):
             missing.append(f"those of SAM, {model}")
     family = MODEL_FAMILIES.get(options.encoder)
-    if (
-        options.features == "none"
-        and family is not None
-        and find_local_model(resolve_model_name(options, family)) is None
-    ):
+    if family is not None and find_local_model(resolve_model_name(options, family)) is None:
         missing.append(f"those of {options.encoder}, {resolve_model_name(options, family)}")
     model, weights = options.encoder_model, options.encoder_pretrained
-    if (
-        options.features == "none"
-        and options.encoder == "open_clip"
-        and has_local_clip_weights(model, weights) is False
-    ):
+    if options.encoder == "open_clip" and has_local_clip_weights(model, weights) is False:
         missing.append(f"those of OpenCLIP, {model} {weights}")
     return missing
 
@@ -514,7 +512,7 @@ def _free_memory() -> int | None:
 
 
 Clock = Callable[[], float]
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 _MAX_VIEWS = 4
 """Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
 _MAX_LOAD_S = 3.0
@@ -533,6 +531,16 @@ class _Observed(NamedTuple):
 
     block: ViewBatch
     seconds: float
+
+
+class _Rasterized(NamedTuple):
+    """Evidence of some views, and what it cost."""
+
+    evidence: Evidence
+    seconds: float
+    cached_seconds: float
+    """Seconds to read it from the cache."""
+    write_bytes_s: float
 
 
 def time_kernel_loading(
@@ -580,31 +588,19 @@ def measure_capture(
         return _Observed(block, seconds)
 
     chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
-    cached: dict[int, ViewBatch] = {}
-    cached_source = cached_only(source, cache)
-    if options.reuse_evidence:
-        for index in chosen:
-            with suppress(NotCachedError):
-                cached[index] = observe([index], cached_source).block
+    observe_cached = partial(observe, source=cached_only(source, cache))
+    cached = _cached_views(chosen if options.reuse_evidence else (), observe_cached)
     new = [index for index in chosen if index not in cached]
     batch = segmentation_workers(source)
     encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
     observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
-    cached_s = observe(list(cached)[:_MAX_LOOKUPS], cached_source).seconds / len(cached) if len(cached) > 0 else None
+    cached_s = _per_view(observe_cached(list(cached))) if len(cached) > 0 else None
     block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
-    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
-        rasterize = partial(_evidence, gaussians, block, scene, options, drawing, Path(folder))
-        if cuda:  # kernels for labels like these are compiled once for all lifts
-            _evidence(gaussians, block, scene, options, drawing, Path(folder) / "first")
-        evidence_s, evidence = timed(rasterize)
-        cached_evidence_s, _ = timed(rasterize)
-        saved_s, _ = timed(lambda: evidence.save(Path(folder) / "again.safetensors"))
-        saved = (Path(folder) / "again.safetensors").stat().st_size
-    count = len(block.cameras)
+    rasterized = _measure_evidence(partial(_evidence, gaussians, block, scene, options, drawing), timed, cuda=cuda)
+    evidence, count = rasterized.evidence, len(block.cameras)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
     rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
-    maps = sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
     return Measurements(
         device=_device_name(device),
         views=len(used),
@@ -615,21 +611,53 @@ def measure_capture(
         entry_bytes=4 + evidence.rows.weight.element_size(),
         before_s=before or {},
         load_s=load_s,
-        features_s=observed.seconds / len(observed.block.cameras) if len(observed.block.cameras) > 0 else None,
+        features_s=_per_view(observed),
         kept_features_s=cached_s,
         features_kept=len(cached) / len(chosen),
-        evidence_s=evidence_s / count,
-        kept_evidence_s=cached_evidence_s / count,
+        evidence_s=rasterized.seconds / count,
+        kept_evidence_s=rasterized.cached_seconds / count,
         evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), scene, options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
-        write_bytes_s=saved / max(saved_s, 1e-6),
-        view_bytes=maps / count,
+        write_bytes_s=rasterized.write_bytes_s,
+        view_bytes=_map_bytes(block) / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
         looked_at=max(count, len(observed.block.cameras)),
     )
+
+
+def _per_view(observed: _Observed) -> float | None:
+    """Return the seconds for each view; None without views."""
+    count = len(observed.block.cameras)
+    return observed.seconds / count if count > 0 else None
+
+
+def _map_bytes(block: ViewBatch) -> int:
+    """Return the size of labels and features in the cache."""
+    return sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
+
+
+def _cached_views(indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed]) -> dict[int, ViewBatch]:
+    """Return the views that can be observed from the cache, by index."""
+    cached: dict[int, ViewBatch] = {}
+    for index in indices:
+        with suppress(NotCachedError):
+            cached[index] = observe([index]).block
+    return cached
+
+
+def _measure_evidence(rasterize: Callable[[Path], Evidence], timed: Timed, *, cuda: bool) -> _Rasterized:
+    """Rasterize some views into a temporary folder, read them from there, and write their evidence once more."""
+    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:
+        folder, file = Path(name), Path(name) / "again.safetensors"
+        if cuda:  # kernels for labels like these are compiled once for all lifts
+            rasterize(folder / "first")
+        seconds, evidence = timed(lambda: rasterize(folder))
+        cached_seconds, _ = timed(lambda: rasterize(folder))
+        saved_s, _ = timed(lambda: evidence.save(file))
+        return _Rasterized(evidence, seconds, cached_seconds, file.stat().st_size / max(saved_s, 1e-6))
 
 
 def _observe_loaded(
@@ -690,7 +718,7 @@ def _device_name(device: str) -> str:
     return torch.cuda.get_device_name(device)
 
 
-def _seconds(work: Callable[[], Result], *, clock: Clock, device: str) -> tuple[float, Result]:
+def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple[float, _Result]:
     """Return the duration of some work, until the GPU is done if there is one, and its result."""
     start = clock()
     result = work()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from normlift_ns.core.metrics import spearman
+from normlift_ns.core.metrics import spearman_test
 from normlift_ns.evaluation.studies import Variant
 from research.damage import LADDER
 from research.report import Report
@@ -110,7 +110,7 @@ def _add_reliability(rows: list[dict[str, Any]], steps: Sequence[str], prefix: s
     for step in steps:
         for name, found in varying.items():
             bins = np.mean([row[f"{name}_bins"] for row in rows if row["damage"] == step], axis=0)
-            value = spearman(torch.arange(10.0), torch.from_numpy(bins))
+            value = spearman_test(torch.arange(10.0), torch.from_numpy(bins)).value
             report.add(f"{prefix}{name}.{step}.spearman_bins", value, "Spearman, ten bins")
             if name == "reliability":
                 report.add(f"{prefix}{name}.{step}.lowest_bin", 100 * bins[0], "points, accuracy of the lowest tenth")

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from normlift_ns import Neighbors, RefineConfig, lift, nearest_neighbors, refine
 from normlift_ns.core.consensus import consensus
-from normlift_ns.core.metrics import classify, kendall, spearman
+from normlift_ns.core.metrics import classify, kendall_test, spearman_test
 from normlift_ns.evaluation.studies import accuracy_bins
 from research.accuracy import scores_3d
 from research.accuracy_report import mean_and_interval
@@ -73,7 +73,7 @@ def observation(
         row[name] = {
             "miou": scores_3d(world, answers[name], some)["miou"],
             "voted": scores_3d(world, voted, some)["miou"],
-            "kendall": kendall(r[known].cpu(), correct.double().cpu()),
+            "kendall": kendall_test(r[known].cpu(), correct.double().cpu()).value,
             "bins": accuracy_bins(r[known], correct),
         }
     return row
@@ -111,7 +111,7 @@ def ranks(row: dict[str, Any], source: str) -> float | None:
     """Spearman's correlation of ten bins, None where accuracy hardly varies by either R."""
     if max(np.ptp(row[x]["bins"]) for x in SOURCES) < VARYING:
         return None
-    return spearman(torch.arange(10.0), torch.tensor(row[source]["bins"]))
+    return spearman_test(torch.arange(10.0), torch.tensor(row[source]["bins"])).value
 
 
 def summarize(rows: list[dict[str, Any]], report: Report) -> None:

@@ -27,6 +27,17 @@ SAME = {
     "main",
     "KIND",
     "FORMAT",  # of every file format
+    "check",  # entry point of a command, and of every backend
+    "composite",  # of every backend, and its kernels
+    "in_flight",
+    "views_evidence",
+    "lift",  # entry point of the command, and the function that it runs
+    "normlift_method",  # entry points of nerfstudio, and the methods that they load
+    "lerf_ovs_method",
+    "scannet_method",
+    "NormLiftModelConfig",  # classes in config.yml, and stand-ins that read it without nerfstudio
+    "NormLiftPipelineConfig",
+    "segment_sum",  # on any device, and its kernel
 }
 """Names that many modules define on purpose, with one meaning."""
 

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import InputError
-from normlift_ns.analysis.objects import OrientedBox, connected_components, find_objects, oriented_box
+from normlift_ns.analysis.objects import (
+    OrientedBox,
+    connected_components,
+    find_instances,
+    find_objects,
+    oriented_box,
+)
 from research.box_overlap import box_iou, half_spaces
 from tests.examples import examples
 from tests.scenes import generator
@@ -39,6 +45,8 @@ def test_parts_smaller_than_one_gaussian_are_refused():
     for min_size in (0, 1.5):
         with pytest.raises(InputError, match="min_size"):
             find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_size=min_size)
+        with pytest.raises(InputError, match="min_size"):
+            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_size=min_size)
 
 
 def test_scale_and_order_do_not_matter():

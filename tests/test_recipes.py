@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from normlift_ns import open_run
+from tests.encoders.test_kinds import install
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf8")
@@ -23,7 +24,10 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package with all three."""
     copy = tmp_path_factory.mktemp("copy")
     shutil.copytree(ROOT / "normlift_ns", copy / "normlift_ns", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("A rule", "An output", "A scene source"):
+    (code,) = re.findall("```python\n(.*?)```", PARTS["An output"], re.DOTALL)
+    (entry_points,) = re.findall(r"```toml\n\[project\.entry-points\.(.*?)```", PARTS["An output"], re.DOTALL)
+    install(copy, "normlift_table", re.sub('"(.*?)"', r"\1", f"[{entry_points}"), code)
+    for name in ("A rule", "A scene source"):
         (recipe,) = re.findall("```diff\n(.*?)```", PARTS[name], re.DOTALL)
         words = ["git", "apply", "--verbose", "-"]
         outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(copy.parent)}
@@ -84,12 +88,13 @@ def test_a_rule_an_output_and_a_scene_source(extended: Path, lifted: Path, tmp_p
     python(extended, "-m", "normlift_ns.cli.query", *asked, "--json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
-    table = tmp_path / "table.csv"
-    words = ("-m", "normlift_ns.cli.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
+    table = tmp_path / "splat_table.csv"
+    words = ("-m", "normlift_ns.cli.export", "--load-config", lifted, "--output-dir", tmp_path, "--exporters", "table")
     python(extended, *words, "--text", "red", "--threshold", "0.9")
     with table.open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == int(open_run(lifted).ask("red", threshold=0.9).mask.sum()) > 20
     assert all(0 <= float(row["reliability"]) <= 1 for row in rows)
-    other = ("--output-filename", "other.ply")
-    assert f"{table.name} exists" in " ".join(python(extended, *words, *other, "--text", "red", code=1).split())
+    for name in ("splat.ply", "splat_rows.npy", "splat_names.json", "splat_objects.json"):
+        (tmp_path / name).unlink()
+    assert f"{table.name} exists" in " ".join(python(extended, *words, "--text", "red", code=1).split())

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float64, Int32
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.gaussians import MIN_OPACITY, GaussianScene
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.errors import InputError
@@ -180,6 +180,12 @@ def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"
     )
 
 
+def evidence_weights(scalars: Scalars, rows: Bool[Tensor, " n"]) -> Float64[Tensor, " m"]:
+    """Return W_j of some Gaussians as shares of their sum; equal shares if none has evidence."""
+    weight = scalars.weight[rows].double() + 1e-12
+    return weight / weight.sum()
+
+
 def connected_components(
     means: Float[Tensor, "n 3"], selected: Bool[Tensor, " n"], *, reach: float = OBJECT_MAX_GAP
 ) -> Int32[Tensor, " n"]:
@@ -277,7 +283,7 @@ def find_instances(
     Args:
         reach, min_size: as in `find_objects`.
     Raises:
-        ValueError: as in `connected_components`.
+        ValueError: as in `find_objects`.
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
@@ -285,6 +291,7 @@ def find_instances(
     >>> instances.class_id.tolist(), instances.instance_id.tolist(), instances.classes
     ([1, 1, 2, 0], [1, 1, 2, 0], (1, 2))
     """
+    check_number("min_size", min_size, int)
     class_id = best_prompt(relevancy, selected) + 1
     instance_id = torch.zeros_like(class_id)
     classes: list[int] = []
@@ -335,8 +342,6 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 
 
 _FLOATER_NEIGHBORS = 8
-_MIN_OPACITY = 1 / 255
-"""Gaussians with a lower opacity are never rendered."""
 _DISAGREEMENT_WEIGHT = 2.0
 
 
@@ -374,7 +379,7 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
     limit = check_number("floater_limit", limit)
     if len(scalars.norm) != len(scene):
         raise InputError(f"the lift has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
-    rows = (scene.drawable & (scene.opacities >= _MIN_OPACITY)).nonzero().squeeze(1)
+    rows = (scene.drawable & (scene.opacities >= MIN_OPACITY)).nonzero().squeeze(1)
     score = torch.full((len(scene),), -torch.inf, device=scene.means.device)
     if len(rows) > 1:
         norm = scalars.norm.to(score)[rows]

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
 from PIL import Image
-from plyfile import PlyData
 from rich.table import Table
-from torch import Tensor
 
 from normlift_ns.analysis.catalogue import Catalogue
 from normlift_ns.analysis.explain import ViewVote, Why
-from normlift_ns.analysis.objects import Instances
 from normlift_ns.api import open_run
 from normlift_ns.cli.common import CONSOLE, info, plain_text
 from normlift_ns.core.device import choose_device
 from normlift_ns.encoders.cache import CachedTextMasks
-from normlift_ns.errors import InputError
-from normlift_ns.exports import write_label_arrays
 from normlift_ns.io.atomic import atomic_files, safe_file_name
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.query.engine import Answer, run_query
+from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query
 from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, SegmentationResult, query_sam3
 from normlift_ns.rasterization.settings import RasterSettings
@@ -240,55 +233,3 @@ def sam3_arrays(segmented: SegmentationResult) -> dict[str, np.ndarray]:
         "segment_agreement": [answer.scalars.c_inter for answer in segmented.answers],
     }
     return {name: torch.stack(tensors, dim=1).cpu().numpy() for name, tensors in columns.items()}
-
-
-# Additional outputs of ns-normlift-export: masks, arrays and labeled point clouds.
-
-
-def export_masks(run: LiftedRun, selected: Bool[Tensor, " n"], folder: Path, *, rest: bool, overwrite: bool) -> None:
-    """Write a mask of every training image; errors are those of `LiftedRun.masks`."""
-    info(f"{len(run.masks(folder, selected, rest=rest, overwrite=overwrite))} masks in {folder}")
-    with suppress(FileNotFoundError, InputError):  # the first image may be missing
-        if run.scene.train[0].original is not None:
-            info(
-                "The masks fit the undistorted images that the scene was trained with, not the original images of the "
-                "capture."
-            )
-
-
-def export_label_arrays(
-    run: LiftedRun, instances: Instances, rows: Int64[np.ndarray, " m"], folder: Path, *, overwrite: bool
-) -> None:
-    """Write labels as arrays; errors are those of `write_label_arrays`."""
-    write_label_arrays(folder, run.scene.gaussians.means, instances, rows, overwrite=overwrite)
-    info(f"Labels of {len(rows):,} Gaussians in {folder}")
-
-
-def export_labeled_cloud(
-    run: LiftedRun,
-    answer: Answer,
-    instances: Instances,
-    cloud: PlyData,
-    path: Path,
-    distance: float,
-    coordinates: Literal["capture", "scene"],
-    *,
-    overwrite: bool,
-) -> None:
-    """Write a point cloud with the labels of the nearest Gaussians.
-
-    Args:
-        run: The lifted run.
-        answer: Answer whose relevancies to write.
-        instances: Objects of the answer.
-        cloud: The point cloud to label.
-        path: Path of the labeled cloud.
-        distance: Largest distance to a Gaussian, in units of the scene's median spacing.
-        coordinates: Coordinates of the cloud.
-        overwrite: Replace an existing file.
-    Raises:
-        FileExistsError, ValueError: Same as in `LiftedRun.transfer`.
-    """
-    kwargs: dict[str, Any] = {"distance": distance, "coordinates": coordinates, "overwrite": overwrite}
-    labeled = run.transfer_to(cloud, path, answer, instances, **kwargs)
-    info(f"{labeled.points:,} points in {path}, {labeled.share:.1%} of them within {labeled.limit:.3g} of a Gaussian")

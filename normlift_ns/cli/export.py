@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
@@ -31,6 +31,15 @@ from normlift_ns.options import (
     check_prompt_list,
 )
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool
+    from plyfile import PlyData
+    from torch import Tensor
+
+    from normlift_ns.exports import ExportJob
+    from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.query.engine import Answer
+
 
 @dataclass
 class NormLiftExport:
@@ -55,6 +64,9 @@ class NormLiftExport:
     arrays_dir: Path | None = None
     """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
     Gaussians) and names.json."""
+    exporters: tuple[str, ...] = ()
+    """Exporters of other packages to run, by name. Each writes <name of the PLY file>_<exporter>, with a suffix of its
+    own, to the output folder."""
     transfer: Path | None = None
     """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
     relevancies of the nearest visible Gaussian; 0 if none is near enough."""
@@ -88,21 +100,11 @@ class NormLiftExport:
         check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
         if self.part in ("selection", "rest") and len(self.text) == 0 and not has_stored_queries(self.load_config):
             raise InputError(f"--part {self.part} needs prompts, and the run stores no queries; give --text")
-        name = Path(self.output_filename).name
-        if name == "":
-            raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
-        target = self.output_dir / name
-        suffixes = ("rows.npy", "names.json", "objects.json")
-        files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
-        refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
-        for file in files:
-            check_writable_file(file, "--output-dir")
-        self._check_extras(files)
+        outputs = self._outputs()
+        self._check_outputs(outputs)
         info_opening(self.load_config)
-        from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
         from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.cli import answers  # noqa: PLC0415
-        from normlift_ns.exports import answer_instances, check_no_properties, read_cloud  # noqa: PLC0415
+        from normlift_ns.exports import find_exporter, read_cloud  # noqa: PLC0415
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
@@ -115,77 +117,110 @@ class NormLiftExport:
         )
         if self.masks_dir is not None:
             refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
+        job = self._job(run, cloud)
+        for kind, path in outputs.items():
+            for line in find_exporter(kind).write(job, path):
+                info(line)
+        if job.objects is not None:
+            CONSOLE.print(_objects_table(job.objects["queries"]))
+        return outputs["ply"]
+
+    def _job(self, run: LiftedRun, cloud: PlyData | None) -> ExportJob:
+        """Return the exported Gaussians with the answer to the prompts."""
+        from normlift_ns import exports  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
+
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
-        mask = None if answer is None or self.part == "scene" else answer.mask
-        mask = ~mask if mask is not None and self.part == "rest" else mask
+        job = exports.ExportJob(
+            run.scene, run.field, self._keep(run, answer), rest=self.part == "rest", overwrite=self.overwrite
+        )
+        if answer is None:
+            return job
+        instances = exports.answer_instances(answer, reach=self.reach, min_size=self.min_size)
+        question = answer.question
+        objects = {
+            "queries": object_tables(run.field, answer.means, instances),
+            "relevancy": question.rule,
+            "threshold": question.threshold,
+            "min_reliability": question.min_reliability,
+        }
+        transfer = None
+        if cloud is not None:
+            names = [*exports.INSTANCE_PROPERTIES, *(f"relevancy_{i}" for i in range(len(answer.texts)))]
+            exports.check_no_properties(cloud, names)
+            to_cloud = run.to_capture if self.transfer_coordinates == "capture" else None
+            transfer = exports.CloudTransfer(cloud, self.transfer_distance, to_cloud)
+        return replace(job, answer=answer, instances=instances, objects=objects, transfer=transfer)
+
+    def _keep(self, run: LiftedRun, answer: Answer | None) -> Bool[Tensor, " n"]:
+        """Return the Gaussians of the exported part."""
+        import torch  # noqa: PLC0415 (--help should not wait for it)
+
         if self.part == "clean":
             floaters = run.floaters(self.floater_limit).mask
-            mask = ~floaters
             info(f"{int(floaters.sum()):,} likely floaters are left out")
-        objects: dict[str, Any] | None = None
-        instances = None
-        if answer is not None:
-            limits, question = {"reach": self.reach, "min_size": self.min_size}, answer.question
-            instances = answer_instances(answer, **limits)
-            objects = {
-                "queries": object_tables(run.field, answer.means, instances),
-                "relevancy": question.rule,
-                "threshold": question.threshold,
-                "min_reliability": question.min_reliability,
-            }
-            if cloud is not None:  # before anything is written
-                count = len(objects["queries"])
-                check_no_properties(cloud, ("class_id", "instance_id", *(f"relevancy_{i}" for i in range(count))))
-        rows = run.export(
-            target, mask, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
-            overwrite=self.overwrite,
-        )  # fmt: skip
-        info(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}")
-        if answer is not None and instances is not None:
-            if self.masks_dir is not None:
-                answers.export_masks(
-                    run, answer.mask, self.masks_dir, rest=self.part == "rest", overwrite=self.overwrite
-                )
-            if self.arrays_dir is not None:
-                answers.export_label_arrays(run, instances, rows, self.arrays_dir, overwrite=self.overwrite)
-            if cloud is not None:
-                limit, coordinates, path = self.transfer_distance, self.transfer_coordinates, self._labeled_cloud
-                answers.export_labeled_cloud(
-                    run, answer, instances, cloud, path, limit, coordinates, overwrite=self.overwrite
-                )
-        if objects is not None:
-            CONSOLE.print(_objects_table(objects["queries"]))
-        return target
+            return ~floaters
+        if answer is None or self.part == "scene":
+            return torch.ones(len(run.field), dtype=torch.bool)
+        return answer.mask if self.part == "selection" else ~answer.mask
 
-    @property
-    def _labeled_cloud(self) -> Path:
-        """Path of the labeled point cloud."""
-        return self.output_dir / f"{Path() if self.transfer is None else self.transfer.stem}_labels.ply"
+    def _outputs(self) -> dict[str, Path]:
+        """Return the path of every output by its exporter."""
+        name = Path(self.output_filename).name
+        if name == "":
+            raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
+        target = self.output_dir / name
+        cloud = None if self.transfer is None else self.output_dir / f"{self.transfer.stem}_labels.ply"
+        paths = {"ply": target, "masks": self.masks_dir, "arrays": self.arrays_dir, "cloud": cloud}
+        outputs = {kind: path for kind, path in paths.items() if path is not None}
+        for kind in self.exporters:
+            from normlift_ns.exports import find_exporter  # noqa: PLC0415 (imports torch)
 
-    def _check_extras(self, files: Sequence[Path]) -> None:
-        """Raise errors about masks, arrays and point clouds that can be detected before anything is loaded."""
-        for name in ("masks_dir", "arrays_dir", "transfer"):
-            if getattr(self, name) is None:
-                continue
-            flag = f"--{name.replace('_', '-')}"
-            if len(self.text) == 0 and not has_stored_queries(self.load_config):
-                raise InputError(f"{flag} needs prompts, and the run stores no queries; give --text")
-            if name != "transfer":
-                check_writable_folder(getattr(self, name), flag)
-        if self.masks_dir is not None and self.part == "clean":
-            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+            outputs[kind] = target.with_name(f"{target.stem}_{kind}{find_exporter(kind).suffix}")
+        return outputs
+
+    def _check_outputs(self, outputs: Mapping[str, Path]) -> None:
+        """Raise errors about the outputs that can be detected before anything is loaded."""
+        target = outputs["ply"]
+        suffixes = ("rows.npy", "names.json", "objects.json")
+        files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
+        refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
+        for file in files:
+            check_writable_file(file, "--output-dir")
+        self._check_answer()
+        if self.masks_dir is not None:
+            check_writable_folder(self.masks_dir, "--masks-dir")
+            if self.part == "clean":
+                raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
         if self.arrays_dir is not None:
+            check_writable_folder(self.arrays_dir, "--arrays-dir")
             paths = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
             refuse_existing(*paths, overwrite=self.overwrite, instead="--arrays-dir")
         if self.transfer is not None:
             check_readable_file(self.transfer, "--transfer")
-            path = self._labeled_cloud
+            path = outputs["cloud"]
             if path in files:
                 raise InputError(
                     f"{path} would be both the splat and the labeled cloud; give another --output-filename"
                 )
             check_writable_file(path, "--output-dir")
             refuse_existing(path, overwrite=self.overwrite, instead="--output-dir")
+        for kind in self.exporters:
+            refuse_existing(outputs[kind], overwrite=self.overwrite, instead="--output-dir or --output-filename")
+
+    def _check_answer(self) -> None:
+        """Raise if an output needs prompts, and there are none."""
+        if len(self.text) > 0 or has_stored_queries(self.load_config):
+            return
+        flags = [
+            f"--{name.replace('_', '-')}" for name in ("masks_dir", "arrays_dir", "transfer") if getattr(self, name)
+        ]
+        for kind in self.exporters:
+            from normlift_ns.exports import find_exporter  # noqa: PLC0415 (imports torch)
+
+            flags += [f"--exporters {kind}"] if find_exporter(kind).needs_answer else []
+        if len(flags) > 0:
+            raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 
 
 def _objects_table(queries: list[dict[str, Any]]) -> Table:

@@ -11,6 +11,10 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 
+MIN_OPACITY = 1 / 255
+"""Opacity below which a Gaussian is never drawn."""
+SH_C0 = 0.28209479177387814
+"""sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 MAX_SCALE = 4.8517e8
 """Largest scale in world units, e^20 with a margin for rounding. The projected covariance of a larger Gaussian may
 overflow float32."""

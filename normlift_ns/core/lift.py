@@ -203,11 +203,25 @@ def lift(
         "c_intra": _ratio(by_view, weight, has_direction).clamp(max=1),
         "c_inter": _ratio(total, by_view, has_direction).clamp(max=1),
         "n_eff": n_eff,
-        "reliability": _ratio(norm * n_eff, n_eff + beta, has_direction),
+        "reliability": reliability(norm, n_eff, beta),
         "weight": weight,
     }
     scalars = Scalars(**{name: x.to(table.dtype) for name, x in values.items()}, view_count=view_count.int())
     return Lifted(scalars, evidence, table)
+
+
+def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float) -> Float[Tensor, "*n"]:
+    """Return R_j, equation 8 of the paper; 0 without evidence.
+
+    Args:
+        norm: ||f_j||. It is 1 if all views agree, so that the result is the factor N_eff / (N_eff + beta) alone.
+        n_eff: N_eff, 0 without evidence.
+        beta: prior strength in virtual views, >= 0.
+
+    >>> reliability(0.6, torch.tensor([0.0, 2.0]), beta=1.0)
+    tensor([0.0000, 0.4000])
+    """
+    return torch.where(n_eff > 0, norm * n_eff / (n_eff + beta), 0.0)
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
-from scipy import stats
 from torch import Tensor
 
 from normlift_ns.errors import InputError
@@ -126,22 +125,16 @@ class Correlation(NamedTuple):
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
     """Compute Spearman's rank correlation, with ties at their mean rank."""
-    return _correlation(stats.spearmanr, a, b)
+    from scipy.stats import spearmanr  # noqa: PLC0415 (takes a second, and only studies need it)
+
+    return _correlation(spearmanr, a, b)
 
 
 def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
     """Compute Kendall's tau-b in O(n log n) steps."""
-    return _correlation(stats.kendalltau, a, b)
+    from scipy.stats import kendalltau  # noqa: PLC0415 (as in `spearman_test`)
 
-
-def spearman(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """Return the value of `spearman_test`."""
-    return spearman_test(a, b).value
-
-
-def kendall(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """Return the value of `kendall_test`."""
-    return kendall_test(a, b).value
+    return _correlation(kendalltau, a, b)
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:

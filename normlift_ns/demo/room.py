@@ -91,7 +91,7 @@ class Surface(NamedTuple):
     """[n], indices of the room's parts"""
 
 
-Painter = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
+SurfaceColors = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
 """sRGB [n, 3] of the Gaussians on a surface, including light and shadow; values may leave 0..1."""
 
 
@@ -111,7 +111,9 @@ def class_names(parts: Sequence[Part]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(part.name for part in parts))
 
 
-def build_room(parts: Sequence[Part], painter: Painter, area: float, num_gaussians: int, seed: int = 0) -> DemoRoom:
+def build_room(
+    parts: Sequence[Part], painter: SurfaceColors, area: float, num_gaussians: int, seed: int = 0
+) -> DemoRoom:
     """Build a room. The same arguments give the same room.
 
     Most Gaussians lie flat on the surfaces. As in trained scenes, some faint ones stray above and below the surfaces,
@@ -139,7 +141,9 @@ def build_room(parts: Sequence[Part], painter: Painter, area: float, num_gaussia
     return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)
 
 
-def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, rng: np.random.Generator) -> _Gaussians:
+def _surface(
+    parts: Sequence[Part], painter: SurfaceColors, area: float, count: int, rng: np.random.Generator
+) -> _Gaussians:
     """Cover all surfaces with Gaussians, except for those inside other parts."""
     low, high = np.array([-HALF_WIDTH, -HALF_WIDTH, 0]), np.array([HALF_WIDTH, HALF_WIDTH, HEIGHT])
     density, shapes = _POINTS_PER_GAUSSIAN * count / area, [part.shape for part in parts]

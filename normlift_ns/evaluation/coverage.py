@@ -13,15 +13,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from normlift_ns.analysis.objects import connected_components
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.lift import Scalars
+from normlift_ns.core.lift import Scalars, reliability
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import unsupported
 from normlift_ns.core.scene import Scene
@@ -291,7 +289,7 @@ class ReliabilityModel:
     ) -> Float64[Tensor, " m"]:
         """Return R_j of some Gaussians with these sums of weights."""
         n_eff = _ratio(weight**2, squared + (FAINT * self.surface[rows]) ** 2)
-        return self.norm[rows] * _ratio(n_eff, n_eff + self.beta)
+        return self.norm[rows] * reliability(1.0, n_eff, self.beta)
 
     def seen_by(self, views: SparseRows, view: int) -> ReliabilityModel:
         """Return the evidence after lifting one of the views, too."""
@@ -589,9 +587,7 @@ def suggest_poses(
         center = torch.tensor(target, dtype=torch.float64)
         positions = positions_around(space, center)
         candidates += [
-            look_at(positions[i], center, space.up, cameras[0])
-            for i in sample_evenly(len(positions), _MAX_CANDIDATES)
-            if len(positions) > 0
+            look_at(positions[i], center, space.up, cameras[0]) for i in sample_evenly(len(positions), _MAX_CANDIDATES)
         ]
     if len(candidates) == 0:
         return []
@@ -702,6 +698,9 @@ def write_poses(
 
 def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     """Save the scene next to its reliability, with a color scale."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (only drawing needs it)
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     height, width = picture.reliability.shape
     figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)

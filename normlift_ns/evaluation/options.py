@@ -103,10 +103,10 @@ PromptText = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*
 """Text that can be used as a prompt: not blank, and without lone surrogates."""
 _MAX_BYTES = 2**26
 """Maximum file size in bytes; label files have some thousands."""
-T = TypeVar("T")
+_Document = TypeVar("_Document")
 
 
-def read_document(path: Path, kind: type[T]) -> T:
+def read_document(path: Path, kind: type[_Document]) -> _Document:
     """Read a JSON file and convert it to a type.
 
     Raises:

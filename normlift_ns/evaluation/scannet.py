@@ -201,31 +201,21 @@ def evaluate_scannet(
     `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
     """
     other: WithoutDirection = "none" if without_direction == "first" else "first"
+    names = [scene.name for scene in scenes]
     results, rows = {}, []
-    by_scene: list[dict[str, Any]] = [{"scene": scene.name} for scene in scenes]
-    for classes, ids in CLASS_SETS.items():
+    by_scene: list[dict[str, Any]] = [{"scene": name} for name in names]
+    for classes in CLASS_SETS:
         scores = {
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
             for rule in (without_direction, other)
         }
-        if all(math.isnan(score.miou) for score in scores[without_direction]):
-            names = ", ".join(scene.name for scene in scenes)
-            raise InputError(
-                f"nothing can be scored with {classes} classes: no Gaussian of {names} has a label "
-                f"among them and an opacity of at least {min_opacity:g} (--min-opacity)"
-            )
+        _check_scored(scores[without_direction], names, classes, min_opacity)
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])
         for row, score in zip(by_scene, scores[without_direction]):
             row |= {f"miou_{classes}": score.miou, f"macc_{classes}": score.macc}
-        for scene, score in zip(scenes, scores[without_direction]):
-            rows += [
-                {"scene": scene.name, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
-                for i, iou, accuracy in zip(ids, score.iou.tolist(), score.accuracy.tolist())
-                if not math.isnan(iou)  # the scene lacks the class
-            ]
-    names = [scene.name for scene in scenes]
+            rows += _class_rows(row["scene"], classes, score)
     missing = [name for name in SCENES if name not in names]
     settings = {
         "protocol": "scannet", "min_opacity": min_opacity, "without_direction": without_direction, "scenes": names,
@@ -233,3 +223,21 @@ def evaluate_scannet(
     }  # fmt: skip
     share = mean([float((~scene.valid).double().mean()) for scene in scenes])
     return Evaluation({**results, "without_direction_share": share}, rows, settings, by_scene)
+
+
+def _check_scored(scores: Sequence[ClassScores], names: Sequence[str], classes: int, min_opacity: float) -> None:
+    """Raise InputError if no scene has a score."""
+    if all(math.isnan(score.miou) for score in scores):
+        raise InputError(
+            f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among them "
+            f"and an opacity of at least {min_opacity:g} (--min-opacity)"
+        )
+
+
+def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
+    """Return the scores of each class that a scene has."""
+    return [
+        {"scene": scene, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
+        for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())
+        if not math.isnan(iou)
+    ]

@@ -7,16 +7,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import matplotlib as mpl
 import torch
 from jaxtyping import Bool, Float, Int, Int32
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import Lifted, Scalars
+from normlift_ns.core.lift import Lifted, Scalars, reliability
 from normlift_ns.core.lowrank import StoredDirections
 from normlift_ns.core.metrics import NO_CLASS, bin_means, classify, kendall_test, lowest_jaccard, spearman_test
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
@@ -28,6 +26,9 @@ from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scen
 from normlift_ns.evaluation.scannet import predict_classes, read_labels
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Variant = Literal["none", "plain_knn", "linear", "norm_only", "support_only", "paper", "posterior"]
 
@@ -117,7 +118,7 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
         return (scalars.norm > 0).to(scalars.norm.dtype)
     if variant == "norm_only":
         return scalars.norm
-    support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + beta), 0.0)
+    support = reliability(1.0, scalars.n_eff, beta)
     return support if variant == "support_only" else scalars.norm * support
 
 
@@ -186,7 +187,7 @@ def voting_scalars(field: SemanticField) -> Scalars:
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False):
         return scalars
-    support = scalars.n_eff / (scalars.n_eff + options.get("beta", BETA))
+    support = reliability(1.0, scalars.n_eff, options.get("beta", BETA))
     return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))
 
 
@@ -459,6 +460,9 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
+    import matplotlib as mpl  # noqa: PLC0415 (only drawing needs it)
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     mpl.rcParams["svg.hashsalt"] = "normlift"  # reproducible files
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)

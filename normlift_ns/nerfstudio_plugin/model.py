@@ -23,10 +23,10 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio.config_classes import active_sh_degree
 from normlift_ns.errors import InputError
+from normlift_ns.exports import TrainedSplat
 from normlift_ns.io.run_dir import FIELD_FOLDER, check_run
 from normlift_ns.lifted_run import resolve_field_paths
 from normlift_ns.nerfstudio_plugin.panel import SearchPanel
-from normlift_ns.options import RasterizeMode
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.rasterization.rasterize import ray_weights, render, view_colors
 from normlift_ns.rasterization.settings import RasterSettings
@@ -191,9 +191,9 @@ class NormLiftModel(SplatfactoModel):
         """Return all Gaussians."""
         return self._scene(None)
 
-    def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """Return parameters, whether colors are spherical harmonics, and rasterize mode, for `write_splat_ply`."""
-        return dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode
+    def splats(self) -> TrainedSplat:
+        """Return the trained Gaussians, for `write_splat_ply`."""
+        return TrainedSplat(dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode)
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
         parts = (self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from functools import cache
 from pathlib import Path
@@ -25,10 +25,10 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.errors import InputError, describe_error
-from normlift_ns.exports import MIN_OPACITY_LOGIT, write_splat_ply
+from normlift_ns.exports import MIN_OPACITY_LOGIT, TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import RELEVANCY_RULES
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import load_query, save_query
 from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors
@@ -206,8 +206,8 @@ class PanelHost(Protocol):
         """Return all Gaussians."""
         ...
 
-    def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """Return parameters, whether colors are spherical harmonics, and rasterize mode, for `write_splat_ply`."""
+    def splats(self) -> TrainedSplat:
+        """Return the trained Gaussians, for `write_splat_ply`."""
         ...
 
 
@@ -224,21 +224,13 @@ def export_selection(host: PanelHost, state: State, mask: Bool[Tensor, " n"], st
     """
     if not bool(mask.any()):
         raise InputError("Nothing is selected; there is nothing to download.")
-    parameters, harmonics, mode = host.splats()
-    if not bool((mask & visible_mask(parameters["opacities"])).any()):
+    splat = host.splats()
+    if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
         raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
     name = f"{safe_file_name(stem)}.ply"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
-        rows = write_splat_ply(
-            path,
-            parameters,
-            state.space.field,
-            state.answer,
-            keep=mask,
-            spherical_harmonics=harmonics,
-            rasterize_mode=mode,
-        )
+        rows = write_splat_ply(path, splat, state.space.field, state.answer, keep=mask)
         return name, path.read_bytes(), len(rows)
 
 
@@ -701,7 +693,7 @@ class PanelView(torch.nn.Module):
             widgets.status.content, widgets.found.content, widgets.histograms.content = NO_FIELD_MESSAGE, "", ""
             return
         widgets.follow(state)
-        visible = visible_mask(self._host[0].splats()[0]["opacities"])
+        visible = visible_mask(self._host[0].splats().parameters["opacities"])
         widgets.status.content = status_mdx(state, self._message, busy, visible)
         widgets.found.content = prompt_table(state)
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
+from normlift_ns.analysis.objects import evidence_weights
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.relevancy import RELEVANCY_RULES
@@ -321,8 +322,7 @@ class FigureHeader:
         if not bool(mask.any()):
             peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
             return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", absent)
-        weight = scalars.weight[mask].double() + 1e-12
-        views = float((weight * scalars.n_eff[mask].double()).sum() / weight.sum())
+        views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
         below = f" (R < {WEAK_RELIABILITY:g})"

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from normlift_ns.analysis.objects import connected_components
+from normlift_ns.analysis.objects import connected_components, evidence_weights
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.options import OBJECT_MIN_GAUSSIANS
 from normlift_ns.rasterization.rasterize import ray_weights
@@ -98,8 +98,7 @@ def list_objects(state: State, *, most: int = 12, min_size: int = OBJECT_MIN_GAU
 
 def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size: int) -> ObjectRow:
     scalars = state.space.field.scalars
-    weight = scalars.weight[mask].double() + 1e-12
-    weight = weight / weight.sum()
+    weight = evidence_weights(scalars, mask)
     means = state.space.means[mask].double()
     center = (weight[:, None] * means).sum(dim=0).tolist()
     low, high = np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)

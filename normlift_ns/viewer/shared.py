@@ -21,10 +21,10 @@ from torch import Tensor
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.analysis.vote_records import RecordedVotes
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.exports import write_splat_ply
+from normlift_ns.exports import TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.query.engine import Answer
@@ -38,10 +38,8 @@ from normlift_ns.session.state import History, State
 MOST_DRAWN = 1_000_000
 """Gaussians that a browser sorts and draws without stuttering; more cost memory of its tab."""
 BYTES = 32
-_FAINTEST = 1 / 255
 _THINNEST = 1e-4
 """Least standard deviation, as a share of the largest: what is thinner is not to be seen."""
-_CONSTANT_HARMONIC = 0.28209479177387814
 _EXTENT = 3.0
 """Half the size that a scene gets in the browser, whose cameras see from 0.01 to 1000."""
 
@@ -119,7 +117,7 @@ class Records:
 def make_records(scene: Scene, most: int = MOST_DRAWN) -> Records:
     """The records of a scene: of what can be seen, the most opaque and largest where that is more than `most`."""
     gaussians, parameters = scene.gaussians, scene.parameters
-    seen = gaussians.drawable & (gaussians.opacities >= _FAINTEST)
+    seen = gaussians.drawable & (gaussians.opacities >= MIN_OPACITY)
     rows = seen.nonzero().squeeze(1)
     left_out = max(0, len(rows) - most)
     if left_out > 0:
@@ -128,7 +126,7 @@ def make_records(scene: Scene, most: int = MOST_DRAWN) -> Records:
     means = gaussians.means[rows].double().cpu().numpy()
     units = Units.of(scene.train.cameras, means)
     constant = parameters["features_dc"][rows].float()
-    rgb = constant * _CONSTANT_HARMONIC + 0.5 if scene.has_harmonics else torch.sigmoid(constant)
+    rgb = constant * SH_C0 + 0.5 if scene.has_harmonics else torch.sigmoid(constant)
     table = np.zeros((len(rows), 8), np.uint32)
     table[:, :3] = np.ascontiguousarray(units.to_browser(means), np.float32).view(np.uint32)
     factors = cholesky(gaussians, rows) * units.factor
@@ -462,13 +460,9 @@ class Run:
         """
         if not bool(mask.any()):
             raise InputError("Nothing is selected; there is nothing to export.")
-        how: dict[str, Any] = {
-            "spherical_harmonics": self.scene.has_harmonics,
-            "rasterize_mode": self.scene.rasterize_mode,
-        }
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"{safe_file_name(name)}.ply"
-            rows = write_splat_ply(path, self.scene.parameters, self.space.field, answer, keep=mask, **how)
+            rows = write_splat_ply(path, TrainedSplat.of(self.scene), self.space.field, answer, keep=mask)
             content = path.read_bytes()
         faint = int(mask.sum()) - len(rows)
         why = f" {faint:,} more are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""

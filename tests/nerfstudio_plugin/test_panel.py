@@ -25,6 +25,7 @@ import torch
 from plyfile import PlyData
 
 from normlift_ns.analysis.objects import find_floaters
+from normlift_ns.exports import TrainedSplat
 from normlift_ns.nerfstudio_plugin.panel_view import prompt_table
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
@@ -338,7 +339,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     faint = pipeline.model.gauss_params["opacities"].detach().clone()
     first = int(chosen(pipeline).nonzero()[0])
     faint[first] = -9.0
-    splats = ({**pipeline.model.gauss_params, "opacities": faint}, True, "classic")
+    splats = TrainedSplat({**pipeline.model.gauss_params, "opacities": faint}, True, "classic")
     monkeypatch.setattr(pipeline.model, "splats", lambda: splats)
     ask(panel, "left, left again")
     rows = chosen(pipeline)

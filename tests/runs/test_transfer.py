@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
-from normlift_ns.exports import nearest_gaussians, read_cloud, vertex_positions, write_cloud
+from normlift_ns.exports import label_cloud, nearest_gaussians, read_cloud, vertex_positions, write_cloud
 from tests.examples import examples
 
 
@@ -82,3 +82,15 @@ def test_what_is_no_cloud_is_refused(tmp_path):
             read_cloud(tmp_path / "a.ply")
     with pytest.raises(FileNotFoundError, match="--transfer"):
         read_cloud(tmp_path / "none.ply")
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_gaussians_at_one_position_label_no_cloud(count, tmp_path):
+    cloud(tmp_path / "a.ply")
+    means, columns = np.ones((count, 3)), {"class_id": np.ones(count, np.uint32)}
+    with pytest.raises(InputError, match="one position"):
+        label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0)
+    assert not (tmp_path / "b.ply").exists()
+    means = np.concatenate([means, [[1, 1, 2.0]]])
+    columns = {"class_id": np.ones(count + 1, np.uint32)}
+    assert label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0).limit == 2.0
