@@ -64,7 +64,7 @@ FOREIGN = {
     "method_configs": {"nerfstudio"},
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "cli": TENSORS | {"numpy", "PIL", "plyfile", "yaml", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
+    "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/capture.py")

@@ -23,7 +23,8 @@ from normlift_ns.data.frames import check_mask, image_warnings, read_image_heade
 from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio import config as plain
 from normlift_ns.data.nerfstudio.config import dump_config
-from normlift_ns.data.nerfstudio.load import image_name
+from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.data.transforms import relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
@@ -53,7 +54,7 @@ def relocate_config(config: TrainerConfig, config_path: Path, data: Path | None 
     Raises:
         FileNotFoundError: as `locate`.
     """
-    location = plain.locate_run(config, config_path, data)
+    location = locate_run(config, config_path, data)
     config = plain.with_absolute_paths(config, location)
     model: Any = config.pipeline.model
     if isinstance(model, NormLiftModelConfig) and model.semantics is not None:
@@ -94,7 +95,7 @@ class DatasetViews:
         self._background = background
         self.files = list(dataset.image_filenames)
         """Absolute paths of the images."""
-        self.names = [image_name(file, folder) for file in self.files]
+        self.names = [relative_name(file, folder) for file in self.files]
         """Paths of the images relative to the dataset, with forward slashes."""
 
     def __len__(self) -> int:

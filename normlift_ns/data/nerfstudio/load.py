@@ -22,7 +22,7 @@ from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkp
 from normlift_ns.data.frames import Frame, Intrinsics, check_mask, image_warnings, read_image_header
 from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio.cameras import DatasetSplit, apply_pose_adjustments
-from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
+from normlift_ns.data.nerfstudio.config import read_trainer_config, with_absolute_paths
 from normlift_ns.data.nerfstudio.config_classes import (
     ASSUMED_STEP,
     NAMED_COLORS,
@@ -34,8 +34,9 @@ from normlift_ns.data.nerfstudio.config_classes import (
     active_sh_degree,
     background_color,
 )
+from normlift_ns.data.nerfstudio.config_file import RunLocation, locate_run
 from normlift_ns.data.nerfstudio.dataparsers import check_dataset, parse_dataset
-from normlift_ns.data.transforms import read_dataparser_transforms
+from normlift_ns.data.transforms import read_dataparser_transforms, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import view_colors
@@ -91,7 +92,7 @@ class TrainedViews:
         self._split, self._poses, self._background, self._reading = split, poses, background, reading
         self.files = list(split.files)
         """Absolute paths of the images."""
-        self.names = [image_name(file, folder) for file in self.files]
+        self.names = [relative_name(file, folder) for file in self.files]
         """Image files relative to the dataset, with forward slashes."""
 
     def __len__(self) -> int:
@@ -278,11 +279,6 @@ def _fisheye(lens: _Lens) -> tuple[Any, Any, Any]:
         matrix, coefficients, (width, height), np.eye(3), balance=0
     )
     return matrix, coefficients, pinhole
-
-
-def image_name(file: Path, folder: Path) -> str:
-    """Return the file relative to its dataset's folder, or unchanged if it lies elsewhere, with forward slashes."""
-    return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
 
 
 # Trained splatfacto runs as a `Scene` of the core, without CUDA and without building a model.
