@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
@@ -189,8 +189,21 @@ def read_ply(path: Path) -> PlySplat:
     if not path.is_file():
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
     check_ply_header(path)
+    data = _parse_ply(path)
+    vertex = next((element for element in data.elements if element.name == "vertex"), None)
+    if vertex is None or vertex.count == 0:
+        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+    _check_properties(path, vertex)
+    rest = _rest_names(path, {item.name for item in vertex.properties})
+    splat = _read_columns(path, vertex.data, rest)
+    validate_splat(splat, path)
+    return PlySplat(splat, _mode([*data.comments, *vertex.comments]))
+
+
+def _parse_ply(path: Path) -> PlyData:
+    """Parse the header, and map the binary data."""
     try:
-        data = PlyData.read(str(path), mmap="c")
+        return PlyData.read(str(path), mmap="c")
     except UnicodeDecodeError as error:
         raise InputError(
             f"The header of {path} has non-ASCII characters, perhaps in a comment ({error}). Remove them, or rewrite "
@@ -206,10 +219,10 @@ def read_ply(path: Path) -> PlySplat:
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
             "splat-transform converts other formats, for example: splat-transform scene.sog scene.ply"
         ) from error
-    elements = {element.name: element for element in data.elements}
-    vertex = elements.get("vertex")
-    if vertex is None or vertex.count == 0:
-        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+
+
+def _check_properties(path: Path, vertex: PlyElement) -> None:
+    """Raise InputError unless the vertices have the properties of a splat, as plain numbers."""
     names = {item.name for item in vertex.properties}
     if "packed_position" in names:
         raise InputError(
@@ -225,9 +238,6 @@ def read_ply(path: Path) -> PlySplat:
     lists = [item.name for item in vertex.properties if item.name in _REQUIRED and hasattr(item, "len_dtype")]
     if lists:
         raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
-    splat = _read_columns(path, vertex.data, _rest_names(path, names))
-    validate_splat(splat, path)
-    return PlySplat(splat, _mode([*data.comments, *vertex.comments]))
 
 
 def check_ply_header(path: Path) -> None:

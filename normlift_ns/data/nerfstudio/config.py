@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -233,52 +233,80 @@ def _format(value: Any) -> str:
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
     """Yield values that violate their type hints: field name, value, and what was expected."""
-    origin, parts = get_origin(hint), get_args(hint)
     if depth > _MAX_DEPTH:
         yield name, value, "no more than a few levels"
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
-    elif origin in (Union, types.UnionType):
-        classes = [part for part in parts if is_dataclass(part) and type(value) is part]
-        errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
-        if all(errors):
-            yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
-    elif origin is Literal:
-        if not any(type(value) is type(part) and value == part for part in parts):
-            yield name, value, " or ".join(map(repr, parts))
+    elif get_origin(hint) in _GENERIC_CHECKS:
+        yield from _GENERIC_CHECKS[get_origin(hint)](value, hint, name, depth)
     elif is_dataclass(hint):
-        if not isinstance(value, hint):  # type: ignore[arg-type]
-            yield name, value, _describe(hint)
-            return
-        hints = get_type_hints(type(value))
-        for field in fields(value):
-            if field.name not in _UNCHECKED:
-                full_name = f"{name}.{field.name}" if name else field.name
-                yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
-    elif origin is tuple:
-        if not isinstance(value, tuple | list) or (parts[-1] is not Ellipsis and len(value) != len(parts)):
-            yield name, value, _describe(hint)
-        else:
-            item_hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-            for i, (item, item_hint) in enumerate(zip(value, item_hints)):
-                yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
-    elif origin is dict:
-        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-            yield name, value, _describe(hint)
-        else:
-            for key, item in value.items():
-                yield from _type_errors(item, parts[1], f"{name}.{key[:40]}", depth + 1)
-    elif hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e300:
-            yield name, value, "a finite number"
-    elif hint is int:
-        if type(value) is not int or abs(value) > _MAX_INT:
-            yield name, value, "a whole number"
-    elif hint is str or hint is Path:
-        if not isinstance(value, hint) or "\0" in str(value):
-            yield name, value, "text" if hint is str else "a path"
+        yield from _dataclass_errors(value, hint, name, depth)
+    elif hint in _SCALARS:
+        is_valid, expected = _SCALARS[hint]
+        if not is_valid(value):
+            yield name, value, expected
     elif isinstance(hint, type) and not isinstance(value, hint):
         yield name, value, _describe(hint)
+
+
+def _union_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    classes = [part for part in parts if is_dataclass(part) and type(value) is part]
+    errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
+    if all(errors):
+        yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
+
+
+def _literal_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    if not any(type(value) is type(part) and value == part for part in parts):
+        yield name, value, " or ".join(map(repr, parts))
+
+
+def _tuple_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    is_open = parts[-1] is Ellipsis
+    if not isinstance(value, tuple | list) or not (is_open or len(value) == len(parts)):
+        yield name, value, _describe(hint)
+        return
+    for i, (item, item_hint) in enumerate(zip(value, parts[:1] * len(value) if is_open else parts)):
+        yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
+
+
+def _dict_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        yield name, value, _describe(hint)
+        return
+    for key, item in value.items():
+        yield from _type_errors(item, get_args(hint)[1], f"{name}.{key[:40]}", depth + 1)
+
+
+def _dataclass_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    if not isinstance(value, hint):
+        yield name, value, _describe(hint)
+        return
+    hints = get_type_hints(type(value))
+    for field in fields(value):
+        if field.name not in _UNCHECKED:
+            full_name = f"{name}.{field.name}" if name else field.name
+            yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
+
+
+_GENERIC_CHECKS: dict[Any, Callable[[Any, Any, str, int], Iterator[tuple[str, Any, str]]]] = {
+    Union: _union_errors,
+    types.UnionType: _union_errors,
+    Literal: _literal_errors,
+    tuple: _tuple_errors,
+    dict: _dict_errors,
+}
+"""Checks of values by the origin of their type hint."""
+_SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    float: (lambda x: type(x) is not bool and isinstance(x, int | float) and abs(x) <= 1e300, "a finite number"),
+    int: (lambda x: type(x) is int and abs(x) <= _MAX_INT, "a whole number"),
+    str: (lambda x: isinstance(x, str) and "\0" not in x, "text"),
+    Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
+}
+"""Checks of values by their type hint, each with what it expects."""
 
 
 def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
