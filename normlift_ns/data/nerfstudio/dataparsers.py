@@ -86,7 +86,7 @@ def _entries(path: Path, data: Path) -> TransformsEntries:
 
 
 def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
-    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    path = _transforms_path(parser)
     entries = _entries(path, parser.data)
     for name in _REQUIRED:
         incomplete = [frame.file_path for frame in entries.frames if getattr(frame, name) is None]
@@ -97,6 +97,10 @@ def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
             )
     _check_positions([frame.transform_matrix for frame in entries.frames], parser, path)
     _check_files([path.parent / frame.file_path for frame in entries.frames], path)
+
+
+def _transforms_path(parser: NerfstudioDataParserConfig) -> Path:
+    return parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
 
 
 def _check_blender(parser: BlenderDataParserConfig) -> None:
@@ -332,7 +336,7 @@ def _distortion(entries: TransformsEntries, frame: CameraEntry) -> list[float]:
 
 
 def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
-    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    path = _transforms_path(parser)
     folder, meta = path.parent, read_transforms_entries(path)
     factor = _downscale_factor(folder, Path(meta.frames[0].file_path), parser)
 
@@ -345,23 +349,21 @@ def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
     if len(masks) not in (0, len(files)):
         raise InputError(f"{path} lists masks for {len(masks)} of {len(files)} images; expected one for each, or none")
-    lists = {
-        split: None if names is None else [resolve(name) for name in names]
-        for split, names in (
-            ("train", meta.train_filenames), ("val", meta.val_filenames), ("test", meta.test_filenames)
-        )
-    }  # fmt: skip
-    split_indices = split_by_lists(lists, files) or split_by_mode(files, parser)
+    lists = {"train": meta.train_filenames, "val": meta.val_filenames, "test": meta.test_filenames}
+    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in lists.items()}
+    split_indices = split_by_lists(resolved, files) or split_by_mode(files, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
     split = DatasetSplit(files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses(meta, frames))
-    applied = meta.applied_transform
-    if applied is None and (parser.data / "colmap/sparse/0").exists():
-        applied = _LEGACY_FLIP
     train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
-    return ParsedDataset(
-        train, held_out, compose_applied_transform(transform, applied), scale * float(meta.applied_scale)
-    )
+    transform = compose_applied_transform(transform, _applied_transform(meta, parser.data))
+    return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
+
+
+def _applied_transform(meta: TransformsEntries, data: Path) -> list[list[float]] | None:
+    """Return the transform of the poses before they were stored, which files of an old ns-process-data do not name."""
+    is_legacy = meta.applied_transform is None and (data / "colmap/sparse/0").exists()
+    return _LEGACY_FLIP if is_legacy else meta.applied_transform
 
 
 def _camera_type(meta: TransformsEntries) -> str:
