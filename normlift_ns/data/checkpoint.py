@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.splat import SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.errors import InputError
 
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
@@ -296,18 +296,7 @@ _UNSUPPORTED = {
 }
 
 
-class GsplatCheckpoint(NamedTuple):
-    """Contents of a gsplat checkpoint."""
-
-    files: tuple[Path, ...]
-    """One file per GPU of the training."""
-    step: int
-    splat: SplatParameters
-    pose_adjust: Float[Tensor, "v 9"] | None
-    """Pose adjustment of each training view: a translation, and a rotation in six numbers."""
-
-
-def read_gsplat_checkpoint(path: Path) -> GsplatCheckpoint:
+def read_gsplat_checkpoint(path: Path) -> SplatFile:
     """Read ckpt_<step>_rank<r>.pt; after training on several GPUs, read the files of all ranks, in order.
 
     Raises:
@@ -332,7 +321,7 @@ def read_gsplat_checkpoint(path: Path) -> GsplatCheckpoint:
     names = splats[0].parameters
     merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
     validate_splat(merged, files[0])
-    return GsplatCheckpoint(files, steps.pop(), merged, loaded[0][2])
+    return SplatFile(merged, step=steps.pop(), pose_adjust=loaded[0][2], by_gsplat=True)
 
 
 def _rank_files(path: Path) -> tuple[Path, ...]:

@@ -150,6 +150,20 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
     return SplatParameters(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})
 
 
+class SplatFile(NamedTuple):
+    """Contents of a file of a trained splat."""
+
+    splat: SplatParameters
+    rasterize_mode: RasterizeMode | None = None
+    """Rasterize mode of the training; None if the file does not name it."""
+    step: int = 0
+    """Training step; 0 if unknown."""
+    pose_adjust: Float[Tensor, "v 9"] | None = None
+    """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
+    by_gsplat: bool = False
+    """Whether gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
+
+
 # Splats in PLY files written by Inria's trainer, gsplat, ns-export or this package.
 
 
@@ -168,15 +182,7 @@ _MODES: dict[str, RasterizeMode] = {
 }  # fmt: skip
 
 
-class PlySplat(NamedTuple):
-    """Contents of a PLY file."""
-
-    splat: SplatParameters
-    rasterize_mode: RasterizeMode | None
-    """Value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
-
-
-def read_ply(path: Path) -> PlySplat:
+def read_ply(path: Path) -> SplatFile:
     """Read a splat. Its properties may be in any order; other properties are ignored.
 
     Peak memory is a little more than one copy of the Gaussians.
@@ -197,7 +203,7 @@ def read_ply(path: Path) -> PlySplat:
     rest = _rest_names(path, {item.name for item in vertex.properties})
     splat = _read_columns(path, vertex.data, rest)
     validate_splat(splat, path)
-    return PlySplat(splat, _mode([*data.comments, *vertex.comments]))
+    return SplatFile(splat, _mode([*data.comments, *vertex.comments]))
 
 
 def _parse_ply(path: Path) -> PlyData:
@@ -327,6 +333,7 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _mode(comments: list[str]) -> RasterizeMode | None:
+    """Return the value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
     for comment in comments:
         key, _, value = comment.partition(":")
         if key.strip().lower() == "splatrendermode":
