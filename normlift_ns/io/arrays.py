@@ -231,11 +231,12 @@ def _check_npy(file: IO[bytes]) -> None:
     except Exception as error:  # a header is a Python literal; its parsers raise any kind of exception
         raise InputError(f"its NPY header cannot be read: {type(error).__name__}") from None
     if dtype.kind not in _NUMERIC_KINDS or dtype.itemsize > 8:
-        raise InputError(f"it holds {'objects' if dtype.hasobject else dtype}; expected integers or floats")
+        kind = "objects" if dtype.hasobject else str(dtype)[:80]
+        raise InputError(f"it holds {kind}; expected integers or floats")
     if len(shape) > 8 or min(shape, default=0) < 0 or math.prod(length or 1 for length in shape) > _MAX_NUMBERS:
-        raise InputError(f"its header has the invalid shape {str(shape)[:80]}")
-    found = -file.tell() + file.seek(0, os.SEEK_END)
-    expected = math.prod(shape) * dtype.itemsize
+        raise InputError("its header has an invalid shape: too many lengths, or lengths that are negative or too large")
+    start, expected = file.tell(), math.prod(shape) * dtype.itemsize
+    found = file.seek(0, os.SEEK_END) - start
     if expected != found:
         lengths = " x ".join(map(str, shape))
         raise InputError(f"{lengths[:80]} {dtype} needs {expected:,} bytes, found {found:,}")
