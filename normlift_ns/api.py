@@ -18,7 +18,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.partition import SINGLE_PROCESS, ProgressCallback
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.data.extra_images import add_stored_images
-from normlift_ns.data.nerfstudio.load import CheckedViews, load_nerfstudio_scene
+from normlift_ns.data.nerfstudio.load import SplitViews, load_nerfstudio_scene
 from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport
@@ -63,7 +63,7 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
 
 
-def _by_nerfstudio(*run: Any) -> tuple[CheckedViews, CheckedViews]:
+def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
     from normlift_ns.nerfstudio_plugin.views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
 
     return nerfstudio_views(*run)

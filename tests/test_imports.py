@@ -13,7 +13,7 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
-    ("options",),
+    ("options", "entry_points"),
     ("io", "kernels"),
     ("core",),
     ("rasterization", "encoders", "segmentation"),
@@ -41,7 +41,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
-    **dict.fromkeys(("errors", "options", "plugin", "scripts"), frozenset()),
+    **dict.fromkeys(("errors", "entry_points", "options", "plugin", "scripts"), frozenset()),
     **dict.fromkeys(("progress",), frozenset({"torch"})),
     **dict.fromkeys(("api", "pipeline"), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},
@@ -65,7 +65,7 @@ FOREIGN = {
     "method_configs": {"nerfstudio"},
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "cli": TENSORS | {"numpy", "PIL", "plyfile", "yaml", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
+    "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/capture.py")

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.splat import SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.errors import InputError
 
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
@@ -290,23 +290,13 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
 
 _RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
 _ADVICE = "give another file with --load-gsplat"
+_GSPLAT_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _UNSUPPORTED = {
     "app_module": "an appearance network (--app_opt), without which its Gaussians have no colors",
 }
 
 
-class GsplatCheckpoint(NamedTuple):
-    """Contents of a gsplat checkpoint."""
-
-    files: tuple[Path, ...]
-    """One file per GPU of the training."""
-    step: int
-    splat: SplatParameters
-    pose_adjust: Float[Tensor, "v 9"] | None
-    """Pose adjustment of each training view: a translation, and a rotation in six numbers."""
-
-
-def read_gsplat_checkpoint(path: Path) -> GsplatCheckpoint:
+def read_gsplat_checkpoint(path: Path) -> SplatFile:
     """Read ckpt_<step>_rank<r>.pt; after training on several GPUs, read the files of all ranks, in order.
 
     Raises:
@@ -331,7 +321,7 @@ def read_gsplat_checkpoint(path: Path) -> GsplatCheckpoint:
     names = splats[0].parameters
     merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
     validate_splat(merged, files[0])
-    return GsplatCheckpoint(files, steps.pop(), merged, loaded[0][2])
+    return SplatFile(merged, step=steps.pop(), pose_adjust=loaded[0][2], by_gsplat=True)
 
 
 def _rank_files(path: Path) -> tuple[Path, ...]:
@@ -360,6 +350,22 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
 def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     """Read the step, the parameters by splatfacto's names, and the pose adjustments."""
     loaded = load_torch_archive(path, "as gsplat's simple_trainer writes them", _ADVICE)
+    splats = _splats(path, loaded)
+    for name in _GSPLAT_NAMES:
+        check_dense_tensor(splats[name], name, path)
+    if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
+        raise InputError(
+            f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
+            "expected (N, 1, 3) and (N,)."
+        )
+    parameters = {name: splats[name] for name in ("means", "quats", "scales")}
+    parameters["opacities"] = splats["opacities"][:, None]
+    parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
+    return validate_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded)
+
+
+def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
+    """Return the tensors in `splats` of a checkpoint, which has those of 3D Gaussians with spherical harmonics."""
     splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
@@ -371,24 +377,14 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
                 f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
                 "trainer's --save_ply and give that with --load-ply."
             )
-    missing = [name for name in ("means", "quats", "scales", "opacities", "sh0", "shN") if name not in splats]
+    missing = [name for name in _GSPLAT_NAMES if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
         raise InputError(
             f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
             f"{', '.join(sorted(map(str, splats)))}. Expected the parameters of 3D Gaussians with spherical harmonics, "
             "as gsplat's simple_trainer writes them."
         )
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        check_dense_tensor(splats[name], name, path)
-    if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
-        raise InputError(
-            f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
-            "expected (N, 1, 3) and (N,)."
-        )
-    parameters = {name: splats[name] for name in ("means", "quats", "scales")}
-    parameters["opacities"] = splats["opacities"][:, None]
-    parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
-    return validate_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded)
+    return splats
 
 
 def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,8 +86,16 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
             images, or an image without its camera.
     """
     as_text = text_first and (model / "cameras.txt").exists()
+    cameras = _check_cameras(_read(model, "cameras", _cameras_text, _cameras_binary, as_text), model)
+    images = _read(model, "images", _images_text, _images_binary, as_text)
+    _check_images(images, cameras, model)
+    return cameras, images
+
+
+def _check_cameras(listed: list[ColmapCamera], model: Path) -> dict[int, ColmapCamera]:
+    """Return the cameras by ID; raise InputError for duplicate IDs and impossible numbers."""
     cameras: dict[int, ColmapCamera] = {}
-    for camera in _read(model, "cameras", _cameras_text, _cameras_binary, as_text):
+    for camera in listed:
         if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
             raise InputError(
                 f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
@@ -99,7 +107,11 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
                 f"below {_MAX_VALUE:g}. {_ADVICE}"
             )
         cameras[camera.camera_id] = camera
-    images = _read(model, "images", _images_text, _images_binary, as_text)
+    return cameras
+
+
+def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera], model: Path) -> None:
+    """Raise InputError unless there are images, with poses, cameras and distinct IDs."""
     for image in images:
         pose = np.array([*image.rotation, *image.translation])
         if not (np.abs(pose) < _MAX_VALUE).all() or not np.any(pose[:4]):
@@ -116,7 +128,6 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
         )
     if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
-    return cameras, images
 
 
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:

@@ -109,6 +109,14 @@ def to_camera(
     return Camera(intrinsics.to(pose.device), pose, width, height)  # nerfstudio keeps intrinsics on the CPU
 
 
+def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 3"]) -> UInt8[Tensor, "h w 3"]:
+    """Return the image with the background, RGB in 0..1, behind its alpha channel if it has one."""
+    if image.shape[2] != 4:
+        return image
+    alpha = image[:, :, 3:].float() / 255
+    return (alpha * image[:, :, :3] + (1 - alpha) * 255 * background).round().to(torch.uint8)
+
+
 class ImageViews:
     """Lazy `Views` of images on disk: indexing reads and undistorts one image.
 
@@ -160,10 +168,8 @@ class ImageViews:
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         frame = self.frames[index % len(self)]
-        image = torch.from_numpy(undistort_image(_read(frame), frame.intrinsics)[0])
-        if image.shape[2] == 4:
-            alpha = image[:, :, 3:].float() / 255
-            image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
+        pixels = torch.from_numpy(undistort_image(_read(frame), frame.intrinsics)[0])
+        image = blend_background(pixels, self._background)
         size = (frame.intrinsics.width, frame.intrinsics.height) if any(frame.intrinsics.distortion) else None
         return View(self.cameras[index], image, _mask(frame), frame.name, size)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,16 @@ from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.cameras import CameraFile, read_camera_file
 from normlift_ns.data.checkpoint import (
     GAUSSIAN_PARAMETERS,
-    GsplatCheckpoint,
     find_checkpoint,
     read_checkpoint,
-    read_gsplat_checkpoint,
 )
 from normlift_ns.data.colmap import read_colmap_points
 from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
 from normlift_ns.data.images import ImageViews, held_out_names
-from normlift_ns.data.splat import PlySplat, SplatParameters, read_ply, splat_from_parameters
+from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.data.transforms import gsplat_normalization, read_json_file, read_transforms, write_transforms
-from normlift_ns.errors import InputError
+from normlift_ns.entry_points import EntryPoints
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import Background, RasterizeMode, SplatOptions
 from normlift_ns.rasterization.rasterize import view_colors
@@ -91,7 +91,7 @@ def open_splat(
 
     Args:
         path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer;
-            the first bytes of the file distinguish the two.
+            the first bytes of the file distinguish the two. Installed packages may add other formats by suffix.
         options: locations of its cameras and images.
         say: function that is called with one sentence per assumption, for example `print`.
     Raises:
@@ -113,64 +113,109 @@ def open_splat(
         )
     path = Path(path).absolute()
     cameras = read_camera_file(options)
-    frames = cameras.frames
-    (splat, mode), checkpoint = _read(path)
-    held_out = cameras.held_out
+    file = _read(path)
+    held_out = _held_out(options, cameras)
+    for text in _assumptions(path, options, file, held_out, cameras):
+        say(text)
+    worlds = _candidate_worlds(file, options, cameras)
+    return _first_aligned(partial(_scene, path, options, cameras, file, held_out), worlds, say)
+
+
+def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
+    """Return the names of the images that the training did not use."""
+    held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.holdout) > 0:
         names = [frame.name for frame in frames]
         held_out = held_out_names(names, test_every=options.test_every, holdout=options.holdout)
     if len(held_out) == len(frames) and options.views == "train":
         raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
-    for text in _assumptions(path, options, mode, held_out, frames, cameras):
-        say(text)
-    worlds = _candidate_worlds(checkpoint, options, cameras)
-
-    def scene_in(world: WorldTransform) -> SplatScene:
-        placed = transform_frames(frames, world)
-        if checkpoint is not None and checkpoint.pose_adjust is not None:
-            placed = _adjust_poses(placed, held_out, checkpoint.pose_adjust, path)
-        background = BACKGROUND_COLORS[options.background]
-        lifted = [frame for frame in placed if options.views == "all" or frame.name not in held_out]
-        rest = [frame for frame in placed if options.views == "train" and frame.name in held_out]
-        step = 0 if checkpoint is None else checkpoint.step
-        train = ImageViews(lifted, background)
-        return SplatScene(
-            splat,
-            train,
-            ImageViews(rest, background),
-            cameras.folder.name or "splat",
-            path,
-            step,
-            Path("outputs").absolute(),
-            cameras.base,
-            {
-                "source_splat": str(path),
-                "source_cameras": str(cameras.source),
-                "source_step": step,
-                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
-            },
-            options.rasterize_mode or mode or "classic",
-            options.background,
-            train.check_files(),
-        )
-
-    return _first_aligned(scene_in, worlds, say)
+    return held_out
 
 
-def _read(path: Path) -> tuple[PlySplat, GsplatCheckpoint | None]:
-    """Read the splat, and the checkpoint if the file is one."""
-    if _is_checkpoint(path):
-        checkpoint = read_gsplat_checkpoint(path)
-        return PlySplat(checkpoint.splat, None), checkpoint
-    return read_ply(path), None
+def _scene(
+    path: Path,
+    options: SplatOptions,
+    cameras: CameraFile,
+    file: SplatFile,
+    held_out: frozenset[str],
+    world: WorldTransform,
+) -> SplatScene:
+    """Return the scene with its cameras mapped to a world."""
+    placed = transform_frames(cameras.frames, world)
+    if file.pose_adjust is not None:
+        placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
+    background = BACKGROUND_COLORS[options.background]
+    train = ImageViews([x for x in placed if options.views == "all" or x.name not in held_out], background)
+    rest = ImageViews([x for x in placed if options.views == "train" and x.name in held_out], background)
+    identity = {
+        "source_splat": str(path),
+        "source_cameras": str(cameras.source),
+        "source_step": file.step,
+        "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+    }
+    return SplatScene(
+        file.splat,
+        train,
+        rest,
+        cameras.folder.name or "splat",
+        path,
+        file.step,
+        Path("outputs").absolute(),
+        cameras.base,
+        identity,
+        options.rasterize_mode or file.rasterize_mode or "classic",
+        options.background,
+        train.check_files(),
+    )
 
 
-def _is_checkpoint(path: Path) -> bool:
-    """Return whether a file is a checkpoint: torch.save writes ZIP archives. For a missing file, the suffix decides."""
+SPLAT_READERS = EntryPoints(
+    "normlift_ns.scenes",
+    {
+        "ply": "normlift_ns.data.splat:read_ply",
+        "pt": "normlift_ns.data.checkpoint:read_gsplat_checkpoint",
+    },
+    what="reader of the splat format",
+    expected=Callable,
+    remedy="convert the splat to PLY",
+)
+"""Readers of splat files by file name suffix, functions from a path to a `SplatFile`. Other packages add theirs with
+entry points of this group."""
+
+
+def _read(path: Path) -> SplatFile:
+    """Read a splat by the reader of its format.
+
+    Raises:
+        FileNotFoundError, ValueError: If the file is missing or not a splat, or the reader of another package fails.
+    """
+    name = _format(path)
+    read = SPLAT_READERS.load(name)
+    if name in SPLAT_READERS.built_in:
+        return read(path)
+    try:
+        file = read(path)
+    except (InputError, OSError):
+        raise
+    except Exception as error:  # readers of other packages may raise anything
+        reason = summarize_error(error)
+        raise InputError(f"{path} cannot be read by the installed reader of the format {name!r} ({reason})") from error
+    if not isinstance(file, SplatFile):
+        kind = type(file).__name__
+        raise InputError(f"the installed reader of the format {name!r} returned {kind}, expected a SplatFile")
+    validate_splat(file.splat, path)
+    return file
+
+
+def _format(path: Path) -> str:
+    """Return the name of a file's format: by its suffix, or by its first bytes for the built-in formats."""
+    name = path.suffix.removeprefix(".")
+    if name != "ply" and name in SPLAT_READERS.names():
+        return name
     if not path.is_file():
-        return path.suffix == ".pt"
+        return "ply"
     with path.open("rb") as file:
-        return file.read(2) == b"PK" or path.suffix == ".pt"
+        return "pt" if file.read(2) == b"PK" else "ply"  # torch.save writes ZIP archives
 
 
 def _first_aligned(
@@ -195,9 +240,7 @@ _TURNED = "The axes of gsplat's normalization point the other way; rotated by ha
 _NORMALIZED = "The splat does not fit its images in the world of its cameras, but it does in gsplat's normalized world."
 
 
-def _candidate_worlds(
-    checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: CameraFile
-) -> list[tuple[str, WorldTransform]]:
+def _candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[tuple[str, WorldTransform]]:
     """Return possible maps from the cameras' world to the splat's, each with a message for its use.
 
     There are several if only the images can tell. A PLY file may come from gsplat's trainer too, so its normalized
@@ -206,15 +249,15 @@ def _candidate_worlds(
     if cameras.to_splat is not None:
         return [("", cameras.to_splat)]
     same = [("", WorldTransform(np.eye(4)[:3], 1.0))]
-    if not options.gsplat_normalize or (checkpoint is None and options.colmap is None):
+    if not options.gsplat_normalize or not (file.by_gsplat or options.colmap):
         return same
     try:
         first, *turned = _normalizations(options, cameras)
     except (ValueError, FileNotFoundError):
-        if checkpoint is None:
+        if not file.by_gsplat:
             return same
         raise
-    worlds = [("", first)] if checkpoint is not None else [*same, (_NORMALIZED, first)]
+    worlds = [("", first)] if file.by_gsplat else [*same, (_NORMALIZED, first)]
     return [*worlds, *((_TURNED, world) for world in turned)]
 
 
@@ -272,15 +315,10 @@ def _adjust_poses(
 
 
 def _assumptions(
-    path: Path,
-    options: SplatOptions,
-    mode: RasterizeMode | None,
-    held_out: frozenset[str],
-    frames: Sequence[Frame],
-    cameras: CameraFile,
+    path: Path, options: SplatOptions, file: SplatFile, held_out: frozenset[str], cameras: CameraFile
 ) -> list[str]:
     """Return messages about settings that the files do not specify."""
-    texts = []
+    texts, mode, frames = [], file.rasterize_mode, cameras.frames
     if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
         texts.append(
             f"{path.name} has SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} is used instead."

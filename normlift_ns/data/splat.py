@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
@@ -150,6 +150,20 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
     return SplatParameters(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})
 
 
+class SplatFile(NamedTuple):
+    """Contents of a file of a trained splat."""
+
+    splat: SplatParameters
+    rasterize_mode: RasterizeMode | None = None
+    """Rasterize mode of the training; None if the file does not name it."""
+    step: int = 0
+    """Training step; 0 if unknown."""
+    pose_adjust: Float[Tensor, "v 9"] | None = None
+    """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
+    by_gsplat: bool = False
+    """Whether gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
+
+
 # Splats in PLY files written by Inria's trainer, gsplat, ns-export or this package.
 
 
@@ -168,15 +182,7 @@ _MODES: dict[str, RasterizeMode] = {
 }  # fmt: skip
 
 
-class PlySplat(NamedTuple):
-    """Contents of a PLY file."""
-
-    splat: SplatParameters
-    rasterize_mode: RasterizeMode | None
-    """Value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
-
-
-def read_ply(path: Path) -> PlySplat:
+def read_ply(path: Path) -> SplatFile:
     """Read a splat. Its properties may be in any order; other properties are ignored.
 
     Peak memory is a little more than one copy of the Gaussians.
@@ -189,8 +195,21 @@ def read_ply(path: Path) -> PlySplat:
     if not path.is_file():
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
     check_ply_header(path)
+    data = _parse_ply(path)
+    vertex = next((element for element in data.elements if element.name == "vertex"), None)
+    if vertex is None or vertex.count == 0:
+        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+    _check_properties(path, vertex)
+    rest = _rest_names(path, {item.name for item in vertex.properties})
+    splat = _read_columns(path, vertex.data, rest)
+    validate_splat(splat, path)
+    return SplatFile(splat, _mode([*data.comments, *vertex.comments]))
+
+
+def _parse_ply(path: Path) -> PlyData:
+    """Parse the header, and map the binary data."""
     try:
-        data = PlyData.read(str(path), mmap="c")
+        return PlyData.read(str(path), mmap="c")
     except UnicodeDecodeError as error:
         raise InputError(
             f"The header of {path} has non-ASCII characters, perhaps in a comment ({error}). Remove them, or rewrite "
@@ -206,10 +225,10 @@ def read_ply(path: Path) -> PlySplat:
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
             "splat-transform converts other formats, for example: splat-transform scene.sog scene.ply"
         ) from error
-    elements = {element.name: element for element in data.elements}
-    vertex = elements.get("vertex")
-    if vertex is None or vertex.count == 0:
-        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+
+
+def _check_properties(path: Path, vertex: PlyElement) -> None:
+    """Raise InputError unless the vertices have the properties of a splat, as plain numbers."""
     names = {item.name for item in vertex.properties}
     if "packed_position" in names:
         raise InputError(
@@ -225,9 +244,6 @@ def read_ply(path: Path) -> PlySplat:
     lists = [item.name for item in vertex.properties if item.name in _REQUIRED and hasattr(item, "len_dtype")]
     if lists:
         raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
-    splat = _read_columns(path, vertex.data, _rest_names(path, names))
-    validate_splat(splat, path)
-    return PlySplat(splat, _mode([*data.comments, *vertex.comments]))
 
 
 def check_ply_header(path: Path) -> None:
@@ -317,6 +333,7 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _mode(comments: list[str]) -> RasterizeMode | None:
+    """Return the value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
     for comment in comments:
         key, _, value = comment.partition(":")
         if key.strip().lower() == "splatrendermode":

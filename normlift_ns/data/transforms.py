@@ -23,6 +23,7 @@ from normlift_ns.io.atomic import write_text_file
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
 _MAX_VALUE = 1e30
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MAX_JSON_BYTES = 2**27
 """Largest JSON file that is read; ten thousand frames take a tenth of that."""
 
@@ -128,21 +129,23 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
 
 def _check_numbers(entry: CameraEntry, source: str) -> None:
     """Raise if a size is not a whole number in range, a focal length not positive, or a number beyond float32."""
-    for name in ("w", "h"):
-        side = getattr(entry, name)
-        if side is not None and not (0 < side <= _MAX_SIDE and float(side).is_integer()):
+    for name, side in _given(entry, "w", "h"):
+        if not (0 < side <= _MAX_SIDE and float(side).is_integer()):
             raise InputError(f"{source}: {name} is {side:g}, expected a whole number of pixels, 1 to {_MAX_SIDE:,}.")
     if (entry.w or 1) * (entry.h or 1) > _MAX_PIXELS:
         raise InputError(f"{source}: w and h are {entry.w:g} and {entry.h:g}, more than {_MAX_PIXELS:,} pixels in all.")
-    numbers = {name: getattr(entry, name) for name in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")}
-    numbers |= {f"distortion_params[{i}]": value for i, value in enumerate(entry.distortion_params or ())}
-    for name in ("fl_x", "fl_y"):
-        focal = getattr(entry, name)
-        if focal is not None and not 0 < focal < _MAX_VALUE:
+    for name, focal in _given(entry, "fl_x", "fl_y"):
+        if not 0 < focal < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
-    for name, value in numbers.items():
-        if value is not None and not abs(value) < _MAX_VALUE:
+    parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
+    for name, value in (*_given(entry, "cx", "cy", *_DISTORTION), *parameters):
+        if not abs(value) < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {value:g}, expected a number that float32 can hold.")
+
+
+def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:
+    """Return the parameters of these names that an entry has."""
+    return [(name, value) for name in names if (value := getattr(entry, name)) is not None]
 
 
 # Cameras in transforms.json, the format of nerfstudio, instant-ngp and Blender's synthetic scenes.
@@ -276,14 +279,11 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
         )
     size = (value("w"), value("h"))
     width, height = read_image_header(file).size if None in size else size
-    fx, fy = value("fl_x"), value("fl_y")
-    for angle in (value("camera_angle_x"), value("camera_angle_y")):
+    angles = value("camera_angle_x"), value("camera_angle_y")
+    for angle in angles:
         if angle is not None and not 0 < angle < math.pi:
             raise InputError(f"{path}: a camera_angle is {angle}, expected radians between 0 and pi.")
-    if fx is None and value("camera_angle_x") is not None:
-        fx = 0.5 * width / math.tan(0.5 * value("camera_angle_x"))
-    if fy is None and value("camera_angle_y") is not None:
-        fy = 0.5 * height / math.tan(0.5 * value("camera_angle_y"))
+    fx, fy = _focal(value("fl_x"), angles[0], width), _focal(value("fl_y"), angles[1], height)
     if fx is None:
         raise InputError(f"{path} has neither fl_x nor camera_angle_x for {frame.file_path}. Expected a focal length.")
     cx, cy = value("cx"), value("cy")
@@ -298,11 +298,15 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
     )
 
 
+def _focal(focal: float | None, angle: float | None, side: float) -> float | None:
+    """Return a focal length in pixels: the given one, or that of an angle of view in radians."""
+    return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
+
+
 def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, ...]:
     """Return k1, k2, k3, p1, p2: the values for all frames if there are any, otherwise the frame's own."""
-    names = ("k1", "k2", "k3", "k4", "p1", "p2")
-    source = entries if any(getattr(entries, name) is not None for name in (*names, "distortion_params")) else frame
-    values = [getattr(source, name) or 0.0 for name in names]
+    source = entries if len(_given(entries, *_DISTORTION, "distortion_params")) > 0 else frame
+    values = [getattr(source, name) or 0.0 for name in _DISTORTION]
     if source.distortion_params is not None:
         values = [*source.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values

@@ -18,9 +18,9 @@ from torch import Tensor
 from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, TextEncoder
 from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.encoders.prompts import UNIT_TOLERANCE, check_prompts
-from normlift_ns.encoders.registry import absolute_paths, encoder_kind, is_built_in, summarize_error
+from normlift_ns.encoders.registry import absolute_paths, encoder_kind, is_built_in
 from normlift_ns.encoders.text_files import TextEmbeddingFile
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeatureKind, RegionKind, SourceOptions
 from normlift_ns.segmentation.checkpoint import find_local_sam
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels

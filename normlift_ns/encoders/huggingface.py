@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from normlift_ns.encoders import registry
-from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.errors import InputError, summarize_error, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
@@ -484,6 +484,6 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
     return FileNotFoundError(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded "
-        f"({registry.summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
+        f"({summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
         "that needs no weights: --encoder colour"
     )

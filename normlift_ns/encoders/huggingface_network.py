@@ -38,9 +38,8 @@ from normlift_ns.encoders.huggingface import (
     read_model_folder,
 )
 from normlift_ns.encoders.prompts import check_prompts
-from normlift_ns.encoders.registry import summarize_error
 from normlift_ns.encoders.text_files import check_template, prompt_templates
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import CropFill
 

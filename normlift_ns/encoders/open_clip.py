@@ -14,8 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from normlift_ns.encoders.registry import check_server, find_in_hub_cache, summarize_error
-from normlift_ns.errors import InputError
+from normlift_ns.encoders.registry import check_server, find_in_hub_cache
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.options import DEFAULT_MODEL
 
 _PARTIAL_PACKAGE = "_normlift_ns_open_clip"

@@ -26,9 +26,9 @@ from normlift_ns.encoders.open_clip import (
     open_clip_model_config,
 )
 from normlift_ns.encoders.prompts import check_prompts
-from normlift_ns.encoders.registry import THIRD_PARTY_ERRORS, find_in_hub_cache, summarize_error
+from normlift_ns.encoders.registry import THIRD_PARTY_ERRORS, find_in_hub_cache
 from normlift_ns.encoders.text_files import check_template, prompt_templates
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
 

@@ -1,4 +1,4 @@
-"""Shared helpers for weight files: local and hub lookups, and one-line summaries of third-party errors.
+"""Shared helpers for weight files: local and hub lookups.
 
 This module imports nothing heavy.
 """
@@ -10,21 +10,19 @@ import importlib
 import os
 import pickle
 import struct
-import sys
 import urllib.error
 import urllib.request
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import EntryPoint, distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from safetensors import SafetensorError
 
+from normlift_ns.entry_points import PACKAGE_PREFIX, EntryPoints
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
 
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_MAX_LENGTH = 300
 _CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
 """Names of the weight files of OpenCLIP models in hub repositories."""
 _SAM_FILES = ("model.safetensors", "pytorch_model.bin")
@@ -136,14 +133,6 @@ def _argument(call: ast.AST, name: str) -> ast.expr:
     return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
 
 
-def summarize_error(error: BaseException) -> str:
-    """Return the beginning of a third-party error message, for use in an error message."""
-    lines = [line.strip() for line in str(error).strip().splitlines()]
-    lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
-    text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
-    return text if len(text) <= _MAX_LENGTH else text[:_MAX_LENGTH] + " ..."
-
-
 def check_server(address: str) -> None:
     """Raise OSError if a server does not respond; the hub's own client would retry for most of a minute."""
     try:
@@ -182,7 +171,6 @@ def is_local_path(name: str, parts: int) -> bool:
 
 ENTRY_POINT_GROUP = "normlift_ns.encoders"
 """Entry point group of encoders."""
-_PACKAGE_PREFIX = "normlift_ns."
 BUILT_IN_ENCODERS = {
     "open_clip": "normlift_ns.encoders.builtin:OPEN_CLIP",
     "siglip": "normlift_ns.encoders.builtin:SIGLIP",
@@ -252,9 +240,18 @@ class EncoderKind:
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
 
+_ENCODERS = EntryPoints(
+    ENTRY_POINT_GROUP,
+    BUILT_IN_ENCODERS,
+    what="encoder",
+    expected=EncoderKind,
+    remedy="use another encoder, such as --encoder open_clip",
+)
+
+
 def encoder_names() -> list[str]:
     """Return the names of all registered encoders in alphabetical order, including those that fail to load."""
-    return sorted({point.name for point in _points()})
+    return _ENCODERS.names()
 
 
 def encoder_kind(name: str) -> EncoderKind:
@@ -263,28 +260,11 @@ def encoder_kind(name: str) -> EncoderKind:
     Raises:
         InputError: If the name is unknown, two packages claim it, or the encoder of another package cannot be loaded.
     """
-    points = {point.value: point for point in _points() if point.name == name}
-    built_in = [value for value in points if value.startswith(_PACKAGE_PREFIX)]
-    if len(points) == 0:
-        known = ", ".join(encoder_names()) or "none: normlift_ns is not installed (pip install -e .)"
+    names = encoder_names()
+    if name not in names:
+        known = ", ".join(names) or "none: normlift_ns is not installed (pip install -e .)"
         raise InputError(f"unknown encoder {truncate_text(name)!r}; --encoder is one of {known}")
-    if len(points) > 1 and len(built_in) == 0:
-        packages = " and ".join(f"{_package(point)} ({value})" for value, point in points.items())
-        raise InputError(f"encoder {name!r} is claimed by {packages}; uninstall one of the two")
-    point = points[built_in[0] if len(built_in) > 0 else next(iter(points))]
-    try:
-        kind = point.load()
-    except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
-        raise InputError(
-            f"encoder {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair or uninstall "
-            "that package, or use another encoder, such as --encoder open_clip"
-        ) from error
-    if not isinstance(kind, EncoderKind):
-        raise InputError(
-            f"encoder {name!r} of {_package(point)} is invalid: {point.value} is of type {type(kind).__name__}, "
-            "expected an EncoderKind; use another encoder, such as --encoder open_clip"
-        )
-    return kind
+    return _ENCODERS.load(name)
 
 
 def find_encoder_kind(name: object) -> EncoderKind | None:
@@ -297,7 +277,7 @@ def find_encoder_kind(name: object) -> EncoderKind | None:
 
 def is_built_in(kind: EncoderKind) -> bool:
     """Return whether an encoder kind is built in."""
-    return kind.make.__module__.startswith(_PACKAGE_PREFIX)
+    return kind.make.__module__.startswith(PACKAGE_PREFIX)
 
 
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
@@ -305,34 +285,3 @@ def absolute_paths(options: SourceOptions) -> dict[str, str]:
     kind = find_encoder_kind(options.encoder)
     values = {name: getattr(options, name) for name in (() if kind is None else kind.paths)}
     return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
-
-
-def _points() -> Sequence[EntryPoint]:
-    """Return the entry points of the group. Packages with damaged metadata are skipped."""
-    return _points_on(tuple(sys.path))
-
-
-@cache
-def _points_on(path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    """Cache the entry points per `sys.path`: a search through hundreds of packages takes 20 ms, and a command needs it
-    often."""
-    return tuple(_discover(path))
-
-
-def _discover(path: Sequence[str]) -> Iterator[EntryPoint]:
-    """Yield the built-in entry points, then those of the packages on a path."""
-    names: set[str] = set()
-    yield from [EntryPoint(name, value, ENTRY_POINT_GROUP) for name, value in BUILT_IN_ENCODERS.items()]
-    for package in distributions(path=list(path)):
-        try:
-            text = package.read_text("entry_points.txt")
-            if text is None or ENTRY_POINT_GROUP not in text or package.name in names:
-                continue
-            names.add(package.name)  # the first on the path is the one that Python imports
-            yield from [point for point in package.entry_points if point.group == ENTRY_POINT_GROUP]
-        except Exception:  # reading third-party metadata may raise anything
-            continue
-
-
-def _package(point: EntryPoint) -> str:
-    return f"package {point.dist.name}" if point.dist is not None else "an unnamed package"

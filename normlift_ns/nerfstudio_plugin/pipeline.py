@@ -16,8 +16,10 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.data.checkpoint import numpy_scalar_globals
-from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
-from normlift_ns.data.nerfstudio.load import image_name, load_nerfstudio_scene
+from normlift_ns.data.nerfstudio.config import check_components, check_lift_options
+from normlift_ns.data.nerfstudio.config_file import dataset_in_config
+from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
+from normlift_ns.data.transforms import relative_name
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.errors import describe_error
@@ -75,7 +77,7 @@ class NormLiftPipeline(VanillaPipeline):
             source = feature_source_of(trainer.config)
             folder = dataset_folder(trainer.config)
             files = self.datamanager.train_dataset.image_filenames  # type: ignore[union-attr]
-            source.available([image_name(file, folder) for file in files])
+            source.available([relative_name(file, folder) for file in files])
             if len(self.config.queries) > 0:
                 source.text(self.config.queries)
             after = [TrainingCallbackLocation.AFTER_TRAIN]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +15,10 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.scene import View
-from normlift_ns.data.frames import check_mask, image_warnings, read_image_header
-from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio import config as plain
 from normlift_ns.data.nerfstudio.config import dump_config
-from normlift_ns.data.nerfstudio.load import image_name
+from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.data.nerfstudio.load import SplitViews, camera_type_error
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
@@ -53,7 +48,7 @@ def relocate_config(config: TrainerConfig, config_path: Path, data: Path | None 
     Raises:
         FileNotFoundError: as `locate`.
     """
-    location = plain.locate_run(config, config_path, data)
+    location = locate_run(config, config_path, data)
     config = plain.with_absolute_paths(config, location)
     model: Any = config.pipeline.model
     if isinstance(model, NormLiftModelConfig) and model.semantics is not None:
@@ -64,22 +59,15 @@ def relocate_config(config: TrainerConfig, config_path: Path, data: Path | None 
 # Images and cameras of a run as splatfacto trained on them, without lens distortion.
 
 
-_SUPPORTED_MODES = {"RGB", "RGBA", "L", "CMYK"}
-"""Pillow image modes that nerfstudio can train on; CMYK images get wrong colors."""
 _SUPPORTED_CAMERAS = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
 
 
-class DatasetViews:
-    """`Views` of one split of a dataset, in its order. Each image is read and undistorted on access.
-
-    Images, masks and intrinsics equal those of `FullImageDatamanager.cached_train`, which holds all of them in memory
-    (and pins that memory, which needs CUDA).
+class DatasetViews(SplitViews):
+    """Views of a split that nerfstudio reads and undistorts.
 
     Args:
         dataset: a split as made by nerfstudio's datamanager; it is not changed.
-        folder: folder of the dataset, to which `names` are relative.
-        poses: camera-to-world poses [V, 3, 4] in OpenGL convention, of the dataset or as optimized in training.
-        background: RGB in 0..1 behind images with an alpha channel.
+        folder, poses, background: as in `SplitViews`.
     """
 
     def __init__(
@@ -89,119 +77,36 @@ class DatasetViews:
         poses: Float[Tensor, "v 3 4"],
         background: Float[Tensor, " 3"],
     ) -> None:
+        files, masks = dataset.image_filenames, dataset._dataparser_outputs.mask_filenames
+        sides = torch.stack([dataset.cameras.width, dataset.cameras.height])
+        sizes = sides.reshape(2, -1).T.tolist() if len(files) > 0 else []
+        super().__init__(files, masks, sizes, folder, poses, background, dataset.scale_factor)
         self._dataset = dataset
-        self._poses = poses
-        self._background = background
-        self.files = list(dataset.image_filenames)
-        """Absolute paths of the images."""
-        self.names = [image_name(file, folder) for file in self.files]
-        """Paths of the images relative to the dataset, with forward slashes."""
+        self._pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}
+        """Undistorted cameras by their parameters, which most images share."""
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __iter__(self) -> Iterator[View]:
-        return (self[i] for i in range(len(self)))
-
-    def __getitem__(self, index: int) -> View:
-        """Read one image with its mask and camera.
-
-        Raises:
-            FileNotFoundError, ValueError: a file is missing, cannot be read, or differs in size from its camera; the
-                message names it.
-        """
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"view {index} of {len(self)}")
-        index %= len(self)
-        data = self._read(index)
-        distorted = data["image"]
-        image, _, mask = _undistort(self._dataset.cameras, index, data)
-        original = None if image is distorted else (distorted.shape[1], distorted.shape[0])
-        if image.shape[2] == 4:
-            alpha = image[:, :, 3:].float() / 255
-            image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
-        return View(self.cameras[index], image, None if mask is None else mask[:, :, 0], self.names[index], original)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """Cameras of all undistorted images; no image is read."""
-        return self._cameras
-
-    @cached_property
-    def _cameras(self) -> list[Camera]:
-        pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}  # images of one camera share an entry
-        return [self._camera(i, pinholes) for i in range(len(self))]
-
-    def _camera(self, index: int, pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]]) -> Camera:
+    def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
         camera = self._dataset.cameras[index].reshape(())
         parameters = (camera.camera_type, camera.width, camera.height, camera.get_intrinsics_matrices())
         key = tuple(
             float(x) for part in (*parameters, camera.distortion_params) if part is not None for x in part.flatten()
         )
-        try:
-            if key not in pinholes:
-                pinholes[key] = self._pinhole(index)
-            return to_camera(self._poses[index], *pinholes[key])
-        except InputError as error:
-            raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
+        if key not in self._pinholes:
+            if int(camera.camera_type) not in _SUPPORTED_CAMERAS:
+                raise InputError(camera_type_error(self.files[index], CameraType(int(camera.camera_type)).name))
+            blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
+            image, intrinsics, _ = _undistort(self._dataset.cameras, index, {"image": blank})
+            self._pinholes[key] = intrinsics, image.shape[1], image.shape[0]
+        return self._pinholes[key]
 
-    def _pinhole(self, index: int) -> tuple[Tensor, int, int]:
-        """Return intrinsics, width and height of an image without distortion."""
-        camera = self._dataset.cameras[index].reshape(())
-        if int(camera.camera_type) not in _SUPPORTED_CAMERAS:
-            raise InputError(
-                f"{self.files[index]} was taken with a {CameraType(int(camera.camera_type)).name} camera; splatfacto "
-                "supports only perspective and fisheye cameras."
-            )
-        blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
-        image, intrinsics, _ = _undistort(self._dataset.cameras, index, {"image": blank})
-        return intrinsics, image.shape[1], image.shape[0]
+    def _load(self, index: int) -> tuple[UInt8[Tensor, "h w c"], Bool[Tensor, "h w 1"] | None]:
+        data = self._dataset.get_data(index, image_type="uint8")
+        return data["image"], data.get("mask")
 
-    def check_files(self) -> tuple[str, ...]:
-        """Check the file headers of all images and masks; return warnings as whole sentences.
-
-        Raises:
-            FileNotFoundError, ValueError: an image or mask is missing, is not a valid image, has pixel values that
-                nerfstudio misreads, or differs in size from its camera or image; the message names it.
-        """
-        heads = [read_image_header(file) for file in self.files]
-        masks, scale = self._dataset._dataparser_outputs.mask_filenames, self._dataset.scale_factor
-        cameras = self._dataset.cameras
-        sizes = torch.stack([cameras.width, cameras.height]).reshape(2, -1).T.tolist() if len(self) > 0 else []
-        for index, (file, head) in enumerate(zip(self.files, heads)):
-            if head.mode not in _SUPPORTED_MODES:
-                raise InputError(
-                    f"{file} has the pixel format {head.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
-                    "RGBA or grayscale; convert the images, and train again."
-                )
-            size = head.size if scale == 1 else tuple(int(side * scale) for side in head.size)
-            self._check_size(index, size, sizes[index])
-            if masks is not None:
-                check_mask(masks[index], file, head.size)
-        return image_warnings(self.files, heads)
-
-    def _check_size(self, index: int, size: Sequence[int], expected: Sequence[int]) -> None:
-        if tuple(size) != tuple(expected):
-            raise InputError(
-                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
-                f"{expected[1]} (width x height). Use the images that the run was trained with."
-            )
-
-    def _read(self, index: int) -> dict[str, Any]:
-        file, camera = self.files[index], self._dataset.cameras[index]
-        try:
-            data = self._dataset.get_data(index, image_type="uint8")
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"{error.filename} is missing, but the dataset lists it. Put it back, or give the path of the dataset "
-                "with --data."
-            ) from error
-        except Exception as error:  # Pillow's readers and nerfstudio's checks may raise anything
-            raise InputError(
-                f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
-            ) from error
-        self._check_size(index, data["image"].shape[1::-1], (int(camera.width), int(camera.height)))
-        return data
+    def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
+        data = {"image": image} if mask is None else {"image": image, "mask": mask}
+        pixels, _, values = _undistort(self._dataset.cameras, index, data)
+        return pixels, None if values is None else values[:, :, 0], pixels is not image
 
 
 def _undistort(

@@ -19,7 +19,6 @@ def test_one_file_and_its_ranks_are_read_alike(tmp_path: Path) -> None:
         write_gsplat(tmp_path / f"ckpt_29999_rank{rank}.pt", rows_of(splat, rows))
     write_gsplat(tmp_path / "ckpt_6999_rank0.pt", random_splat(5), step=6999)
     together = read_gsplat_checkpoint(tmp_path / "ckpt_29999_rank1.pt")
-    assert [file.name for file in together.files] == [f"ckpt_29999_rank{r}.pt" for r in range(12)]
     assert together.step == alone.step == 29999
     for name, value in splat.parameters.items():
         assert torch.equal(alone.splat.parameters[name], value)

@@ -43,7 +43,8 @@ from tests.scripts.conftest import SMALL, run_entry, said, wait_for
 STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 PATIENCE = 1.5
 ROOT = Path(__file__).parents[2]
-CONFIG = """experiment_name: {}
+CONFIG = """!!python/object:nerfstudio.engine.trainer.TrainerConfig
+experiment_name: {}
 method_name: splatfacto
 timestamp: run
 output_dir: !!python/object/apply:pathlib.PosixPath

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -25,10 +24,16 @@ from normlift_ns.data.nerfstudio.config_classes import (
     TrainerConfig,
     intern_target,
 )
+from normlift_ns.data.nerfstudio.config_file import (
+    OBJECT_TAG,
+    RunLocation,
+    compose_config,
+    config_string,
+    describe_yaml_error,
+)
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 
-OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"
 
 
@@ -228,52 +233,80 @@ def _format(value: Any) -> str:
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
     """Yield values that violate their type hints: field name, value, and what was expected."""
-    origin, parts = get_origin(hint), get_args(hint)
     if depth > _MAX_DEPTH:
         yield name, value, "no more than a few levels"
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
-    elif origin in (Union, types.UnionType):
-        classes = [part for part in parts if is_dataclass(part) and type(value) is part]
-        errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
-        if all(errors):
-            yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
-    elif origin is Literal:
-        if not any(type(value) is type(part) and value == part for part in parts):
-            yield name, value, " or ".join(map(repr, parts))
+    elif get_origin(hint) in _GENERIC_CHECKS:
+        yield from _GENERIC_CHECKS[get_origin(hint)](value, hint, name, depth)
     elif is_dataclass(hint):
-        if not isinstance(value, hint):  # type: ignore[arg-type]
-            yield name, value, _describe(hint)
-            return
-        hints = get_type_hints(type(value))
-        for field in fields(value):
-            if field.name not in _UNCHECKED:
-                full_name = f"{name}.{field.name}" if name else field.name
-                yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
-    elif origin is tuple:
-        if not isinstance(value, tuple | list) or (parts[-1] is not Ellipsis and len(value) != len(parts)):
-            yield name, value, _describe(hint)
-        else:
-            item_hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-            for i, (item, item_hint) in enumerate(zip(value, item_hints)):
-                yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
-    elif origin is dict:
-        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-            yield name, value, _describe(hint)
-        else:
-            for key, item in value.items():
-                yield from _type_errors(item, parts[1], f"{name}.{key[:40]}", depth + 1)
-    elif hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e300:
-            yield name, value, "a finite number"
-    elif hint is int:
-        if type(value) is not int or abs(value) > _MAX_INT:
-            yield name, value, "a whole number"
-    elif hint is str or hint is Path:
-        if not isinstance(value, hint) or "\0" in str(value):
-            yield name, value, "text" if hint is str else "a path"
+        yield from _dataclass_errors(value, hint, name, depth)
+    elif hint in _SCALARS:
+        is_valid, expected = _SCALARS[hint]
+        if not is_valid(value):
+            yield name, value, expected
     elif isinstance(hint, type) and not isinstance(value, hint):
         yield name, value, _describe(hint)
+
+
+def _union_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    classes = [part for part in parts if is_dataclass(part) and type(value) is part]
+    errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
+    if all(errors):
+        yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
+
+
+def _literal_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    if not any(type(value) is type(part) and value == part for part in parts):
+        yield name, value, " or ".join(map(repr, parts))
+
+
+def _tuple_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    parts = get_args(hint)
+    is_open = parts[-1] is Ellipsis
+    if not isinstance(value, tuple | list) or not (is_open or len(value) == len(parts)):
+        yield name, value, _describe(hint)
+        return
+    for i, (item, item_hint) in enumerate(zip(value, parts[:1] * len(value) if is_open else parts)):
+        yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
+
+
+def _dict_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        yield name, value, _describe(hint)
+        return
+    for key, item in value.items():
+        yield from _type_errors(item, get_args(hint)[1], f"{name}.{key[:40]}", depth + 1)
+
+
+def _dataclass_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    if not isinstance(value, hint):
+        yield name, value, _describe(hint)
+        return
+    hints = get_type_hints(type(value))
+    for field in fields(value):
+        if field.name not in _UNCHECKED:
+            full_name = f"{name}.{field.name}" if name else field.name
+            yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
+
+
+_GENERIC_CHECKS: dict[Any, Callable[[Any, Any, str, int], Iterator[tuple[str, Any, str]]]] = {
+    Union: _union_errors,
+    types.UnionType: _union_errors,
+    Literal: _literal_errors,
+    tuple: _tuple_errors,
+    dict: _dict_errors,
+}
+"""Checks of values by the origin of their type hint."""
+_SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    float: (lambda x: type(x) is not bool and isinstance(x, int | float) and abs(x) <= 1e300, "a finite number"),
+    int: (lambda x: type(x) is int and abs(x) <= _MAX_INT, "a whole number"),
+    str: (lambda x: isinstance(x, str) and "\0" not in x, "text"),
+    Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
+}
+"""Checks of values by their type hint, each with what it expects."""
 
 
 def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
@@ -348,16 +381,13 @@ def check_lift_options(options: LiftOptions, name: str) -> None:
         raise InputError(f"{name}: {error}. {_REMEDY}") from error
 
 
-# Safe reading of a nerfstudio run's config.yml, and location of its files from any working directory.
+# Safe reading of a nerfstudio run's config.yml, and changes of its paths.
 
 
 SUPPORTED_METHODS = (
     *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one comes from nerfstudio's main branch
     *("normlift", "normlift-lerf-ovs", "normlift-scannet"),
 )
-_MAX_BYTES = 2**18
-"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
-_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
 
 
 def read_trainer_config(path: Path) -> TrainerConfig:
@@ -368,27 +398,8 @@ def read_trainer_config(path: Path) -> TrainerConfig:
         ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
             other than nerfstudio's configuration classes, or invalid values.
     """
-    if not path.is_file():
-        hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""
-        raise FileNotFoundError(
-            f"No config at {path}{hint}. Expected the config.yml that ns-train wrote, "
-            "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
-        )
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError(
-            f"{path} is not a nerfstudio config: it has {path.stat().st_size:,} bytes, more than {_MAX_BYTES:,}. "
-            f"{_EXPECTED}"
-        )
-    try:
-        loader = ConfigLoader(path.read_text("utf8"))
-        root = loader.get_single_node()
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f"{path} is not a nerfstudio config: it is not valid YAML ({_brief(error)}). {_EXPECTED}"
-        ) from error
-    method = _method_name(root)
-    if method is None:
-        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
+    root = compose_config(path)
+    method = config_string(root, "method_name")
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
@@ -396,119 +407,15 @@ def read_trainer_config(path: Path) -> TrainerConfig:
             "export them with ns-export gaussian-splat and lift that file with --load-ply"
         )
     try:
-        config = loader.construct_document(root)
+        config = ConfigLoader("").construct_document(root)
     except Exception as error:  # PyYAML converts values to dates, numbers and sets without catching their errors
         raise InputError(
-            f"{path} cannot be read: {_brief(error)}. Only the configuration classes of splatfacto and normlift_ns "
-            "are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
+            f"{path} cannot be read: {describe_yaml_error(error)}. Only the configuration classes of splatfacto and "
+            "normlift_ns are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
             "blender-data. Convert other datasets to one of those formats with ns-process-data, and train on that."
         ) from error
     check_config_values(config, path)
     return config
-
-
-def _method_name(root: yaml.Node | None) -> str | None:
-    """Return the method_name of any config, without constructing objects."""
-    if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{OBJECT_TAG}:"):
-        return None
-    for key, value in root.value:
-        if isinstance(key, yaml.ScalarNode) and key.value == "method_name" and isinstance(value, yaml.ScalarNode):
-            return value.value
-    return None
-
-
-def _brief(error: Exception) -> str:
-    """Summarize a YAML error in one line: problem and line number."""
-    if isinstance(error, RecursionError):
-        return "it is nested too deeply"
-    if isinstance(error, yaml.MarkedYAMLError):
-        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
-        return f"{error.problem}{line}"
-    return " ".join(str(error).split())
-
-
-@dataclass(frozen=True)
-class RunLocation:
-    """Current absolute paths of a run's files."""
-
-    run_dir: Path
-    """Folder of config.yml."""
-    output_dir: Path
-    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
-    root: Path | None
-    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
-    because output_dir is absolute or the run was moved."""
-    data: Path
-    """The dataset: a folder or a .json file."""
-    moved_data: bool
-    """Whether `data` differs from the path in the config, read relative to `root`."""
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the dataset."""
-        return self.data.parent if self.data.suffix == ".json" else self.data
-
-    def portable(self, path: Path) -> Path:
-        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
-        return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
-
-
-def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
-    """Locate the files of a run from the path of its config.yml, whatever the current directory.
-
-    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
-    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
-
-    Args:
-        config: contents of config.yml.
-        config_path: path of config.yml.
-        data: current path of the dataset, relative to the current directory; None: the path in the config.
-    Raises:
-        FileNotFoundError: if there is no dataset; the message names every path tried.
-    """
-    run_dir = _absolute(config_path).parent
-    inferred = _strip_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
-    output_dir = fallback_output_dir(config.output_dir) if inferred is None else inferred
-    root = None if inferred is None else _strip_tail(inferred, Path(os.path.normpath(config.output_dir)))
-    if data is not None:
-        if not data.exists():
-            raise FileNotFoundError(
-                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
-                "transforms.json that the run was trained with."
-            )
-        return RunLocation(run_dir, output_dir, root, _absolute(data), moved_data=True)
-    stored = dataset_in_config(config)
-    roots = [root] if root is not None else list(output_dir.parents)
-    tried = list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
-    for path in tried:
-        if path.exists():
-            moved = root is None or path != _absolute(root / stored)
-            return RunLocation(run_dir, output_dir, root, path, moved_data=moved)
-    raise FileNotFoundError(
-        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
-        "If it was moved, give its path with --data."
-    )
-
-
-def _strip_tail(path: Path, tail: Path) -> Path | None:
-    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
-    count = len(path.parts) - len(tail.parts)
-    return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
-
-
-def dataset_in_config(config: Any) -> Path:
-    """Return the path of the dataset in the config."""
-    datamanager = config.pipeline.datamanager
-    return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
-
-
-def fallback_output_dir(output_dir: Path) -> Path:
-    """Return the output folder for a moved run: inside the current directory, whatever its config names."""
-    return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
-
-
-def _absolute(path: Path) -> Path:
-    return Path(os.path.abspath(path))
 
 
 def with_absolute_paths(config: Any, location: RunLocation) -> Any:

@@ -7,13 +7,14 @@ numbers in the files. These checks raise errors with advice instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
+from torch import Tensor
 
 from normlift_ns.data.colmap import ColmapCamera, ColmapImage, read_colmap_model
 from normlift_ns.data.frames import read_image_header
@@ -33,7 +34,7 @@ from normlift_ns.data.nerfstudio.config_classes import (
     NerfstudioDataParserConfig,
     SupportedDataParserConfig,
 )
-from normlift_ns.data.transforms import CameraEntry, TransformsEntries, read_transforms_entries
+from normlift_ns.data.transforms import CameraEntry, FrameEntry, TransformsEntries, read_transforms_entries
 from normlift_ns.errors import InputError
 
 MAX_AUTO_RESOLUTION = 1600
@@ -68,8 +69,10 @@ def image_size(file: Path, parser: SupportedDataParserConfig) -> tuple[int, int]
     return read_image_header(file).size
 
 
-def auto_downscale_factor(file: Path, parser: ColmapDataParserConfig) -> int:
-    """Return the factor by which nerfstudio downscales images if the config does not name one."""
+def _colmap_downscale_factor(file: Path, parser: ColmapDataParserConfig) -> int:
+    """Return the factor by which nerfstudio downscales images, which depends on one of them if the config has none."""
+    if parser.downscale_factor is not None:
+        return parser.downscale_factor
     longest, factor = max(image_size(file, parser)), 1
     while longest / factor > MAX_AUTO_RESOLUTION:
         factor *= 2
@@ -83,7 +86,7 @@ def _entries(path: Path, data: Path) -> TransformsEntries:
 
 
 def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
-    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    path = _transforms_path(parser)
     entries = _entries(path, parser.data)
     for name in _REQUIRED:
         incomplete = [frame.file_path for frame in entries.frames if getattr(frame, name) is None]
@@ -94,6 +97,10 @@ def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
             )
     _check_positions([frame.transform_matrix for frame in entries.frames], parser, path)
     _check_files([path.parent / frame.file_path for frame in entries.frames], path)
+
+
+def _transforms_path(parser: NerfstudioDataParserConfig) -> Path:
+    return parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
 
 
 def _check_blender(parser: BlenderDataParserConfig) -> None:
@@ -120,9 +127,7 @@ def _check_colmap(parser: ColmapDataParserConfig) -> None:
     registered.sort(key=lambda image: image.image_id)
     files = [images / image.name for image in registered]
     _check_files(files, model)
-    factor = parser.downscale_factor
-    if factor is None:
-        factor = auto_downscale_factor(files[0], parser)
+    factor = _colmap_downscale_factor(files[0], parser)
     if factor == 1:
         return
     smaller = images.parent / f"{images.name}_{factor}"
@@ -178,44 +183,50 @@ def parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
     """
     cameras, images = read_colmap_model(parser.data / parser.colmap_path, text_first=True)
     images = sorted(images, key=lambda image: image.image_id)
-    intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
-    kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera].model else "PERSPECTIVE" for image in images}
-    if len(kinds) > 1:
-        raise InputError("multiple camera models are not supported")
-    used = [intrinsics[image.camera] for image in images]
-    if any(row[7] != 0 for row in used):
-        raise InputError("the distortion k4 of a camera is not zero")
+    kind, values = _colmap_cameras(cameras, images)
     images_dir = parser.data / parser.images_path
     files = [images_dir / image.name for image in images]
-    masks = [(parser.data / parser.masks_path / image.name).with_suffix(".png") for image in images] if (
-        parser.masks_path is not None
-    ) else None  # fmt: skip
+    masks = None
+    if parser.masks_path is not None:
+        masks = [(parser.data / parser.masks_path / image.name).with_suffix(".png") for image in images]
     flip = parser.assume_colmap_world_coordinate_convention
     poses, transform, scale = normalize_poses(
         [_pose(image, flip) for image in images], parser, parser.orientation_method
     )
     split_indices = split_by_lists(_read_lists(parser), files) or split_by_mode(files, parser)
-    factor = parser.downscale_factor
-    if factor is None:
-        factor = auto_downscale_factor(files[0], parser)
+    factor = _colmap_downscale_factor(files[0], parser)
     if factor > 1:
         files = _downscaled(files, images_dir, factor)
         masks = None if masks is None else _downscaled(masks, parser.data / (parser.masks_path or ""), factor)
     split = DatasetSplit(
         files,
         masks,
-        kinds.pop(),
+        kind,
         poses[:, :3, :4],
-        torch.tensor([row[:4] for row in used], dtype=torch.float32),
+        torch.tensor([row[:4] for row in values], dtype=torch.float32),
         torch.tensor(
             [[cameras[image.camera].width, cameras[image.camera].height] for image in images], dtype=torch.int64
         ),
-        torch.tensor([row[4:] for row in used], dtype=torch.float32),
+        torch.tensor([row[4:] for row in values], dtype=torch.float32),
     )
     train, held_out = (
         split.select(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
     )
     return ParsedDataset(train, held_out, compose_applied_transform(transform, _FLIP if flip else None), scale)
+
+
+def _colmap_cameras(
+    cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]
+) -> tuple[str, list[list[float]]]:
+    """Return nerfstudio's type of all cameras, and fx, fy, cx, cy and k1, k2, k3, k4, p1, p2 of each image."""
+    intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
+    kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera].model else "PERSPECTIVE" for image in images}
+    if len(kinds) > 1:
+        raise InputError("multiple camera models are not supported")
+    values = [intrinsics[image.camera] for image in images]
+    if any(row[7] != 0 for row in values):
+        raise InputError("the distortion k4 of a camera is not zero")
+    return kinds.pop(), values
 
 
 def _colmap_camera(camera: ColmapCamera) -> list[float]:
@@ -325,11 +336,9 @@ def _distortion(entries: TransformsEntries, frame: CameraEntry) -> list[float]:
 
 
 def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
-    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    path = _transforms_path(parser)
     folder, meta = path.parent, read_transforms_entries(path)
-    factor = parser.downscale_factor
-    if factor is None:
-        factor = _downscale_factor(folder, Path(meta.frames[0].file_path), parser)
+    factor = _downscale_factor(folder, Path(meta.frames[0].file_path), parser)
 
     def resolve(name: str, prefix: str = "images_") -> Path:
         return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
@@ -340,39 +349,46 @@ def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
     if len(masks) not in (0, len(files)):
         raise InputError(f"{path} lists masks for {len(masks)} of {len(files)} images; expected one for each, or none")
-    lists = {
-        split: None if names is None else [resolve(name) for name in names]
-        for split, names in (
-            ("train", meta.train_filenames), ("val", meta.val_filenames), ("test", meta.test_filenames)
-        )
-    }  # fmt: skip
-    split_indices = split_by_lists(lists, files) or split_by_mode(files, parser)
+    lists = {"train": meta.train_filenames, "val": meta.val_filenames, "test": meta.test_filenames}
+    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in lists.items()}
+    split_indices = split_by_lists(resolved, files) or split_by_mode(files, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
+    split = DatasetSplit(files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses(meta, frames))
+    train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
+    transform = compose_applied_transform(transform, _applied_transform(meta, parser.data))
+    return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
+
+
+def _applied_transform(meta: TransformsEntries, data: Path) -> list[list[float]] | None:
+    """Return the transform of the poses before they were stored, which files of an old ns-process-data do not name."""
+    is_legacy = meta.applied_transform is None and (data / "colmap/sparse/0").exists()
+    return _LEGACY_FLIP if is_legacy else meta.applied_transform
+
+
+def _camera_type(meta: TransformsEntries) -> str:
     model = "OPENCV" if meta.camera_model is None else meta.camera_model
     if model not in _CAMERA_TYPES:
         raise InputError(f"unknown camera_model {model!r}")
+    return _CAMERA_TYPES[model]
+
+
+def _lenses(
+    meta: TransformsEntries, frames: Sequence[FrameEntry]
+) -> tuple[Float[Tensor, "v 4"], Int64[Tensor, "v 2"], Float[Tensor, "v k"]]:
+    """Return the intrinsics, sizes and distortion of the frames."""
     values = [[_value(meta, frame, name) for name in _INTRINSICS] for frame in frames]
-    split = DatasetSplit(
-        files,
-        masks or None,
-        _CAMERA_TYPES[model],
-        poses[:, :3, :4],
+    return (
         torch.tensor([row[:4] for row in values], dtype=torch.float32),
         torch.tensor([[int(side) for side in row[4:]] for row in values], dtype=torch.int64),
         torch.tensor([_distortion(meta, frame) for frame in frames], dtype=torch.float32),
     )
-    applied = meta.applied_transform
-    if applied is None and (parser.data / "colmap/sparse/0").exists():
-        applied = _LEGACY_FLIP
-    train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
-    return ParsedDataset(
-        train, held_out, compose_applied_transform(transform, applied), scale * float(meta.applied_scale)
-    )
 
 
-def _downscale_factor(folder: Path, name: Path, parser: SupportedDataParserConfig) -> int:
+def _downscale_factor(folder: Path, name: Path, parser: NerfstudioDataParserConfig) -> int:
     """Return the factor of the downscaled copies that nerfstudio reads if the images are too large and copies exist."""
+    if parser.downscale_factor is not None:
+        return parser.downscale_factor
     longest, power = max(image_size(folder / name, parser)), 0
     while longest / 2**power > MAX_AUTO_RESOLUTION and (folder / f"images_{2 ** (power + 1)}" / name.name).exists():
         power += 1

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,9 +21,9 @@ from normlift_ns.core.scene import View, Views
 from normlift_ns.data import images
 from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, Intrinsics, check_mask, image_warnings, read_image_header
-from normlift_ns.data.images import to_camera
+from normlift_ns.data.images import blend_background, to_camera
 from normlift_ns.data.nerfstudio.cameras import DatasetSplit, apply_pose_adjustments
-from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
+from normlift_ns.data.nerfstudio.config import read_trainer_config, with_absolute_paths
 from normlift_ns.data.nerfstudio.config_classes import (
     ASSUMED_STEP,
     NAMED_COLORS,
@@ -34,8 +35,9 @@ from normlift_ns.data.nerfstudio.config_classes import (
     active_sh_degree,
     background_color,
 )
+from normlift_ns.data.nerfstudio.config_file import RunLocation, locate_run
 from normlift_ns.data.nerfstudio.dataparsers import check_dataset, parse_dataset
-from normlift_ns.data.transforms import read_dataparser_transforms
+from normlift_ns.data.transforms import read_dataparser_transforms, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import view_colors
@@ -66,33 +68,50 @@ class _Lens(NamedTuple):
     distortion: tuple[float, ...]
 
 
-class TrainedViews:
+class SplitViews(ABC):
     """Lazy `Views` of one split of a dataset, in its order: indexing reads and undistorts one image.
 
     Images, masks and intrinsics are those of nerfstudio's `FullImageDatamanager.cached_train`, which holds all of them
     in memory (and pins that memory, which needs CUDA).
 
     Args:
-        split: image files and cameras, before undistortion.
+        files: the images.
+        masks: one mask per image, or None.
+        sizes: width and height of the cameras, before undistortion.
         folder: folder of the dataset, to which `names` are relative.
         poses: camera-to-world poses [V, 3, 4] in OpenGL convention: the split's, or those optimized by the training.
         background: RGB in 0..1, blended behind images with an alpha channel.
-        reading: other settings of the config that affect pixels.
+        scale: camera_res_scale_factor, by which the files are resized.
     """
 
     def __init__(
         self,
-        split: DatasetSplit,
+        files: Sequence[Path],
+        masks: Sequence[Path] | None,
+        sizes: Sequence[Sequence[int]],
         folder: Path,
         poses: Float[Tensor, "v 3 4"],
         background: Float[Tensor, " 3"],
-        reading: ImageReadOptions,
+        scale: float,
     ) -> None:
-        self._split, self._poses, self._background, self._reading = split, poses, background, reading
-        self.files = list(split.files)
+        self.files = list(files)
         """Absolute paths of the images."""
-        self.names = [image_name(file, folder) for file in self.files]
+        self.names = [relative_name(file, folder) for file in self.files]
         """Image files relative to the dataset, with forward slashes."""
+        self._masks, self._sizes, self._poses = masks, sizes, poses
+        self._background, self._scale = background, scale
+
+    @abstractmethod
+    def _load(self, index: int) -> tuple[Any, Any]:
+        """Read an image [H, W, C] and its mask or None, at the size of the camera."""
+
+    @abstractmethod
+    def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
+        """Return image and mask without distortion, and whether they had any."""
+
+    @abstractmethod
+    def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
+        """Return intrinsics, width and height of an undistorted image."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -111,14 +130,10 @@ class TrainedViews:
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         index %= len(self)
-        lens = self._lens(index)
-        pixels, mask_values = self._read(index)
-        image = torch.from_numpy(_undistorted(pixels, lens)[0])
-        mask = None if mask_values is None else torch.from_numpy(_undistorted_mask(mask_values, lens)).bool()
-        if image.shape[2] == 4:
-            alpha = image[:, :, 3:].float() / 255
-            image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
-        original_size = (pixels.shape[1], pixels.shape[0]) if any(lens.distortion) else None
+        distorted, distorted_mask = self._read(index)
+        image, mask, was_distorted = self._undistort(index, distorted, distorted_mask)
+        original_size = (distorted.shape[1], distorted.shape[0]) if was_distorted else None
+        image = blend_background(image, self._background)
         return View(self.cameras[index], image, mask, self.names[index], original_size)
 
     @property
@@ -131,22 +146,10 @@ class TrainedViews:
         return [self._camera(i) for i in range(len(self))]
 
     def _camera(self, index: int) -> Camera:
-        lens = self._lens(index)
         try:
-            if lens.kind not in ("PERSPECTIVE", "FISHEYE"):
-                raise InputError(
-                    f"{self.files[index]} was taken with a {lens.kind} camera; splatfacto supports only perspective "
-                    "and fisheye cameras."
-                )
-            return to_camera(self._poses[index], *_pinhole(lens))
+            return to_camera(self._poses[index], *self._pinhole(index))
         except InputError as error:
             raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
-
-    def _lens(self, index: int) -> _Lens:
-        width, height = self._split.sizes[index].tolist()
-        distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
-        fx, fy, cx, cy = self._split.intrinsics[index].tolist()
-        return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
 
     def check_files(self) -> tuple[str, ...]:
         """Check the headers of all images and masks, and return warnings in whole sentences.
@@ -155,53 +158,98 @@ class TrainedViews:
             FileNotFoundError, ValueError: if an image or mask is missing, not an image, misread by nerfstudio, or not
                 of the size of its camera or image; the message names it.
         """
-        headers, scale = [read_image_header(file) for file in self.files], self._reading.scale
+        headers = [read_image_header(file) for file in self.files]
         for index, (file, header) in enumerate(zip(self.files, headers)):
             if header.mode not in _SUPPORTED_MODES:
                 raise InputError(
                     f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
                     "RGBA or grayscale; convert the images, and train again."
                 )
-            self._check_size(index, header.size if scale == 1 else _scaled(header.size, scale))
-            if self._split.masks is not None:
-                check_mask(self._split.masks[index], file, header.size)
+            self._check_size(index, header.size if self._scale == 1 else _scaled(header.size, self._scale))
+            if self._masks is not None:
+                check_mask(self._masks[index], file, header.size)
         return image_warnings(self.files, headers)
 
-    def _check_size(self, index: int, size: tuple[int, int]) -> None:
-        expected = self._split.sizes[index].tolist()
-        if list(size) != expected:
+    def _check_size(self, index: int, size: Sequence[int]) -> None:
+        expected = self._sizes[index]
+        if list(size) != list(expected):
             raise InputError(
                 f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
                 f"{expected[1]} (width x height). Use the images that the run was trained with."
             )
 
-    def _read(self, index: int) -> tuple[Any, Bool[np.ndarray, "h w"] | None]:
-        """Read pixels and mask like nerfstudio's `InputDataset`."""
-        file, masks = self.files[index], self._split.masks
+    def _read(self, index: int) -> tuple[Any, Any]:
+        """Load an image and its mask, and check their files and size."""
         try:
-            image = self._pixels(file)
-            mask = None if masks is None else _mask(masks[index], self._reading.scale)
-            if mask is not None and mask.shape != image.shape[:2]:
-                raise InputError(f"the mask has shape {mask.shape}, the image {image.shape[:2]}")
+            image, mask = self._load(index)
         except FileNotFoundError as error:
             raise FileNotFoundError(
                 f"{error.filename} is missing, but the dataset lists it. Put it back, or give the path of the dataset "
                 "with --data."
             ) from error
-        except Exception as error:  # Pillow's readers raise any kind of exception on a damaged file
+        except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
             raise InputError(
-                f"{file}{'' if masks is None else ' or its mask'} cannot be read ({error}). Expected an 8-bit image; "
-                "copy it again from the capture."
+                f"{self.files[index]}{'' if self._masks is None else ' or its mask'} cannot be read ({error}). "
+                "Expected an 8-bit image; copy it again from the capture."
             ) from error
-        if self._reading.mask_color is not None and any(self._reading.mask_color) and mask is not None:
-            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.mask_color)
-            image = torch.where(torch.from_numpy(mask)[:, :, None], torch.from_numpy(image), filled).numpy()
         self._check_size(index, image.shape[1::-1])
+        return image, mask
+
+
+class TrainedViews(SplitViews):
+    """Views of a split that are read and undistorted without nerfstudio.
+
+    Args:
+        split: image files and cameras, before undistortion.
+        folder, poses, background: as in `SplitViews`.
+        reading: settings of the config that affect pixels.
+    """
+
+    def __init__(
+        self,
+        split: DatasetSplit,
+        folder: Path,
+        poses: Float[Tensor, "v 3 4"],
+        background: Float[Tensor, " 3"],
+        reading: ImageReadOptions,
+    ) -> None:
+        super().__init__(split.files, split.masks, split.sizes.tolist(), folder, poses, background, reading.scale)
+        self._split, self._reading = split, reading
+
+    def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
+        lens = self._lens(index)
+        if lens.kind not in ("PERSPECTIVE", "FISHEYE"):
+            raise InputError(camera_type_error(self.files[index], lens.kind))
+        return _pinhole(lens)
+
+    def _lens(self, index: int) -> _Lens:
+        width, height = self._sizes[index]
+        distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
+        fx, fy, cx, cy = self._split.intrinsics[index].tolist()
+        return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
+
+    def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
+        lens = self._lens(index)
+        pixels = torch.from_numpy(_undistorted(image, lens)[0])
+        values = None if mask is None else torch.from_numpy(_undistorted_mask(mask, lens)).bool()
+        return pixels, values, any(lens.distortion)
+
+    def _load(self, index: int) -> tuple[UInt8[np.ndarray, "h w c"], Bool[np.ndarray, "h w"] | None]:
+        """Read pixels and mask like nerfstudio's `InputDataset`."""
+        image, color = self._pixels(self.files[index]), self._reading.mask_color
+        if self._masks is None:
+            return image, None
+        mask = _mask(self._masks[index], self._scale)
+        if mask.shape != image.shape[:2]:
+            raise InputError(f"the mask has shape {mask.shape}, the image {image.shape[:2]}")
+        if color is not None and any(color):
+            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(color)
+            image = torch.where(torch.from_numpy(mask)[:, :, None], torch.from_numpy(image), filled).numpy()
         return image, mask
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
         with Image.open(file) as opened:
-            scale = self._reading.scale
+            scale = self._scale
             resized = opened if scale == 1 else opened.resize(_scaled(opened.size, scale), Image.Resampling.BILINEAR)
             image = np.array(resized, dtype=np.uint8)
         if image.ndim == 2:
@@ -213,6 +261,11 @@ class TrainedViews:
         blended, color = torch.from_numpy(image), torch.tensor(self._reading.alpha_color)
         blended = blended[:, :, :3] * (blended[:, :, -1:] / 255.0) + 255.0 * color * (1.0 - blended[:, :, -1:] / 255.0)
         return torch.clamp(blended, min=0, max=255).to(torch.uint8).numpy()
+
+
+def camera_type_error(file: Path, kind: str) -> str:
+    """Return the message about an image whose camera is of a type that splatfacto does not support."""
+    return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
 
 
 def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
@@ -280,23 +333,10 @@ def _fisheye(lens: _Lens) -> tuple[Any, Any, Any]:
     return matrix, coefficients, pinhole
 
 
-def image_name(file: Path, folder: Path) -> str:
-    """Return the file relative to its dataset's folder, or unchanged if it lies elsewhere, with forward slashes."""
-    return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
-
-
 # Trained splatfacto runs as a `Scene` of the core, without CUDA and without building a model.
 
 
 _TRANSFORM_TOLERANCE = 1e-3
-
-
-class CheckedViews(Views, Protocol):
-    """`Views` that can check their image files."""
-
-    def check_files(self) -> tuple[str, ...]:
-        """Check the image files, and return warnings in whole sentences."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -381,7 +421,7 @@ class NerfstudioScene:
 
 
 ViewsFactory = Callable[
-    [TrainerConfig, Path, Float[Tensor, "v 3 4"], Float[Tensor, " 3"]], tuple[CheckedViews, CheckedViews]
+    [TrainerConfig, Path, Float[Tensor, "v 3 4"], Float[Tensor, " 3"]], tuple[SplitViews, SplitViews]
 ]
 """Function that returns the training and evaluation views. Its arguments are a config with absolute paths, the folder
 of the dataset, the training poses and the background color."""
