@@ -1,4 +1,4 @@
-"""Export of Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties."""
+"""Exports of a lifted run: PLY files for splat tools, label arrays, and labels of other point clouds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Validation of options: one table of ranges, and the declared types. Imports no heavy package.
+"""Options of a lift, of queries and of exports as dataclasses, with the table of their ranges.
+
+Validation of options: one table of ranges, and the declared types. Imports no heavy package.
 
 Options are dataclasses that call `check_options` in `__post_init__`. Wrong values are therefore reported before
 anything is loaded, in the commands, in `ns-train normlift` and in Python.
@@ -330,7 +332,7 @@ BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things"
 
 
 class RuleSettings(NamedTuple):
-    """Constants of a relevancy rule; its formula is in `core.relevancy` for torch and in `quick` for numpy."""
+    """Constants of a relevancy rule; its formula is in `core.relevancy` for torch and in `query.arrays` for NumPy."""
 
     threshold: float
     """Relevancy above which a Gaussian is selected."""

@@ -1,4 +1,4 @@
-"""Names and paths in a config.yml, read without nerfstudio and without constructing any object."""
+"""Checks of a command line before torch is imported."""
 
 from __future__ import annotations
 

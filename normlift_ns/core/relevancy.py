@@ -23,7 +23,7 @@ RELEVANCY_FORMULAS: dict[RelevancyRule, Callable[[Tensor, Tensor, float], Tensor
     "lerf": lambda positive, negative, temperature: torch.sigmoid(temperature * _margin(positive, negative)),
     "margin": lambda positive, negative, temperature: _margin(positive, negative),
 }
-"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `quick` has the same formulas for numpy."""
+"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `query.arrays` has them for NumPy."""
 
 
 def relevancy(

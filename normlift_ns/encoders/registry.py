@@ -1,4 +1,4 @@
-"""Shared helpers for weight files: local and hub lookups, and one-line summaries of third-party errors.
+"""Registry of encoders, and the lookup of weight files of all networks.
 
 This module imports nothing heavy.
 """

@@ -1,4 +1,4 @@
-"""Clicks on the scene in nerfstudio's viewer. At most one browser at a time waits for a click."""
+"""Widgets of the search panel, what they show, and what it exports."""
 
 from __future__ import annotations
 

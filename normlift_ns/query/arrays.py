@@ -87,7 +87,7 @@ class QuickAnswer:
     """True for Gaussians that are valid, above the threshold and reliable enough."""
 
     def summarize(self) -> list[dict[str, Any]]:
-        """Return the numbers of every prompt as plain Python types, like `asking.summarize`."""
+        """Return the numbers of every prompt as plain Python types, like `summarize_result`."""
         return [self._row(i) for i in range(len(self.question.texts))]
 
     @cached_property
@@ -157,7 +157,7 @@ def open_quick(
 
 
 def query_arrays(field: FieldArrays, question: Query) -> QuickAnswer:
-    """Compute relevancy and selection of every Gaussian for each prompt, like `asking.answer`.
+    """Compute relevancy and selection of every Gaussian for each prompt, like `run_query`.
 
     Raises:
         ValueError: the embeddings have a different dimension than the field.

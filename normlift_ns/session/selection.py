@@ -49,7 +49,7 @@ class SelectionContext:
         return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
 
     def answer(self, question: Query) -> Answer:
-        """Answer a query as `asking.answer` does; the relevancies of the last four queries are cached.
+        """Answer a query as `run_query` does; the relevancies of the last four queries are cached.
 
         Raises:
             ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
