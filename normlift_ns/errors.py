@@ -1,4 +1,4 @@
-"""InputError for the user's mistakes as opposed to internal errors, and safe display of foreign text."""
+"""Errors, exit codes and crash logs: user errors as opposed to internal errors."""
 
 from __future__ import annotations
 

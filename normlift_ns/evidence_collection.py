@@ -1,4 +1,4 @@
-"""Check that label maps match the undistorted images that the scene was trained on."""
+"""Evidence and features of the training views, chunk by chunk, so that an interrupted lift can resume."""
 
 from __future__ import annotations
 

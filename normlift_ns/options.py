@@ -1,4 +1,6 @@
-"""Validation of options: one table of ranges, and the declared types. Imports no heavy package.
+"""Options of a lift, of queries and of exports as dataclasses, with the table of their ranges.
+
+Validation of options: one table of ranges, and the declared types. Imports no heavy package.
 
 Options are dataclasses that call `check_options` in `__post_init__`. Wrong values are therefore reported before
 anything is loaded, in the commands, in `ns-train normlift` and in Python.

@@ -1,4 +1,4 @@
-"""Warm-up of GPU kernels in the background, while images are read and networks process them."""
+"""The lift from a trained scene and its features to a lifted run: evidence, consensus, lift, vote, store, write."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Diagnostics of a query: relevancy histograms, votes of images, and floaters."""
+"""Analysis of a lifted run: objects, catalogs, explanations and vote records."""

@@ -1,4 +1,4 @@
-"""Objects in a selection: connected components, oriented boxes, and a catalogue for other programs."""
+"""Objects in a selection: connected components, boxes, instances and floaters."""
 
 from __future__ import annotations
 

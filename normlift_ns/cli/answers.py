@@ -1,4 +1,4 @@
-"""ns-normlift-query --objects: a catalog of the selected objects."""
+"""Tables and files that ns-normlift-query and ns-normlift-export make of an answer."""
 
 from __future__ import annotations
 

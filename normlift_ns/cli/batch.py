@@ -1,4 +1,4 @@
-"""Capture lists of ns-normlift-batch: the ns-normlift call and the run directory of each line.
+"""ns-normlift-batch: lift many captures, by one worker or several.
 
 Runs of a batch are named after a digest of the scene and the options. The name therefore shows whether a capture was
 lifted with the same options, and no two processes can both write it.

@@ -1,4 +1,4 @@
-"""One-line messages for command-line errors, in place of the boxes that tyro draws on standard error."""
+"""Common parts of the commands: flags and their help, printed text, errors and exit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that run in several processes."""
+"""ns-normlift: lift 2D features onto a trained splat."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Checks of options and files that run before the slow import of torch and nerfstudio.
-
-The code that uses a file checks it again.
-"""
+"""Checks of a command line before torch is imported."""
 
 from __future__ import annotations
 

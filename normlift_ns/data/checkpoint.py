@@ -1,4 +1,4 @@
-"""Safe unpickling of NumPy scalars, such as the learning rates in nerfstudio's scheduler states."""
+"""Checkpoints of nerfstudio and of gsplat, read without running what they contain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Headers of image files, checked before a lift without decoding any pixels."""
+"""Images and their cameras as camera files describe them, and image headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Selection of the images that were held out of the training."""
+"""Training images, undistorted with their pinhole cameras, and the selection of those held out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes without a nerfstudio run: a PLY file or gsplat checkpoint, with a file of cameras."""
+"""Splats without a nerfstudio run: opening them, and storing them in a lifted run."""
 
 from __future__ import annotations
 

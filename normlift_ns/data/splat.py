@@ -1,4 +1,4 @@
-"""Raw parameters of a trained splat, and the validation of splat files."""
+"""Parameters of a trained splat, their validation, and PLY files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Schema and validation of transforms.json."""
+"""transforms.json: schema, cameras, and transforms between the world of the cameras and that of the splat."""
 
 from __future__ import annotations
 

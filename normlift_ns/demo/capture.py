@@ -1,4 +1,4 @@
-"""Cameras in the demo room, its images and true masks, and a nerfstudio dataset of them."""
+"""Images and masks of the demo room as a nerfstudio dataset, and a splatfacto run of it."""
 
 from __future__ import annotations
 

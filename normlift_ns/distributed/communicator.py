@@ -1,4 +1,4 @@
-"""Communication between processes with torch.distributed: NCCL for GPUs, gloo for CPUs."""
+"""Communication between processes, and the redistribution of evidence among them."""
 
 from __future__ import annotations
 

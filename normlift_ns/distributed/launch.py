@@ -1,4 +1,4 @@
-"""Heartbeats that reveal a lost process and tolerate a slow one.
+"""Launch of processes on this machine or by torchrun, and heartbeats that reveal a lost one.
 
 A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
 counter stops is lost, and the others report that and exit. A process that fails reports its own error first.

@@ -1,4 +1,4 @@
-"""Sources of 2D features: an image becomes labeled regions with one unit feature each, a prompt becomes a unit vector.
+"""Protocols of feature sources, regions and encoders, and dense features of patches.
 
 The two steps are separate. `Regions` segments an image, an `Encoder` embeds regions and prompts in one space, and
 `RegionFeatures` combines the two into a `FeatureSource`. The rest of the package uses `FeatureSource` only. Code that

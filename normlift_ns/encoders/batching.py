@@ -1,4 +1,4 @@
-"""A parallel `map` that prefetches the next results."""
+"""Batches that fit into memory, prefetching, and masked crops of regions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adapter for encoders of other packages: checks their results and attributes their errors."""
+"""Feature sources from `SourceOptions`, and the adapter that checks encoders of other packages."""
 
 from __future__ import annotations
 

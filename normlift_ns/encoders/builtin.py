@@ -1,4 +1,4 @@
-"""Registration of `--encoder open_clip`, without torch."""
+"""Registration of the built-in encoders, without torch."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def _no_color_message(prompt: str) -> str:
 
 @dataclass(frozen=True)
 class ColorEncoder(ColorTextEncoder):
-    """Encoder that compares mean CIELAB colors with color names; formulas in `texts.colours`. Needs neither weights nor
+    """Encoder that compares mean CIELAB colors with color names; formulas above. Needs neither weights nor
     a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:

@@ -1,4 +1,4 @@
-"""Model families: their identifiers in configurations, and their text preprocessing. Imports nothing heavy."""
+"""Model families, folders and names of Hugging Face networks, without torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks of transformers with their weights on a device: embeddings of images, patches and texts in a joint space.
+"""Hugging Face networks as encoders of images and prompts.
 
 SigLIP pools the tokens of all patches by attention with one learned query. As MaskCLIP (Zhou, Loy and Dai, ECCV 2022)
 does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. After the final

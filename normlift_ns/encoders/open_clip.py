@@ -1,5 +1,8 @@
-"""Parts of open_clip without importing the whole package. That import takes ten seconds, mostly for torchvision and
-transformers, and only networks need it."""
+"""Architectures and weight files of OpenCLIP, without importing open_clip.
+
+Parts of open_clip without importing the whole package. That import takes ten seconds, mostly for torchvision and
+transformers, and only networks need it.
+"""
 
 from __future__ import annotations
 

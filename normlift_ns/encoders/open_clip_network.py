@@ -1,4 +1,4 @@
-"""OpenCLIP models with their weights on a device."""
+"""OpenCLIP as an encoder of images and prompts, and its text tower in plain torch."""
 
 from __future__ import annotations
 

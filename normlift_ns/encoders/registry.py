@@ -1,4 +1,4 @@
-"""Shared helpers for weight files: local and hub lookups.
+"""Registry of encoders, and the lookup of weight files of all networks.
 
 This module imports nothing heavy.
 """

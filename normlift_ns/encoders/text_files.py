@@ -1,4 +1,4 @@
-"""Prompt templates: the sentences that an encoder embeds for a text."""
+"""Prompt templates, files of text embeddings, and the cache of embedded prompts."""
 
 from __future__ import annotations
 

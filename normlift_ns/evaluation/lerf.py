@@ -1,5 +1,8 @@
-"""Score map processing of the published code of Splat Feature Solver (SFS), number by number, including its
-oddities."""
+"""Evaluation on LERF-OVS: labels, scores, and the score maps of Splat Feature Solver.
+
+Score map processing of the published code of Splat Feature Solver (SFS), number by number, including its
+oddities.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of the evaluation protocols. Imports no heavy package, to keep --help fast."""
+"""Options, documents and results of the evaluation protocols."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluation with instance masks: true classes of Gaussians from the evidence of the masks, and held-out pixels."""
+"""Evaluation protocols on lifted runs, and instance masks."""
 
 from __future__ import annotations
 

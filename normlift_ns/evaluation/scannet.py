@@ -1,4 +1,4 @@
-"""Reader of one vertex property of a PLY file, which validates the header against the file size."""
+"""Evaluation on ScanNet as OpenGaussian does it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Variants of the refinement: those of the paper's ablation (its table 2), and the posterior vote."""
+"""Studies of lifted runs: ablation, sweeps, signals and timing."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def save_arrays(
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Write a safetensors file and return its digest; see `tensors.save_tensors`."""
+    """Write a safetensors file and return its digest; see `save_tensors`."""
     metadata = dict(facts or {})
     content = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = array_digest(content, metadata, key)

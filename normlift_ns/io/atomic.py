@@ -1,4 +1,4 @@
-"""Digests of strings and files: the 128-bit XXH3, which detects damage but not forgery."""
+"""Atomic writes of files and folders, their journal, and digests of files."""
 
 from __future__ import annotations
 

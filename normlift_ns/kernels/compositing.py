@@ -1,4 +1,4 @@
-"""Exact lists of the splats that touch each cell of an image, nearest first, built by two stable sorts.
+"""Triton kernels that composite: lists of splats per cell, sums by region, and images of any number of channels.
 
 A cell is one of gsplat's tiles or a part of one. A splat is in the list of a cell if its rectangle touches the tile, as
 in gsplat, and alpha can reach its threshold in a pixel of the cell. The second condition is computed in float64 with a

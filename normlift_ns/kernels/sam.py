@@ -1,4 +1,4 @@
-"""Pixel counts and boxes of masks at the size of the image, without enlarging the logits in memory.
+"""Triton kernels for SAM: measurements of masks, and the upscaling of its mask decoder.
 
 Enlarging is linear and separable, and every pixel is computed from three neighboring logits along each axis. One
 program handles some rows of one mask. It keeps three lines of logits, enlarged along the row, until a row needs others.

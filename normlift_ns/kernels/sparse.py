@@ -1,4 +1,4 @@
-"""Sums over the rows of a sparse matrix: sums of weights, and weighted sums of table rows."""
+"""Triton kernels for sparse matrices: sums over rows, and products of rows."""
 
 from __future__ import annotations
 

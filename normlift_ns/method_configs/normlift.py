@@ -1,4 +1,4 @@
-"""Method of `ns-train normlift`; with it, ns-viewer, ns-render and ns-export also accept runs of ns-normlift.
+"""Methods of `ns-train`: normlift, normlift-lerf-ovs and normlift-scannet.
 
 Every ns-* command imports this module while nerfstudio builds its list of methods. It must therefore import neither
 that list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.

@@ -1,4 +1,4 @@
-"""LPIPS metric that is built at its first use."""
+"""splatfacto's model with a semantic field, and an LPIPS metric that is built at its first use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoding of the prompts typed into the panel, with the text encoder of the run."""
+"""Search panel in the nerfstudio viewer: what its widgets do to the history of states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clicks on the scene in nerfstudio's viewer. At most one browser at a time waits for a click."""
+"""Widgets of the search panel, what they show, and what it exports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT, TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder
-from normlift_ns.options import RELEVANCY_RULES
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import load_query, save_query
 from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors

@@ -1,4 +1,4 @@
-"""Configs of trained runs as objects of nerfstudio's own classes, for its commands and its viewer."""
+"""Configs and training views of a run as nerfstudio makes them."""
 
 from __future__ import annotations
 

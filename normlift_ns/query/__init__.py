@@ -1,1 +1,1 @@
-"""normlift_ns.query"""
+"""Queries of a semantic field: prompts, relevancy, thresholds and answers."""

@@ -1,4 +1,4 @@
-"""Decorators that compile the CPU rasterizer with numba, and the exponential function that its kernels share.
+"""Kernels of the CPU rasterizer, compiled with numba.
 
 numba caches a compiled function until its own file changes, and ignores changes to functions that it calls in other
 files. After a change here or to `numba_lists.extent`, delete the .nbi files in the `__pycache__` of this folder.

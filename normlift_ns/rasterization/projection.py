@@ -1,4 +1,4 @@
-"""Projection of Gaussians to depth-sorted 2D Gaussians and tile lists, exactly as in gsplat.
+"""Projection of Gaussians to 2D and tile lists, as in gsplat, and the reference rasterizer in PyTorch.
 
 The gsplat sources are utils.cuh and isect_tiles.cu.
 """

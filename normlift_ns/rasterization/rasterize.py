@@ -1,4 +1,4 @@
-"""View-dependent colors of Gaussians, on any device."""
+"""Rasterization of evidence and images by the backend that suits a job, and weights along a ray."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""normlift_ns.rendering"""
+"""Colors, legends and figures of answers."""

@@ -1,4 +1,4 @@
-"""Colors of query results, the same in every viewer and figure.
+"""Colors of query results and the legend, the same in every viewer and figure.
 
 Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, which
 keeps weak matches unobtrusive. A prompt that names a color is drawn in that color. The other prompts get colors that

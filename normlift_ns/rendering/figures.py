@@ -1,4 +1,4 @@
-"""Rendered outputs of an answer: which scalars of the Gaussians are rendered, and how their images are colored."""
+"""Rendered outputs of an answer, and figures of the training images with it."""
 
 from __future__ import annotations
 

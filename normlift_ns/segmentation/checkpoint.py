@@ -1,4 +1,4 @@
-"""Detection and loading of networks from model folders in the format of transformers.
+"""Checkpoints of SAM: model folders, published files and names.
 
 Only the sizes of the parts are read from config.json, so it cannot name code, kernels or other weights.
 """

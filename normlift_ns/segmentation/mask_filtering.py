@@ -1,4 +1,4 @@
-"""Operations on binary masks: boxes, LangSplat's suppression, and label maps of overlapping masks."""
+"""Filtering of binary masks: boxes, suppression, label maps, small holes and islands."""
 
 from __future__ import annotations
 

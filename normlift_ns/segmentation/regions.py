@@ -1,4 +1,4 @@
-"""Safe image reading: nothing in a file is executed, and errors name the file."""
+"""Regions of images: superpixels, grids and label maps from files, and safe image reading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bit-exact version of Pillow's bilinear resize for any device.
+"""Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
 Pillow resizes 8-bit images along rows, then along columns, with weights of 22 bits and sums rounded to 8 bits. This is
 integer arithmetic below 2^31, which gives the same result on every device. Pillow 13 may start with the columns if the

@@ -1,4 +1,4 @@
-"""Diagnostics of a query: relevancy histograms, suggested thresholds, and prompts that may not be in the scene."""
+"""Actions on the state of a session, and diagnostics of its query."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Immutable state of a session: what a user has asked, selected and hidden."""
+"""State of a session, its history, and the jobs that change it."""
 
 from __future__ import annotations
 

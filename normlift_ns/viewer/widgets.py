@@ -1,4 +1,4 @@
-"""Escaped text and color swatches as MDX, which the viewer compiles."""
+"""Contents of panels as MDX: status, object rows, plots and explanations."""
 
 from __future__ import annotations
 

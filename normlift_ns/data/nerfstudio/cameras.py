@@ -1,4 +1,4 @@
-"""Camera poses computed with nerfstudio's own float32 steps, which makes the results bit-identical."""
+"""Camera poses and splits of a dataset, with nerfstudio's own float32 steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Allow-list of the classes that a config.yml may name, and its safe YAML loader and dumper."""
+"""Safe reading of config.yml: allowed classes, checks of values, and the files of the run."""
 
 from __future__ import annotations
 

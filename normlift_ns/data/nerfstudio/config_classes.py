@@ -1,4 +1,4 @@
-"""Placeholders for classes and functions that a config.yml names and this package does not need."""
+"""Mirrors of the nerfstudio configuration classes that a config.yml may name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Validation of a trained run's dataset, before nerfstudio reads it.
+"""Datasets of trained runs: validation, and cameras as the data parsers of nerfstudio compute them.
 
 If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts all
 numbers in the files. These checks raise errors with advice instead.

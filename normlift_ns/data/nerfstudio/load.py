@@ -1,4 +1,4 @@
-"""Undistorted images and cameras of a run, exactly as splatfacto trained on them."""
+"""A trained splatfacto run as a `Scene`, with its images as splatfacto trained on them."""
 
 from __future__ import annotations
 
