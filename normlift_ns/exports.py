@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,12 +23,12 @@ from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.splat import check_ply_header
-from normlift_ns.encoders.registry import summarize_error
-from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file, atomic_files
 from normlift_ns.options import LABEL_ARRAY_FILES, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, RasterizeMode
 from normlift_ns.query.engine import Answer
 from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.registry import Registry
 from normlift_ns.rendering.figures import write_masks
 
 # Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties.
@@ -391,10 +390,6 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
 # Exporters of ns-normlift-export, by kind of output. Other packages register theirs as entry points.
 
 
-EXPORTER_GROUP = "normlift_ns.exporters"
-"""Entry point group of exporters."""
-
-
 @dataclass(frozen=True, eq=False)
 class ExportJob:
     """Gaussians of a lifted run to export, and everything that an exporter may write about them."""
@@ -492,39 +487,21 @@ def _export_cloud(job: ExportJob, path: Path) -> list[str]:
     return [f"{labeled.points:,} points in {path}, {within}"]
 
 
-EXPORTERS = {
-    "ply": Exporter(_export_ply, ".ply", needs_answer=False),
-    "masks": Exporter(_export_masks),
-    "arrays": Exporter(_export_arrays),
-    "cloud": Exporter(_export_cloud, ".ply"),
-}
-"""Exporters of this package, in the order in which a command runs them."""
-
-
-def find_exporter(name: str) -> Exporter:
-    """Return the exporter of a name. Other packages cannot take the name of one in `EXPORTERS`.
-
-    Raises:
-        InputError: the name is unknown, two packages claim it, or the exporter of another package cannot be loaded.
-    """
-    if name in EXPORTERS:
-        return EXPORTERS[name]
-    points = {point.value: point for point in entry_points(group=EXPORTER_GROUP, name=name)}
-    if len(points) == 0:
-        known = ", ".join(sorted({*EXPORTERS, *entry_points(group=EXPORTER_GROUP).names}))
-        raise InputError(f"unknown exporter {truncate_text(name)!r}; --exporters takes {known}")
-    if len(points) > 1:
-        raise InputError(f"exporter {name!r} is claimed by {' and '.join(points)}; uninstall one of the two")
-    (value,) = points
-    try:
-        exporter = points[value].load()
-    except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
-        raise InputError(
-            f"exporter {name!r} cannot be loaded from {value} ({summarize_error(error)}); repair or uninstall that "
-            "package"
-        ) from error
-    if not isinstance(exporter, Exporter):
-        raise InputError(
-            f"exporter {name!r} is invalid: {value} is of type {type(exporter).__name__}, expected Exporter"
-        )
-    return exporter
+PLY = Exporter(_export_ply, ".ply", needs_answer=False)
+MASKS = Exporter(_export_masks)
+ARRAYS = Exporter(_export_arrays)
+CLOUD = Exporter(_export_cloud, ".ply")
+EXPORTERS = Registry(
+    "normlift_ns.exporters",
+    {
+        "ply": "normlift_ns.exports:PLY",
+        "masks": "normlift_ns.exports:MASKS",
+        "arrays": "normlift_ns.exports:ARRAYS",
+        "cloud": "normlift_ns.exports:CLOUD",
+    },
+    Exporter,
+    "exporter",
+    "--exporters",
+    "ply",
+)
+"""Exporters by kind of output."""

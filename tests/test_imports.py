@@ -13,7 +13,8 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
-    ("options", "entry_points"),
+    ("registry",),
+    ("options",),
     ("io", "kernels"),
     ("core",),
     ("rasterization", "encoders", "segmentation"),
@@ -41,7 +42,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
-    **dict.fromkeys(("errors", "entry_points", "options", "plugin", "scripts"), frozenset()),
+    **dict.fromkeys(("errors", "registry", "options", "plugin", "scripts"), frozenset()),
     **dict.fromkeys(("progress",), frozenset({"torch"})),
     **dict.fromkeys(("api", "pipeline"), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},

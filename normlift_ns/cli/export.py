@@ -104,7 +104,7 @@ class NormLiftExport:
         self._check_outputs(outputs)
         info_opening(self.load_config)
         from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.exports import find_exporter, read_cloud  # noqa: PLC0415
+        from normlift_ns.exports import EXPORTERS, read_cloud  # noqa: PLC0415
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
@@ -119,7 +119,7 @@ class NormLiftExport:
             refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
         job = self._job(run, cloud)
         for kind, path in outputs.items():
-            for line in find_exporter(kind).write(job, path):
+            for line in EXPORTERS.load(kind).write(job, path):
                 info(line)
         if job.objects is not None:
             CONSOLE.print(_objects_table(job.objects["queries"]))
@@ -174,9 +174,9 @@ class NormLiftExport:
         paths = {"ply": target, "masks": self.masks_dir, "arrays": self.arrays_dir, "cloud": cloud}
         outputs = {kind: path for kind, path in paths.items() if path is not None}
         for kind in self.exporters:
-            from normlift_ns.exports import find_exporter  # noqa: PLC0415 (imports torch)
+            from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
-            outputs[kind] = target.with_name(f"{target.stem}_{kind}{find_exporter(kind).suffix}")
+            outputs[kind] = target.with_name(f"{target.stem}_{kind}{EXPORTERS.load(kind).suffix}")
         return outputs
 
     def _check_outputs(self, outputs: Mapping[str, Path]) -> None:
@@ -216,9 +216,9 @@ class NormLiftExport:
             f"--{name.replace('_', '-')}" for name in ("masks_dir", "arrays_dir", "transfer") if getattr(self, name)
         ]
         for kind in self.exporters:
-            from normlift_ns.exports import find_exporter  # noqa: PLC0415 (imports torch)
+            from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
-            flags += [f"--exporters {kind}"] if find_exporter(kind).needs_answer else []
+            flags += [f"--exporters {kind}"] if EXPORTERS.load(kind).needs_answer else []
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 

@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from normlift_ns.cli import export
 from normlift_ns.errors import InputError
-from normlift_ns.exports import EXPORTER_GROUP, EXPORTERS, find_exporter
+from normlift_ns.exports import ARRAYS, CLOUD, EXPORTERS, MASKS, PLY
 from tests.encoders.test_kinds import plugged
 from tests.scripts.conftest import run_entry, said
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+
 
 def points(**exporters: str) -> str:
-    return f"[{EXPORTER_GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in exporters.items())
+    return f"[{EXPORTERS.group}]\n" + "".join(f"{name} = {value}\n" for name, value in exporters.items())
 
 
-def test_those_of_the_package_need_no_metadata_and_cannot_be_replaced(tmp_path: Path) -> None:
+def test_those_of_the_package_are_in_pyproject_and_cannot_be_replaced(tmp_path: Path) -> None:
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"]
+    assert registered[EXPORTERS.group] == EXPORTERS.built_in
     with plugged(tmp_path, "plug", points(ply="plug:KIND", other="plug:KIND"), "KIND = 3"):
-        for name, exporter in EXPORTERS.items():
-            assert find_exporter(name) is exporter
-        with pytest.raises(InputError, match=r"unknown exporter 'csv'; .* arrays, cloud, masks, other, ply"):
-            find_exporter("csv")
-
-
-def test_a_broken_exporter_is_named(tmp_path: Path) -> None:
-    for number, (value, code, message) in enumerate((
-        ("nowhere:KIND", "", "ModuleNotFoundError"),
-        ("plug:KIND", "1 / 0", "ZeroDivisionError"),
-        ("plug:KIND", "raise SystemExit(3)", "SystemExit: 3"),
-        ("plug:KIND", "KIND = 3", "plug:KIND is of type int, expected Exporter"),
-    )):  # fmt: skip
-        package = plugged(tmp_path / str(number), "plug", points(bad=value), code)
-        with package, pytest.raises(InputError, match=f"exporter 'bad' .*{message}"):
-            find_exporter("bad")
+        assert [EXPORTERS.load(name) for name in EXPORTERS.built_in] == [PLY, MASKS, ARRAYS, CLOUD]
+        for name, message in (("csv", "arrays, cloud, masks, other, ply"), ("other", "type int, expected Exporter")):
+            with pytest.raises(InputError, match=f"exporter '{name}'.*{message}"):
+                EXPORTERS.load(name)
 
 
 NOTE = """
