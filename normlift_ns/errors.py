@@ -47,6 +47,9 @@ def escape_unprintable(text: str, keep: str = "") -> str:
     )
 
 
+_MAX_SUMMARY = 300
+
+
 def truncate_text(text: str, most: int = 40) -> str:
     """Cut a text to at most `most` characters.
 
@@ -54,6 +57,14 @@ def truncate_text(text: str, most: int = 40) -> str:
     'a red b…'
     """
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def summarize_error(error: BaseException) -> str:
+    """Return the beginning of a third-party error message, for use in an error message."""
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
+    text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
+    return text if len(text) <= _MAX_SUMMARY else text[:_MAX_SUMMARY] + " ..."
 
 
 # User-facing messages and exit codes of exceptions; internal errors also get a log file.

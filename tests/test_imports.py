@@ -13,6 +13,7 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
+    ("registry",),
     ("options",),
     ("io", "kernels"),
     ("core",),
@@ -40,7 +41,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
-    **dict.fromkeys(("errors", "options", "plugin", "scripts"), frozenset()),
+    **dict.fromkeys(("errors", "registry", "options", "plugin", "scripts"), frozenset()),
     **dict.fromkeys(("progress",), frozenset({"torch"})),
     **dict.fromkeys(("api", "pipeline"), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},

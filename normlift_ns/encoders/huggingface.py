@@ -14,8 +14,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders import registry
-from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.encoders import weights
+from normlift_ns.errors import InputError, summarize_error, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
@@ -415,7 +415,7 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
         read_model_folder(folder, family)
         return
     try:
-        registry.check_hub_access()
+        weights.check_hub_access()
     except OSError as error:
         raise _unreachable(model, family, error) from None
 
@@ -431,7 +431,7 @@ def check_model_name(model: str, family: ModelFamily) -> None:
         return
     if os.path.lexists(model):
         raise InputError(f"{model}, given with --encoder-model, is not a folder; {example}")
-    if registry.is_local_path(model, 2):
+    if weights.is_local_path(model, 2):
         raise FileNotFoundError(f"{model}, given with --encoder-model, does not exist; {example}")
     if len(Path(model).parts) != 2:
         raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
@@ -442,7 +442,7 @@ def find_local_model(model: str) -> Path | None:
     incomplete."""
     if os.path.isdir(model):
         return Path(model).resolve()
-    if not registry.is_in_hub_cache(model, CONFIG_FILE):
+    if not weights.is_in_hub_cache(model, CONFIG_FILE):
         return None
     hub = importlib.import_module("huggingface_hub")
     config, *weight_files = (
@@ -465,7 +465,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
         return local
     hub = importlib.import_module("huggingface_hub")
     try:
-        registry.check_hub_access()
+        weights.check_hub_access()
         folder = Path(hub.snapshot_download(model, allow_patterns=[CONFIG_FILE]))
     except Exception as error:  # download clients raise exceptions without a common base class
         raise _unreachable(model, family, error) from None
@@ -484,6 +484,6 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
     return FileNotFoundError(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded "
-        f"({registry.summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
+        f"({summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
         "that needs no weights: --encoder colour"
     )

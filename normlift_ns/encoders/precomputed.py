@@ -13,8 +13,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.base import ViewFeatures
-from normlift_ns.encoders.prompts import check_prompts, unit_rows
-from normlift_ns.encoders.text_files import look_up_embeddings
+from normlift_ns.encoders.text_files import check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
 
 

@@ -1,32 +1,20 @@
-"""Shared helpers for weight files: local and hub lookups, and one-line summaries of third-party errors.
+"""Encoders by their `--encoder` names.
 
-This module imports nothing heavy.
+Every encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. Imports nothing
+heavy.
 """
 
 from __future__ import annotations
 
-import ast
-import importlib
 import os
-import pickle
-import struct
-import sys
-import urllib.error
-import urllib.request
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import EntryPoint, distributions
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from safetensors import SafetensorError
-
-from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
+from normlift_ns.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,164 +22,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from normlift_ns.encoders.base import Encoder
-
-
-_PROBE_SECONDS = 10
-_HUB = "https://huggingface.co"
-_FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_MAX_LENGTH = 300
-_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
-"""Names of the weight files of OpenCLIP models in hub repositories."""
-_SAM_FILES = ("model.safetensors", "pytorch_model.bin")
-THIRD_PARTY_ERRORS = (
-    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
-    ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
-    SafetensorError,
-)  # fmt: skip
-"""Exceptions that torch, safetensors and open_clip raise for a bad file or name. Out-of-memory errors are not among
-them."""
-
-
-def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
-    """Return whether the weights of an OpenCLIP model are on this machine.
-
-    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
-    Face hub.
-
-    >>> has_local_clip_weights("ViT-B-16", __file__)
-    True
-    """
-    if os.path.isfile(pretrained):
-        return True
-    repository = _hub_location(model, pretrained)
-    if not repository:
-        return None
-    owner_and_name, _, file = repository.rpartition("/")
-    return any(is_in_hub_cache(owner_and_name, name) for name in ([file] if file else _CLIP_FILES))
-
-
-def has_local_sam_weights(checkpoint: str) -> bool:
-    """Return whether a SAM checkpoint, given as a path or a hub name, is on this machine."""
-    cached = is_in_hub_cache(checkpoint, "config.json") and any(
-        is_in_hub_cache(checkpoint, name) for name in _SAM_FILES
-    )
-    return os.path.exists(checkpoint) or cached
-
-
-def is_in_hub_cache(repository: str, file: str) -> bool:
-    """Return whether the Hugging Face hub cache holds a file in its main revision. Needs no network."""
-    constants = importlib.import_module("huggingface_hub.constants")
-    folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
-    try:
-        revision = (folder / "refs" / "main").read_text("utf8").strip()
-        return os.path.isfile(folder / "snapshots" / revision / file)
-    except (OSError, ValueError):
-        return False
-
-
-def find_in_hub_cache(published: Mapping[str, Any], constants: Any) -> Path | None:
-    """Return the path of the weights in the Hugging Face hub cache, or None. Needs no network.
-
-    Args:
-        published: Entry of open_clip's table of pretrained weights.
-        constants: open_clip's module of file names.
-    """
-    hub = importlib.import_module("huggingface_hub")
-    repository, name = os.path.split(published.get("hf_hub", ""))
-    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
-        path = hub.try_to_load_from_cache(repository, file) if repository else None
-        if isinstance(path, str):
-            return Path(path)
-    return None
-
-
-def _hub_location(model: str, tag: str) -> str | None:
-    """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
-
-    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
-    hub, or the source has an unexpected form.
-    """
-    try:
-        spec = find_spec("open_clip")  # does not import the package
-        assert spec is not None and spec.origin is not None
-        source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
-        tables = {
-            node.targets[0].id: node.value
-            for node in ast.parse(source).body
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-        }
-        models = tables["_PRETRAINED"]
-        assert isinstance(models, ast.Dict)
-        names = [ast.literal_eval(key) for key in models.keys if key is not None]
-        entry = models.values[names.index(model.removesuffix("-quickgelu"))]
-        entry = tables[entry.id] if isinstance(entry, ast.Name) else entry
-        call = _argument(entry, tag.lower().replace("-", "_"))
-        return ast.literal_eval(_argument(call, "hf_hub"))
-    except (OSError, ValueError, LookupError, AttributeError, TypeError, AssertionError, SyntaxError, StopIteration):
-        return None
-
-
-def _argument(call: ast.AST, name: str) -> ast.expr:
-    """Return the value of a keyword argument of a call."""
-    return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
-
-
-def summarize_error(error: BaseException) -> str:
-    """Return the beginning of a third-party error message, for use in an error message."""
-    lines = [line.strip() for line in str(error).strip().splitlines()]
-    lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
-    text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
-    return text if len(text) <= _MAX_LENGTH else text[:_MAX_LENGTH] + " ..."
-
-
-def check_server(address: str) -> None:
-    """Raise OSError if a server does not respond; the hub's own client would retry for most of a minute."""
-    try:
-        urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
-    except urllib.error.HTTPError:  # the server responded
-        pass
-    except OSError as error:
-        raise ConnectionError(f"{address} cannot be reached: {error}") from error
-
-
-def check_hub_access() -> None:
-    """Raise OSError if the Hugging Face hub is not available for downloads."""
-    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
-    check_server(os.environ.get("HF_ENDPOINT", _HUB))
-
-
-def is_local_path(name: str, parts: int) -> bool:
-    """Return whether a name can only be a local path.
-
-    Args:
-        parts: Largest number of parts that names of other kinds have.
-
-    >>> is_local_path("google/siglip2-base-patch16-224", 2), is_local_path("a/b/c", 2), is_local_path("clip.pt", 2)
-    (False, True, True)
-    """
-    path = Path(name)
-    return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
-
-
-# Registry of encoders by their `--encoder` names.
-#
-# Every encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. This module
-# imports nothing heavy; a package is imported only when its encoder is requested.
-
-
-ENTRY_POINT_GROUP = "normlift_ns.encoders"
-"""Entry point group of encoders."""
-_PACKAGE_PREFIX = "normlift_ns."
-BUILT_IN_ENCODERS = {
-    "open_clip": "normlift_ns.encoders.builtin:OPEN_CLIP",
-    "siglip": "normlift_ns.encoders.builtin:SIGLIP",
-    "siglip2": "normlift_ns.encoders.builtin:SIGLIP2",
-    "metaclip2": "normlift_ns.encoders.builtin:METACLIP2",
-    "colour": "normlift_ns.encoders.builtin:COLOR",
-}
-"""The built-in encoders, as pyproject.toml registers them. Listed here for source trees that are not installed, or were
-installed before an encoder was added."""
 
 
 class LazyTextEncoder(Protocol):
@@ -211,7 +41,7 @@ class LazyTextEncoder(Protocol):
         ...
 
 
-def _accept_all(options: SourceOptions) -> None:
+def accept_all_options(options: SourceOptions) -> None:
     """Accept all options."""
 
 
@@ -238,7 +68,7 @@ class EncoderKind:
     """Negative prompts of queries that set none; (): no negatives."""
     threshold: float | Literal["auto"] = 0.5
     """Relevancy by `rule` above which a Gaussian is selected; "auto": chosen from the histogram."""
-    check: Callable[[SourceOptions], None] = _accept_all
+    check: Callable[[SourceOptions], None] = accept_all_options
     """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
     texts: Callable[[SourceOptions, str, Path | None, Mapping[str, Any]], LazyTextEncoder] | None = None
     """Makes the text encoder of a lifted run. Its arguments: the options, the device, the folder in which to cache
@@ -252,39 +82,26 @@ class EncoderKind:
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
 
-def encoder_names() -> list[str]:
-    """Return the names of all registered encoders in alphabetical order, including those that fail to load."""
-    return sorted({point.name for point in _points()})
+ENCODERS = Registry(
+    "normlift_ns.encoders",
+    {
+        "open_clip": "normlift_ns.encoders.builtin:OPEN_CLIP",
+        "siglip": "normlift_ns.encoders.builtin:SIGLIP",
+        "siglip2": "normlift_ns.encoders.builtin:SIGLIP2",
+        "metaclip2": "normlift_ns.encoders.builtin:METACLIP2",
+        "colour": "normlift_ns.encoders.builtin:COLOR",
+    },
+    EncoderKind,
+    "encoder",
+    "--encoder",
+    "open_clip",
+)
+"""Encoders by their `--encoder` names."""
 
 
 def encoder_kind(name: str) -> EncoderKind:
-    """Return the encoder kind of a name. Other packages cannot take the name of a built-in encoder.
-
-    Raises:
-        InputError: If the name is unknown, two packages claim it, or the encoder of another package cannot be loaded.
-    """
-    points = {point.value: point for point in _points() if point.name == name}
-    built_in = [value for value in points if value.startswith(_PACKAGE_PREFIX)]
-    if len(points) == 0:
-        known = ", ".join(encoder_names()) or "none: normlift_ns is not installed (pip install -e .)"
-        raise InputError(f"unknown encoder {truncate_text(name)!r}; --encoder is one of {known}")
-    if len(points) > 1 and len(built_in) == 0:
-        packages = " and ".join(f"{_package(point)} ({value})" for value, point in points.items())
-        raise InputError(f"encoder {name!r} is claimed by {packages}; uninstall one of the two")
-    point = points[built_in[0] if len(built_in) > 0 else next(iter(points))]
-    try:
-        kind = point.load()
-    except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
-        raise InputError(
-            f"encoder {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair or uninstall "
-            "that package, or use another encoder, such as --encoder open_clip"
-        ) from error
-    if not isinstance(kind, EncoderKind):
-        raise InputError(
-            f"encoder {name!r} of {_package(point)} is invalid: {point.value} is of type {type(kind).__name__}, "
-            "expected an EncoderKind; use another encoder, such as --encoder open_clip"
-        )
-    return kind
+    """Return the encoder kind of a name; raises as `Registry.load`."""
+    return ENCODERS.load(name)
 
 
 def find_encoder_kind(name: object) -> EncoderKind | None:
@@ -295,44 +112,8 @@ def find_encoder_kind(name: object) -> EncoderKind | None:
         return None
 
 
-def is_built_in(kind: EncoderKind) -> bool:
-    """Return whether an encoder kind is built in."""
-    return kind.make.__module__.startswith(_PACKAGE_PREFIX)
-
-
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
     """Return the encoder's options that may be paths. The path of an existing file or folder is made absolute."""
     kind = find_encoder_kind(options.encoder)
     values = {name: getattr(options, name) for name in (() if kind is None else kind.paths)}
     return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
-
-
-def _points() -> Sequence[EntryPoint]:
-    """Return the entry points of the group. Packages with damaged metadata are skipped."""
-    return _points_on(tuple(sys.path))
-
-
-@cache
-def _points_on(path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    """Cache the entry points per `sys.path`: a search through hundreds of packages takes 20 ms, and a command needs it
-    often."""
-    return tuple(_discover(path))
-
-
-def _discover(path: Sequence[str]) -> Iterator[EntryPoint]:
-    """Yield the built-in entry points, then those of the packages on a path."""
-    names: set[str] = set()
-    yield from [EntryPoint(name, value, ENTRY_POINT_GROUP) for name, value in BUILT_IN_ENCODERS.items()]
-    for package in distributions(path=list(path)):
-        try:
-            text = package.read_text("entry_points.txt")
-            if text is None or ENTRY_POINT_GROUP not in text or package.name in names:
-                continue
-            names.add(package.name)  # the first on the path is the one that Python imports
-            yield from [point for point in package.entry_points if point.group == ENTRY_POINT_GROUP]
-        except Exception:  # reading third-party metadata may raise anything
-            continue
-
-
-def _package(point: EntryPoint) -> str:
-    return f"package {point.dist.name}" if point.dist is not None else "an unnamed package"

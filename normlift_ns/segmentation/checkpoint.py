@@ -19,8 +19,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.registry import check_server, summarize_error
-from normlift_ns.errors import InputError
+from normlift_ns.encoders.weights import check_server
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 

@@ -18,14 +18,13 @@ from normlift_ns.cli.preflight import check_source_options
 from normlift_ns.encoders.build import make_encoder
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
 from normlift_ns.encoders.registry import (
-    BUILT_IN_ENCODERS,
-    ENTRY_POINT_GROUP,
+    ENCODERS,
     encoder_kind,
-    encoder_names,
     find_encoder_kind,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation.registry import MASK_SOURCES
 from tests.encoders.tiny import refused
 
 if sys.version_info >= (3, 11):
@@ -57,16 +56,17 @@ def plugged(folder: Path, package: str, points: str, code: str) -> Iterator[None
 
 
 def points(**encoders: str) -> str:
-    return f"[{ENTRY_POINT_GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
+    return f"[{ENCODERS.group}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
 
 
 def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     """So that they are found without metadata too, as in a source tree on PYTHONPATH."""
-    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][
-        ENTRY_POINT_GROUP
-    ]
-    assert registered == BUILT_IN_ENCODERS
-    assert sorted(registered) == encoder_names() == OURS
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"]
+    for registry in (ENCODERS, MASK_SOURCES):
+        assert registered[registry.group] == registry.built_in
+        assert sorted(registry.built_in) == registry.names()
+        assert all(registry.load(name) is not None for name in registry.names())
+    assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
         assert (kind.rule, kind.threshold) == (("cosine" if name == "colour" else "lerf"), 0.5)
@@ -91,11 +91,11 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
         ("plug:", "", ["cannot be loaded"]),
     )):  # fmt: skip
-        install(tmp_path / str(number), "worse", f"[{ENTRY_POINT_GROUP}]\nno value at all\n= = =\n[")
+        install(tmp_path / str(number), "worse", f"[{ENCODERS.group}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
             assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.builtin"
-            assert encoder_names() == ["bad", *OURS]
+            assert ENCODERS.names() == ["bad", *OURS]
 
 
 WRONG = """
