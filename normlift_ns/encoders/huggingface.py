@@ -280,25 +280,28 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
     settings = settings.get("image_processor", settings)
     if not isinstance(settings, Mapping):
         raise InputError(f"image_processor of {file} is {type(settings).__name__}, expected an object")
-
-    def three(key: str, default: tuple[float, ...], minimum: float) -> tuple[float, ...]:
-        values = settings.get(key, list(default))
-        if not isinstance(values, list) or len(values) != 3:
-            raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
-        return tuple(_number(value, f"{key} of {file}", minimum, 1e3) for value in values)
-
-    normalize = settings.get("do_normalize", True) is not False
     factor = _number(settings.get("rescale_factor", 1 / 255), f"rescale_factor of {file}", 1e-6, 1e3)
+    factor = factor if settings.get("do_rescale", True) is not False else 1.0
+    mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    if settings.get("do_normalize", True) is not False:
+        mean = _channels(settings, "image_mean", family.mean, -1e3, file)
+        std = _channels(settings, "image_std", family.std, 1e-6, file)
+    if kind != "siglip2":
+        return PixelNormalization(factor, mean, std, _side(settings), None)
     patches = settings.get("max_num_patches", 256)
-    if kind == "siglip2" and (type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]):
+    if type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]:
         raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer")
-    return PixelNormalization(
-        factor if settings.get("do_rescale", True) is not False else 1.0,
-        three("image_mean", family.mean, -1e3) if normalize else (0.0, 0.0, 0.0),
-        three("image_std", family.std, 1e-6) if normalize else (1.0, 1.0, 1.0),
-        None if kind == "siglip2" else _side(settings),
-        patches if kind == "siglip2" else None,
-    )
+    return PixelNormalization(factor, mean, std, None, patches)
+
+
+def _channels(
+    settings: Mapping[str, Any], key: str, default: tuple[float, ...], minimum: float, file: str
+) -> tuple[float, ...]:
+    """Return one number per color channel."""
+    values = settings.get(key, list(default))
+    if not isinstance(values, list) or len(values) != 3:
+        raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
+    return tuple(_number(value, f"{key} of {file}", minimum, 1e3) for value in values)
 
 
 def _side(settings: Mapping[str, Any]) -> int | None:

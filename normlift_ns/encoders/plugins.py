@@ -130,13 +130,13 @@ class PluginRegions:
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         with _attribute_errors("mask source", self.name):
-            labels = torch.as_tensor(self.regions.labels(image, name))
-        labels = labels[None, None] if labels.ndim == 2 else labels
+            returned = torch.as_tensor(self.regions.labels(image, name))
+        labels = returned[None, None] if returned.ndim == 2 else returned
         fits = labels.ndim == 4 and labels.shape[2:] == image.shape[:2] and labels.numel() > 0
         if not fits or labels.is_floating_point() or labels.is_complex():
             raise InputError(
-                f"mask source {self.name!r} of another package returned {labels.dtype} {tuple(labels.shape)} for an "
-                f"image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that package"
+                f"mask source {self.name!r} of another package returned {returned.dtype} {tuple(returned.shape)} for "
+                f"an image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that package"
             )
         for level in labels:
             ids = level.unique()

@@ -10,12 +10,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from normlift_ns.cli.preflight import check_source_options
-from normlift_ns.encoders.build import make_encoder
+from normlift_ns.encoders.build import make_encoder, make_source
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
 from normlift_ns.encoders.registry import (
     ENCODERS,
@@ -123,6 +125,42 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
         code = WRONG.format(rows=rows, made=made)
         with plugged(tmp_path / str(number), "wrong_plug", points(wrong="wrong_plug:KIND"), code):
             refused(lambda: make_encoder(SourceOptions(encoder="wrong")).encode(image, labels), *parts)
+
+
+MASKS = """
+import torch
+from normlift_ns.segmentation.registry import MaskSource
+class Halves:
+    identity = {{"version": 1}}
+    def labels(self, image, name): return {labels}
+HALVES = MaskSource(lambda options, device: Halves(), options=("level",))
+"""
+
+
+def test_another_package_adds_masks(tmp_path: Path) -> None:
+    image, halves = torch.zeros(4, 2, 3, dtype=torch.uint8), "torch.arange(2).repeat(4, 1)"
+    entry = f"[{MASK_SOURCES.group}]\nhalves = halves_plug:HALVES\nlangsplat = halves_plug:HALVES\n"
+
+    def options(**more: Any) -> SourceOptions:
+        return SourceOptions(**{"encoder": "colour", "regions": "halves", **more})
+
+    refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
+    with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
+        check_source_options(options(level="2"), ())
+        source = make_source(options(level="2"))
+        assert source.identity["regions"] == {"kind": "halves", "version": 1}
+        view = source.view(image, "a.png")
+        assert len(view.features) == 2 and view.labels.tolist() == [[0, 1]] * 4
+        assert cached(source, tmp_path / "cache").view(image, "a.png").labels.equal(view.labels)
+        refused(lambda: check_source_options(options(sam_model="a/b"), ()), "--sam-model a/b", '"halves"')
+        refused(lambda: options(regions="langsplat"), "auto, sam, sam3, patches, superpixel, grid, files, halves")
+    for number, (labels, parts) in enumerate((
+        ("torch.zeros(2, 2)", ["torch.float32 (2, 2)", "(4, 2)", "[H, W]"]),
+        (f"{halves} * 2", ["0..2", "without gaps"]),
+        ("1 / 0", ["ZeroDivisionError"]),
+    )):  # fmt: skip
+        with plugged(tmp_path / str(number), "halves_plug", entry, MASKS.format(labels=labels)):
+            refused(lambda: make_source(options()).view(image, "a.png"), "'halves'", *parts)
 
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
