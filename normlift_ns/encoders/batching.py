@@ -13,11 +13,11 @@ from torch import Tensor
 
 from normlift_ns.core.device import Items, retry_in_halves
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 
-def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+def prefetch_map(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int) -> Iterator[_Result]:
     """Yield `map(function, items)`, and compute up to `threads` of the next results while the caller uses one.
 
     Items are requested in the caller's thread. An exception of the items or the function is raised when its turn comes.
@@ -29,7 +29,7 @@ def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], thre
     if threads == 1:
         yield from map(function, items)
         return
-    iterator, pending = iter(items), deque[Future[Result]]()
+    iterator, pending = iter(items), deque[Future[_Result]]()
 
     def submit(count: int) -> None:
         try:
@@ -52,8 +52,6 @@ def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], thre
 # Batched computation that adapts to the available GPU memory.
 
 
-T = TypeVar("T")
-Element = TypeVar("Element")
 _ADVICE = (
     "close other programs that use the GPU, use a smaller model, downscale the images (--lift-downscale 2), or lift on "
     "the CPU: --device cpu"
@@ -67,7 +65,7 @@ class AdaptiveBatches:
     size: int
     """Items per batch."""
 
-    def __call__(self, function: Callable[[Items], T], items: Items) -> Iterator[T]:
+    def __call__(self, function: Callable[[Items], _Result], items: Items) -> Iterator[_Result]:
         """Yield the results of the function on consecutive batches of items.
 
         Raises:
@@ -83,7 +81,7 @@ class AdaptiveBatches:
             yield from results
 
     def across(
-        self, function: Callable[[Sequence[Element]], Tensor], parts: Iterable[Sequence[Element]]
+        self, function: Callable[[Sequence[_Item]], Tensor], parts: Iterable[Sequence[_Item]]
     ) -> Iterator[list[Tensor]]:
         """Yield the rows of each part, one per item; one batch may hold items of several parts.
 
@@ -96,7 +94,7 @@ class AdaptiveBatches:
         Raises:
             MemoryError: If not even one item fits.
         """
-        counts, queue, rows = deque[int](), list[Element](), deque[Tensor]()
+        counts, queue, rows = deque[int](), list[_Item](), deque[Tensor]()
         for part in parts:
             counts.append(len(part))
             queue.extend(part)

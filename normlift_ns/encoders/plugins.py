@@ -136,7 +136,8 @@ class PluginRegions:
         if not fits or labels.is_floating_point() or labels.is_complex():
             raise InputError(
                 f"mask source {self.name!r} of another package returned {returned.dtype} {tuple(returned.shape)} for "
-                f"an image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that package"
+                f"an image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that "
+                "package"
             )
         for level in labels:
             ids = level.unique()

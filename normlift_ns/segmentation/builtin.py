@@ -34,7 +34,7 @@ def _check_sam(options: SourceOptions) -> None:
     _check_level(options, "sam", _LEVELS)
 
 
-SAM = MaskSource(_make_sam, _check_sam, ("sam_model", "sam_precision", "level"))
+SAM_MASKS = MaskSource(_make_sam, _check_sam, ("sam_model", "sam_precision", "level"))
 """Masks of SAM, SAM 2 or HQ-SAM for a grid of points."""
 
 
@@ -49,7 +49,7 @@ def _check_sam3(options: SourceOptions) -> None:
         raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
 
 
-SAM3 = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "region_texts"))
+SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "region_texts"))
 """Masks of SAM 3 for text prompts."""
 
 

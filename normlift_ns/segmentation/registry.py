@@ -48,8 +48,8 @@ class MaskSource:
 MASK_SOURCES = Registry(
     MASK_GROUP,
     {
-        "sam": "normlift_ns.segmentation.builtin:SAM",
-        "sam3": "normlift_ns.segmentation.builtin:SAM3",
+        "sam": "normlift_ns.segmentation.builtin:SAM_MASKS",
+        "sam3": "normlift_ns.segmentation.builtin:SAM3_MASKS",
         "patches": "normlift_ns.segmentation.builtin:PATCHES",
         "superpixel": "normlift_ns.segmentation.builtin:SUPERPIXEL",
         "grid": "normlift_ns.segmentation.builtin:GRID",
