@@ -67,21 +67,8 @@ def summarize_error(error: BaseException) -> str:
     return text if len(text) <= _MAX_SUMMARY else text[:_MAX_SUMMARY] + " ..."
 
 
-# User-facing messages and exit codes of exceptions; internal errors also get a log file.
-
-
 EXIT_USER_ERROR, EXIT_INTERNAL_ERROR = 1, 70
 """Exit codes of user errors and internal errors; 70 is EX_SOFTWARE of sysexits.h."""
-_MAX_LINE = 300
-"""Largest number of characters of a foreign message."""
-
-
-def summarize_error(error: BaseException) -> str:
-    """Return the beginning of a third-party error message, for use in an error message."""
-    lines = [line.strip() for line in str(error).strip().splitlines()]
-    lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
-    text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
-    return text if len(text) <= _MAX_LINE else text[:_MAX_LINE] + " ..."
 
 
 def describe_error(error: BaseException) -> tuple[str, int]:

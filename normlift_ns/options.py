@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Union, cast, get_args, get_origin, get_type_hints
 
 from normlift_ns.errors import InputError
+from normlift_ns.registry import installed_names
 
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
 """Default bounds of integers and floats: larger numbers overflow in int32 and float32."""
@@ -317,6 +318,9 @@ UnlabeledMode = Literal["ignore", "dilute"]
 """Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
 
 RegionKind = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
+"""Built-in regions."""
+MASK_GROUP = "normlift_ns.masks"
+"""Entry point group of mask sources, whose names are further regions."""
 FeatureKind = Literal["none", "langsplat"]
 SamPrecision = Literal["auto", "float32", "float16", "bfloat16"]
 CropFill = Literal["black", "white"]
@@ -376,12 +380,12 @@ class SourceOptions:
     text_template: str = "{}"
     """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
     mean over seven OpenCLIP templates. {} alone is the bare prompt."""
-    regions: RegionKind = "auto"
+    regions: str = "auto"
     """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
     patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
     neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
-    cases use superpixel."""
+    cases use superpixel. Any other name: a mask source from an installed plugin."""
     region_texts: tuple[str, ...] = ()
     """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None
@@ -414,6 +418,9 @@ class SourceOptions:
     """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
 
     def __post_init__(self) -> None:
+        if self.regions not in get_args(RegionKind):
+            plugins = [name for name in installed_names(MASK_GROUP) if name not in get_args(FeatureKind)]
+            _check_choice("regions", self.regions, list(dict.fromkeys((*get_args(RegionKind), *plugins))))
         check_options(self)
         check_prompt_list("region_texts", self.region_texts)
 

@@ -32,7 +32,7 @@ from normlift_ns.encoders.base import FeatureSource, segmentation_workers
 from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached_only
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
-from normlift_ns.encoders.registry import has_local_clip_weights, has_local_sam_weights
+from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_weights
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,

@@ -20,7 +20,7 @@ from normlift_ns.encoders.cache import CachedTextMasks
 from normlift_ns.io.atomic import atomic_files, safe_file_name
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.query.engine import run_query
+from normlift_ns.query.engine import Answer, run_query
 from normlift_ns.query.question import Query
 from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, SegmentationResult, query_sam3
 from normlift_ns.rasterization.settings import RasterSettings

@@ -243,25 +243,18 @@ def check_unused_options(lift: LiftOptions) -> None:
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     """Check the folders, weights, levels and prompts of 2D features."""
-    from normlift_ns.encoders.registry import encoder_kind, is_local_path  # noqa: PLC0415 (not needed for --help)
+    from normlift_ns.encoders.registry import encoder_kind  # noqa: PLC0415 (not needed for --help)
+    from normlift_ns.encoders.weights import is_local_path  # noqa: PLC0415
+    from normlift_ns.segmentation.registry import check_mask_options, requested_regions  # noqa: PLC0415
 
     texts = tuple(queries)
     check_prompt_list("queries", texts)
-    if source.regions == "sam3" and len(source.looking_for(texts).region_texts) == 0:
-        raise InputError('regions "sam3" need prompts: give them with --queries, such as --queries mug plate')
     check_readable_folder(source.regions_dir, "--regions-dir")
     check_readable_folder(source.features_dir, "--features-dir")
     check_readable_file(source.text_vectors, "--text-vectors")
-    regions = source.regions
-    if regions == "auto" and (source.regions_dir is not None or source.sam_model is not None):
-        regions = "sam" if source.regions_dir is None else "files"
-    if source.features == "none" and regions == "files" and source.regions_dir is None:
-        raise InputError(
-            'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
-        )
-    if source.features != "none" and source.features_dir is None:
-        raise InputError(f"features {source.features!r} need their folder: give it with --features-dir")
-    _check_level(source.level, "langsplat" if source.features == "langsplat" else regions)
+    name = requested_regions(source) if source.features == "none" else source.features
+    if name != "auto":
+        check_mask_options(source.looking_for(texts), name)
     if source.sam_model is not None and is_local_path(source.sam_model, 2):
         _mode(Path(source.sam_model), "--sam-model")
     if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
@@ -273,19 +266,3 @@ def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     kind = encoder_kind(source.encoder)  # raises for an unknown encoder
     if needed:
         kind.check(source)
-
-
-def _check_level(level: str | None, kind: str) -> None:
-    if level is None or kind == "auto":
-        return
-    if kind == "files":
-        if not (level.isascii() and level.isdigit()):
-            raise InputError(
-                f"--level must be the number of a map, 0, 1, ..., for --regions files; got {short_repr(level)}"
-            )
-        return
-    levels = _LEVELS.get(kind, ())
-    if len(levels) == 0:
-        raise InputError(f'--level {short_repr(level)} is for --regions files or sam, not for "{kind}"; leave it out')
-    if level not in levels:
-        raise InputError(f"--level must be one of {', '.join(levels)} for {kind}, got {short_repr(level)}")

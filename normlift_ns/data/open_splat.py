@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import msgspec
@@ -28,11 +29,11 @@ from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transfo
 from normlift_ns.data.images import ImageViews, held_out_names
 from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.data.transforms import gsplat_normalization, read_json_file, read_transforms, write_transforms
-from normlift_ns.entry_points import EntryPoints
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import Background, RasterizeMode, SplatOptions
 from normlift_ns.rasterization.rasterize import view_colors
+from normlift_ns.registry import Registry
 
 BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 _MIN_POINTS, _PARALLEL = 4, 1e-6
@@ -169,15 +170,16 @@ def _scene(
     )
 
 
-SPLAT_READERS = EntryPoints(
+SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
         "ply": "normlift_ns.data.splat:read_ply",
         "pt": "normlift_ns.data.checkpoint:read_gsplat_checkpoint",
     },
-    what="reader of the splat format",
-    expected=Callable,
-    remedy="convert the splat to PLY",
+    plugin=FunctionType,
+    noun="splat format",
+    flag="--load-ply",
+    default="splat.ply",
 )
 """Readers of splat files by file name suffix, functions from a path to a `SplatFile`. Other packages add theirs with
 entry points of this group."""

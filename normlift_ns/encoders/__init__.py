@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.base import FeatureSource as FeatureSource
     from normlift_ns.encoders.base import RegionFeatures as RegionFeatures
     from normlift_ns.encoders.base import Regions as Regions
-    from normlift_ns.encoders.base import TextEncoder as TextEncoder
     from normlift_ns.encoders.base import ViewFeatures as ViewFeatures
     from normlift_ns.encoders.build import make_encoder as make_encoder
     from normlift_ns.encoders.build import make_regions as make_regions
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.langsplat import LangSplat as LangSplat
     from normlift_ns.encoders.langsplat import write_langsplat as write_langsplat
     from normlift_ns.encoders.registry import EncoderKind as EncoderKind
+    from normlift_ns.encoders.text_files import TextEncoder as TextEncoder
     from normlift_ns.options import SourceOptions as SourceOptions
     from normlift_ns.segmentation.regions import read_image as read_image
 
@@ -34,7 +34,6 @@ _EXPORTS = {
         "FeatureSource",
         "RegionFeatures",
         "Regions",
-        "TextEncoder",
         "ViewFeatures",
     ),
     "normlift_ns.encoders.build": (
@@ -49,6 +48,7 @@ _EXPORTS = {
         "write_langsplat",
     ),
     "normlift_ns.encoders.registry": ("EncoderKind",),
+    "normlift_ns.encoders.text_files": ("TextEncoder",),
     "normlift_ns.options": ("SourceOptions",),
     "normlift_ns.segmentation.regions": ("read_image",),
 }

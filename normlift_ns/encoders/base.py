@@ -26,7 +26,7 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.batching import AdaptiveBatches, prefetch_map
-from normlift_ns.encoders.prompts import UNIT_TOLERANCE
+from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.segmentation.regions import resample_nearest
 
@@ -160,19 +160,6 @@ class Regions(Protocol):
         If regions overlap, depth 0 holds the one that counts for the lift; only the encoder uses deeper ones. A method
         without overlaps returns depth 1.
         """
-        ...
-
-
-class TextEncoder(Protocol):
-    """The part of an encoder that queries need."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """See `FeatureSource.identity`."""
-        ...
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """See `FeatureSource.text`."""
         ...
 
 

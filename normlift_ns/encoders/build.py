@@ -1,121 +1,21 @@
-"""Feature sources from `SourceOptions`, and the adapter that checks encoders of other packages."""
+"""Builders of feature sources, encoders and regions from `SourceOptions`."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from importlib.util import find_spec
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
-import torch
-from jaxtyping import Float32, Int32, UInt8
-from torch import Tensor
-
-from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, TextEncoder
-from normlift_ns.encoders.langsplat import LangSplat
-from normlift_ns.encoders.prompts import UNIT_TOLERANCE, check_prompts
-from normlift_ns.encoders.registry import absolute_paths, encoder_kind, is_built_in
-from normlift_ns.encoders.text_files import TextEmbeddingFile
-from normlift_ns.errors import InputError, summarize_error
-from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeatureKind, RegionKind, SourceOptions
-from normlift_ns.segmentation.checkpoint import find_local_sam
-from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.segmentation.sam import SamMasks
-from normlift_ns.segmentation.sam3 import Sam3Masks
-
-
-@dataclass(frozen=True)
-class PluginEncoder:
-    """An encoder of another package. The wrapped object needs only `identity`, `encode` and `text`; if it has
-    `patches`, so does the adapter. Error messages name the encoder that failed.
-
-    Raises (from every method):
-        InputError: If the encoder fails, or returns something that `Encoder` does not allow.
-    """
-
-    name: str
-    encoder: Encoder
-
-    @classmethod
-    def made(cls, name: str, make: Callable[[], Encoder]) -> PluginEncoder:
-        """Make an encoder, and check that it has the required attributes."""
-        with _attribute_errors(name):
-            encoder = make()
-        missing = [x for x in ("identity", "encode", "text") if not hasattr(encoder, x)]
-        if len(missing) > 0:
-            raise InputError(f"encoder {name!r} of another package has no {' and no '.join(missing)}; fix that package")
-        return DensePluginEncoder(name, encoder) if hasattr(encoder, "patches") else cls(name, encoder)
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        with _attribute_errors(self.name):
-            return {"kind": self.name, **self.encoder.identity}
-
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        with _attribute_errors(self.name):
-            rows = self.encoder.encode(image, labels)
-        return self._check_rows(rows, int(labels.max()) + 1, "regions")
-
-    def encode_each(
-        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
-    ) -> Iterator[Float32[Tensor, "r d"]]:
-        return (self.encode(image, labels) for image, labels in views)
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        check_prompts(prompts)
-        with _attribute_errors(self.name):
-            rows = self.encoder.text(prompts)
-        return self._check_rows(rows, len(prompts), "texts")
-
-    def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
-        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length
-        1."""
-        if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
-            received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
-            raise InputError(
-                f"encoder {self.name!r} of another package returned {received} for {count} {units}, expected "
-                f"floats [{count}, D]; fix that package"
-            )
-        rows = rows.detach().float().cpu()
-        length = torch.linalg.vector_norm(rows, dim=1)
-        if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
-            raise InputError(
-                f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "
-                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them"
-            )
-        return rows
-
-
-@dataclass(frozen=True)
-class DensePluginEncoder(PluginEncoder):
-    """An encoder of another package that also has features of patches."""
-
-    @property
-    def why_not_dense(self) -> str | None:
-        return getattr(self.encoder, "why_not_dense", None)
-
-    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        with _attribute_errors(self.name):
-            features = self.encoder.patches(image, rows, columns)  # type: ignore[attr-defined]
-        return self._check_rows(features, rows * columns, "patches")
-
-
-@contextmanager
-def _attribute_errors(name: str) -> Iterator[None]:
-    """Attribute exceptions to the encoder of another package."""
-    try:
-        yield
-    except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
-        raise
-    except Exception as error:  # a third-party module may raise anything
-        raise InputError(f"encoder {name!r} of another package failed ({summarize_error(error)})") from error
-
-
-# Builders of feature sources, encoders and regions from `SourceOptions`.
+from normlift_ns.encoders.base import Encoder, FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.plugins import PluginEncoder, PluginRegions
+from normlift_ns.encoders.registry import ENCODERS, absolute_paths, encoder_kind
+from normlift_ns.encoders.text_files import TextEmbeddingFile, TextEncoder
+from normlift_ns.errors import InputError
+from normlift_ns.options import FeatureKind, SourceOptions
+from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -131,33 +31,25 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     if options.features not in get_args(FeatureKind):
         known = ", ".join(get_args(FeatureKind))
         raise InputError(f"unknown features {options.features!r}; --features is one of {known}")
-    if options.features == "none":
-        if options.features_dir is not None:
-            raise InputError(
-                f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
-            )
-        if options.text_vectors is not None:
-            raise InputError(
-                f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"
-            )
-        options = replace(options, regions=resolve_regions(options, device))
-        if options.regions == "patches":
-            return _make_patches(options, device)
-        return RegionFeatures(make_regions(options, device), make_encoder(options, device))
-    if options.features_dir is None:
-        raise InputError(f"--features {options.features} needs the folder of the features; give it with --features-dir")
-    if options.regions != "auto" or options.regions_dir is not None:
+    if options.features != "none":
+        return _make_masks(options, options.features, device)
+    if options.features_dir is not None:
         raise InputError(
-            "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
+            f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
         )
-    if not encoder_kind(options.encoder).learned and options.text_vectors is None:
-        raise InputError(
-            f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
-            "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
-        )
-    level: Any = options.level or "l"
-    texts = make_texts(options, device)
-    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+    if options.text_vectors is not None:
+        raise InputError(f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat")
+    name = resolve_regions(options, device)
+    masks = _make_masks(options, name, device)
+    return masks if MASK_SOURCES.load(name).has_features else RegionFeatures(masks, make_encoder(options, device))
+
+
+def _make_masks(options: SourceOptions, name: str, device: str) -> Any:
+    """Check the options of a mask source and make it: `Regions`, or a `FeatureSource` if it has features."""
+    source = check_mask_options(options, name)
+    if name in MASK_SOURCES.built_in or source.has_features:
+        return source.make(options, device)
+    return PluginRegions.made(name, lambda: source.make(options, device))
 
 
 _PATHS = ("regions_dir", "features_dir", "text_vectors")
@@ -234,31 +126,9 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         FileNotFoundError: If a weight file does not exist.
     """
     kind = encoder_kind(options.encoder)
-    if is_built_in(kind):
+    if options.encoder in ENCODERS.built_in:
         return kind.make(options, device)
     return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))
-
-
-def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionKind:
-    """Return the regions of the options, with "auto" resolved.
-
-    Raises:
-        ValueError: If the regions are unknown.
-    """
-    if options.regions not in get_args(RegionKind):
-        raise InputError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionKind))}")
-    if options.regions != "auto":
-        return options.regions
-    if options.regions_dir is not None:
-        return "files"
-    if options.sam_model is not None:
-        return "sam"
-    kind = encoder_kind(options.encoder)
-    if not kind.learned:
-        return "superpixel"
-    if device.startswith("cuda") and find_spec("transformers") is not None and find_local_sam(DEFAULT_SAM) is not None:
-        return "sam"
-    return "patches" if kind.has_patches(options) else "superpixel"
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
@@ -271,60 +141,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
             `SamMasks` and `Sam3Masks`.
         FileNotFoundError: If the folder or the SAM checkpoint does not exist.
     """
-    kind = resolve_regions(options, device)
-    if kind not in ("sam", "sam3"):
-        _reject_sam_options(options, kind)
-    if kind != "sam3":
-        _reject(" ".join(options.region_texts) or None, "--region-texts", kind, "sam3")
-    if kind == "files":
-        if options.regions_dir is None:
-            raise InputError(
-                'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
-            )
-        level = _parse_level(options.level)
-        return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
-    _reject(options.regions_dir, "--regions-dir", kind, "files")
-    if kind == "sam":
-        level: Any = options.level or "l"
-        return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
-    _reject(options.level, "--level", kind, "files or sam")
-    if kind == "sam3":
-        return Sam3Masks(options.region_texts, options.sam_model or DEFAULT_SAM3, device, options.sam_precision)
-    count = 256 if options.region_count is None else options.region_count
-    if kind == "patches":
-        raise InputError("patches have features already and cannot be used as regions; use make_source")
-    return Superpixels(count) if kind == "superpixel" else Grid(count)
-
-
-def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
-    """Return the patch features of the options; raise InputError for options of other regions."""
-    _reject_sam_options(options, "patches")
-    _reject(" ".join(options.region_texts) or None, "--region-texts", "patches", "sam3")
-    _reject(options.regions_dir, "--regions-dir", "patches", "files")
-    _reject(options.level, "--level", "patches", "files or sam")
-    encoder: Any = make_encoder(options, device)
-    if not hasattr(encoder, "patches"):
-        raise InputError(
-            f"--regions patches needs an encoder with patch features; --encoder {options.encoder} has none. Use "
-            "--regions superpixel or --encoder open_clip"
-        )
-    return PatchFeatures(encoder, 1024 if options.region_count is None else options.region_count)
-
-
-def _reject_sam_options(options: SourceOptions, kind: str) -> None:
-    """Raise InputError if an option of SAM is set."""
-    _reject(options.sam_model, "--sam-model", kind, "sam")
-    _reject(options.sam_precision if options.sam_precision != "auto" else None, "--sam-precision", kind, "sam")
-
-
-def _reject(value: object, flag: str, kind: str, intended: str) -> None:
-    """Raise InputError if an option is set that only applies to other regions."""
-    if value is not None:
-        raise InputError(f'{flag} {value} is for --regions {intended}, not for "{kind}"; leave one of them out')
-
-
-def _parse_level(level: str | None) -> int | None:
-    """Parse the level of label maps."""
-    if level is not None and not (level.isascii() and level.isdigit()):
-        raise InputError(f"--level must be the number of a map (0, 1, ...) with --regions files; got {level!r}")
-    return None if level is None else int(level)
+    name = resolve_regions(options, device)
+    if MASK_SOURCES.load(name).has_features:
+        raise InputError(f"{name} have features already and cannot be used as regions; use make_source")
+    return _make_masks(options, name, device)

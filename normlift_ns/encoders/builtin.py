@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from normlift_ns.encoders import registry
+from normlift_ns.encoders import weights
 from normlift_ns.encoders.huggingface import (
     MODEL_FAMILIES,
     ModelFamily,
@@ -16,21 +16,19 @@ from normlift_ns.encoders.huggingface import (
     check_transformers_version,
     resolve_model_name,
 )
+from normlift_ns.encoders.open_clip import OPEN_CLIP_REMEDY, missing_patches_reason
 from normlift_ns.encoders.registry import EncoderKind
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
 
 if TYPE_CHECKING:
-    from normlift_ns.encoders.base import Encoder, TextEncoder
+    from normlift_ns.encoders.base import Encoder
     from normlift_ns.encoders.color import ColorTextEncoder
-    from normlift_ns.encoders.text_files import CachedTextEncoder
+    from normlift_ns.encoders.text_files import CachedTextEncoder, TextEncoder
 
 
 _DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
 """Prefixes of weight identities that are digests of file contents rather than tags."""
-_REMEDY = (
-    "give a local weight file with --encoder-pretrained, or use the encoder that needs no weights: --encoder colour"
-)
 
 
 def _make_encoder(options: SourceOptions, device: str) -> Encoder:
@@ -91,21 +89,19 @@ def _check_weights(options: SourceOptions) -> None:
     model, pretrained = options.encoder_model, options.encoder_pretrained
     if Path(pretrained).is_file():
         return
-    if registry.is_local_path(pretrained, 1):
-        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {_REMEDY}")
-    if registry.has_local_clip_weights(model, pretrained) is False:
+    if weights.is_local_path(pretrained, 1):
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {OPEN_CLIP_REMEDY}")
+    if weights.has_local_clip_weights(model, pretrained) is False:
         try:
-            registry.check_hub_access()
+            weights.check_hub_access()
         except OSError as error:
             raise FileNotFoundError(
                 f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded "
-                f"({error}); go online once, {_REMEDY}"
+                f"({error}); go online once, {OPEN_CLIP_REMEDY}"
             ) from None
 
 
 def _has_patches(options: SourceOptions) -> bool:
-    from normlift_ns.encoders.open_clip_network import missing_patches_reason  # noqa: PLC0415 (needs torch)
-
     return missing_patches_reason(options.encoder_model) is None
 
 

@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, ViewFeatures
-from normlift_ns.encoders.prompts import UNIT_TOLERANCE
-from normlift_ns.encoders.text_files import cache_path
+from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.io.arrays import load_tensors, save_tensors
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from normlift_ns.encoders.prompts import check_prompts
+from normlift_ns.encoders.text_files import check_prompts
 from normlift_ns.errors import InputError, truncate_text
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders import registry
+from normlift_ns.encoders import weights
 from normlift_ns.errors import InputError, summarize_error, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
@@ -280,25 +280,28 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
     settings = settings.get("image_processor", settings)
     if not isinstance(settings, Mapping):
         raise InputError(f"image_processor of {file} is {type(settings).__name__}, expected an object")
-
-    def three(key: str, default: tuple[float, ...], minimum: float) -> tuple[float, ...]:
-        values = settings.get(key, list(default))
-        if not isinstance(values, list) or len(values) != 3:
-            raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
-        return tuple(_number(value, f"{key} of {file}", minimum, 1e3) for value in values)
-
-    normalize = settings.get("do_normalize", True) is not False
     factor = _number(settings.get("rescale_factor", 1 / 255), f"rescale_factor of {file}", 1e-6, 1e3)
+    factor = factor if settings.get("do_rescale", True) is not False else 1.0
+    mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    if settings.get("do_normalize", True) is not False:
+        mean = _channels(settings, "image_mean", family.mean, -1e3, file)
+        std = _channels(settings, "image_std", family.std, 1e-6, file)
+    if kind != "siglip2":
+        return PixelNormalization(factor, mean, std, _side(settings), None)
     patches = settings.get("max_num_patches", 256)
-    if kind == "siglip2" and (type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]):
+    if type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]:
         raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer")
-    return PixelNormalization(
-        factor if settings.get("do_rescale", True) is not False else 1.0,
-        three("image_mean", family.mean, -1e3) if normalize else (0.0, 0.0, 0.0),
-        three("image_std", family.std, 1e-6) if normalize else (1.0, 1.0, 1.0),
-        None if kind == "siglip2" else _side(settings),
-        patches if kind == "siglip2" else None,
-    )
+    return PixelNormalization(factor, mean, std, None, patches)
+
+
+def _channels(
+    settings: Mapping[str, Any], key: str, default: tuple[float, ...], minimum: float, file: str
+) -> tuple[float, ...]:
+    """Return one number per color channel."""
+    values = settings.get(key, list(default))
+    if not isinstance(values, list) or len(values) != 3:
+        raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
+    return tuple(_number(value, f"{key} of {file}", minimum, 1e3) for value in values)
 
 
 def _side(settings: Mapping[str, Any]) -> int | None:
@@ -415,7 +418,7 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
         read_model_folder(folder, family)
         return
     try:
-        registry.check_hub_access()
+        weights.check_hub_access()
     except OSError as error:
         raise _unreachable(model, family, error) from None
 
@@ -431,7 +434,7 @@ def check_model_name(model: str, family: ModelFamily) -> None:
         return
     if os.path.lexists(model):
         raise InputError(f"{model}, given with --encoder-model, is not a folder; {example}")
-    if registry.is_local_path(model, 2):
+    if weights.is_local_path(model, 2):
         raise FileNotFoundError(f"{model}, given with --encoder-model, does not exist; {example}")
     if len(Path(model).parts) != 2:
         raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
@@ -442,7 +445,7 @@ def find_local_model(model: str) -> Path | None:
     incomplete."""
     if os.path.isdir(model):
         return Path(model).resolve()
-    if not registry.is_in_hub_cache(model, CONFIG_FILE):
+    if not weights.is_in_hub_cache(model, CONFIG_FILE):
         return None
     hub = importlib.import_module("huggingface_hub")
     config, *weight_files = (
@@ -465,7 +468,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
         return local
     hub = importlib.import_module("huggingface_hub")
     try:
-        registry.check_hub_access()
+        weights.check_hub_access()
         folder = Path(hub.snapshot_download(model, allow_patterns=[CONFIG_FILE]))
     except Exception as error:  # download clients raise exceptions without a common base class
         raise _unreachable(model, family, error) from None

@@ -13,20 +13,19 @@ Position embeddings are interpolated as in transformers.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import torch
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.nn.functional import linear, normalize
+from torch.nn.functional import linear
 
-from normlift_ns.encoders.base import resize_image
-from normlift_ns.encoders.batching import AdaptiveBatches, CropNetwork, encode_crops
+from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.huggingface import (
     MODEL_FAMILIES,
     TOKENIZER_FILE,
@@ -37,8 +36,6 @@ from normlift_ns.encoders.huggingface import (
     patches_per_side,
     read_model_folder,
 )
-from normlift_ns.encoders.prompts import check_prompts
-from normlift_ns.encoders.text_files import check_template, prompt_templates
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import CropFill
@@ -69,6 +66,11 @@ class HuggingFaceNetwork:
     def patch(self) -> int:
         """Side of a patch, in pixels."""
         return self.model.config.vision_config.patch_size
+
+    @property
+    def patch_size(self) -> tuple[int, int]:
+        """Height and width of a patch, in pixels."""
+        return self.patch, self.patch
 
     @property
     def width(self) -> int:
@@ -239,16 +241,9 @@ def _load_tokenizer(folder: ModelFolder, config: Any) -> Any:
     return tokenizer
 
 
-# Encoder with networks of transformers: masked square crops of regions, or patches, compared with text.
-
-
-_BATCH_SIZE = {"cuda": 128, "cpu": 8}
-
-
 @dataclass(frozen=True)
-class HuggingFaceEncoder:
-    """SigLIP, SigLIP 2 or MetaCLIP 2 features of masked crops. The weights are loaded at their first use, in half
-    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
+class HuggingFaceEncoder(NetworkEncoder):
+    """SigLIP, SigLIP 2 or MetaCLIP 2 features; see `NetworkEncoder`.
 
     Raises:
         ValueError: If the model is neither a folder nor a hub name, the fill is unknown, or the template has no
@@ -261,16 +256,10 @@ class HuggingFaceEncoder:
     model: str
     """Folder, or name on the hub."""
     fill: CropFill = "black"
-    """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Device of the network; results are always on the CPU."""
     template: str = "{}"
-    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
-    def __post_init__(self) -> None:
-        if self.fill not in get_args(CropFill):
-            raise InputError(f"crop fill must be one of {', '.join(get_args(CropFill))}; got {self.fill!r}")
-        check_template(self.template)
+    def _check_names(self) -> None:
         check_model_name(self.model, self.family)
 
     @property
@@ -288,48 +277,20 @@ class HuggingFaceEncoder:
     def why_not_dense(self) -> None:
         """None, because all networks of these families have patches."""
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """Return one unit row per region; see `Encoder.encode`.
+    @cached_property
+    def network(self) -> HuggingFaceNetwork:
+        return load_huggingface_network(self._folder, self.family, self.device)
 
-        Raises:
-            FileNotFoundError: If the network cannot be downloaded.
-            ValueError: If the folder is damaged or of another architecture.
-            MemoryError: If not even one crop fits into the memory of the device.
-        """
-        return next(self.encode_each([(image, labels)]))
+    def _width(self) -> int:
+        return self.network.width
 
-    def encode_each(
-        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
-    ) -> Iterator[Float32[Tensor, "r d"]]:
-        """Yield the features of several views; their crops share batches. Raises as `encode`."""
-        network = CropNetwork(lambda: self.network.size, self._image_rows, lambda: self.network.width)
-        return encode_crops(views, network, self._crops, self.fill, self.device)
-
-    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """Return one unit row per patch, see `DenseEncoder.patches`; formulas in `hub.network`."""
-        side = self.network.patch
-        pixels = resize_image(image.to(self.device), rows * side, columns * side)
-        return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
-        check_prompts(prompts)
-        templates = prompt_templates(self.template)
-        texts = [self.family.read(template(prompt)) for prompt in prompts for template in templates]
-        empty = [i for i, text in enumerate(texts) if not text.strip()]
-        if len(empty) > 0:
+    def _prepare(self, prompt: str, text: str) -> str:
+        text = self.family.read(text)
+        if not text.strip():
             raise InputError(
-                f"text {prompts[empty[0] // len(templates)]!r} has no letters or digits, and {self.family.title} "
-                "ignores everything else; use words"
+                f"text {prompt!r} has no letters or digits, and {self.family.title} ignores everything else; use words"
             )
-        rows = torch.cat(list(self._texts(self._text_rows, texts)))
-        return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
-
-    def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
-        return normalize(self.network.images(crops).float(), dim=1).cpu()
-
-    def _text_rows(self, texts: Sequence[str]) -> Float32[Tensor, "b d"]:
-        return normalize(self.network.texts(texts).float(), dim=1).cpu()
+        return text
 
     @cached_property
     def _folder(self) -> ModelFolder:
@@ -338,16 +299,3 @@ class HuggingFaceEncoder:
     @cached_property
     def _digest(self) -> str:
         return file_digest(*self._folder.files)
-
-    @cached_property
-    def network(self) -> HuggingFaceNetwork:
-        """The network with its weights, loaded at its first use; raises as `encode`."""
-        return load_huggingface_network(self._folder, self.family, self.device)
-
-    @cached_property
-    def _crops(self) -> AdaptiveBatches:
-        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
-
-    @cached_property
-    def _texts(self) -> AdaptiveBatches:
-        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])

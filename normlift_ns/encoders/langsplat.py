@@ -29,12 +29,11 @@ from torch.nn.functional import normalize
 from normlift_ns.encoders.base import (
     FeatureSource,
     RegionFeatures,
-    TextEncoder,
     ViewFeatures,
     check_files_distinct,
     joint_partition,
 )
-from normlift_ns.encoders.prompts import UNIT_TOLERANCE
+from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.atomic import atomic_file

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from normlift_ns.encoders.registry import check_server, find_in_hub_cache
+from normlift_ns.encoders.weights import check_server, find_in_hub_cache, is_local_path
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.options import DEFAULT_MODEL
 
@@ -58,6 +58,16 @@ def open_clip_model_config(model: str) -> dict[str, Any] | None:
     return config if set(config) >= _REQUIRED_KEYS else None
 
 
+def missing_patches_reason(model: str) -> str | None:
+    """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
+    vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
+    if "timm_model_name" in vision:
+        return "its image encoder is timm's"
+    if not isinstance(vision.get("layers"), int):
+        return "its image encoder is a convolutional network"
+    return "it pools by attention" if vision.get("attentional_pool") else None
+
+
 def _folder() -> Path:
     """Return the folder of the open_clip package."""
     spec = find_spec("open_clip")
@@ -73,7 +83,6 @@ OPEN_CLIP_REMEDY = (
     "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
     "the encoder that needs no weights: --encoder colour"
 )
-_WEIGHT_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 
 
 def import_open_clip() -> Any:
@@ -123,7 +132,7 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
         raise InputError(
             f"{pretrained} is not a weight file of an OpenCLIP model (--encoder-pretrained); {OPEN_CLIP_REMEDY}"
         )
-    if path.suffix in _WEIGHT_SUFFIXES or len(path.parts) > 1:
+    if is_local_path(pretrained, 1):
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {OPEN_CLIP_REMEDY}")
     known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
     raise InputError(

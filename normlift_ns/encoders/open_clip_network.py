@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast
 
 import torch
-from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int64
 from safetensors import safe_open
 from torch import Tensor
 from torch.nn.functional import gelu, interpolate, layer_norm, linear, normalize, scaled_dot_product_attention
 
-from normlift_ns.encoders.base import resize_image
-from normlift_ns.encoders.batching import AdaptiveBatches, CropNetwork, encode_crops
+from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.open_clip import (
     OPEN_CLIP_REMEDY,
     check_open_clip_names,
     find_open_clip_weights,
     import_open_clip,
     import_open_clip_module,
+    missing_patches_reason,
     open_clip_model_config,
 )
-from normlift_ns.encoders.prompts import check_prompts
-from normlift_ns.encoders.registry import THIRD_PARTY_ERRORS, find_in_hub_cache
-from normlift_ns.encoders.text_files import check_template, prompt_templates
+from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
+from normlift_ns.encoders.weights import THIRD_PARTY_ERRORS, find_in_hub_cache
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
@@ -46,6 +45,24 @@ class OpenClipNetwork(NamedTuple):
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Return pixels, 0..255, on the device, normalized for the model."""
         return ((pixels / 255 - self.mean) / self.std).to(torch.float16 if pixels.is_cuda else torch.float32)
+
+    @property
+    def patch_size(self) -> tuple[int, int]:
+        """Height and width of a patch, in pixels."""
+        height, width = self.model.visual.patch_size
+        return height, width
+
+    def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
+        """Embed images; see `JointNetwork.images`."""
+        return self.model.encode_image(self.normalized(pixels))
+
+    def patches(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
+        """Embed patches; see `patch_embeddings`."""
+        return patch_embeddings(self.model.visual, self.normalized(pixels))
+
+    def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
+        """Embed texts."""
+        return self.model.encode_text(self.tokenizer(list(texts)).to(self.mean.device))
 
 
 def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
@@ -101,16 +118,6 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
 # of patches, preserving its aspect ratio, and position embeddings are interpolated to that grid.
 
 
-def missing_patches_reason(model: str) -> str | None:
-    """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
-    vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
-    if "timm_model_name" in vision:
-        return "its image encoder is timm's"
-    if not isinstance(vision.get("layers"), int):
-        return "its image encoder is a convolutional network"
-    return "it pools by attention" if vision.get("attentional_pool") else None
-
-
 @torch.no_grad()
 def patch_embeddings(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
     """Return patch tokens in the joint space, row by row, not normalized.
@@ -141,16 +148,9 @@ def _positions(visual: Any, rows: int, columns: int) -> Float[Tensor, "n d"]:
     return torch.cat([learned[:1], grid[0].flatten(1).T])
 
 
-# OpenCLIP encoder: masked square crops of regions, compared with text.
-
-
-_BATCH_SIZE = {"cuda": 128, "cpu": 8}
-
-
 @dataclass(frozen=True)
-class OpenClipEncoder:
-    """CLIP features of masked crops, computed with open_clip. The weights are loaded at their first use, in half
-    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
+class OpenClipEncoder(NetworkEncoder):
+    """CLIP features, computed with open_clip; see `NetworkEncoder`.
 
     Raises:
         ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
@@ -163,39 +163,15 @@ class OpenClipEncoder:
     pretrained: str = DEFAULT_PRETRAINED
     """Tag of weights to download, or a weight file of that architecture. Pickles are read with weights_only=True."""
     fill: CropFill = "black"
-    """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Device of the network; results are always on the CPU."""
     template: str = "{}"
-    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
-    def __post_init__(self) -> None:
-        if self.fill not in get_args(CropFill):
-            raise InputError(f"crop fill must be one of {', '.join(get_args(CropFill))}; got {self.fill!r}")
-        check_template(self.template)
+    def _check_names(self) -> None:
         check_open_clip_names(self.model, self.pretrained)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Settings of the image features. A weight file is identified by its content, independent of its path."""
         return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
-
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """Return one unit row per region; see `Encoder.encode`.
-
-        Raises:
-            FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the weight file is damaged or of another architecture.
-            MemoryError: If not even one crop fits into the memory of the device.
-        """
-        return next(self.encode_each([(image, labels)]))
-
-    def encode_each(
-        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
-    ) -> Iterator[Float32[Tensor, "r d"]]:
-        """Yield the features of several views; their crops share batches. Raises as `encode`."""
-        network = CropNetwork(lambda: self.network.size, self._image_rows, self._width)
-        return encode_crops(views, network, self._crops, self.fill, self.device)
 
     @property
     def why_not_dense(self) -> str | None:
@@ -207,50 +183,17 @@ class OpenClipEncoder:
             f"Use --encoder-model {DEFAULT_MODEL}, or other regions"
         )
 
-    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        visual = self.network.model.visual
-        patch_height, patch_width = visual.patch_size
-        pixels = self.network.normalized(
-            resize_image(image.to(self.device), rows * patch_height, columns * patch_width)
-        )
-        return normalize(patch_embeddings(visual, pixels)[0].float(), dim=1).cpu()
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
-        check_prompts(prompts)
-        templates = prompt_templates(self.template)
-        tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])
-        rows = torch.cat(list(self._texts(self._text_rows, tokens.to(self.device))))
-        return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
+    @cached_property
+    def network(self) -> OpenClipNetwork:
+        return load_open_clip(self.model, self.pretrained, self.device)
 
     def _width(self) -> int:
         return cast(Any, open_clip_model_config(self.model))["embed_dim"]
-
-    @torch.no_grad()
-    def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
-        return normalize(self.network.model.encode_image(self.network.normalized(crops)).float(), dim=1).cpu()
-
-    @torch.no_grad()
-    def _text_rows(self, tokens: Tensor) -> Float32[Tensor, "b d"]:
-        return normalize(self.network.model.encode_text(tokens).float(), dim=1).cpu()
 
     @cached_property
     def _weights_identity(self) -> str:
         path = Path(self.pretrained)
         return file_digest(path) if path.is_file() else self.pretrained
-
-    @cached_property
-    def network(self) -> OpenClipNetwork:
-        """The model with its weights, loaded at its first use; raises as `encode`."""
-        return load_open_clip(self.model, self.pretrained, self.device)
-
-    @cached_property
-    def _crops(self) -> AdaptiveBatches:
-        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
-
-    @cached_property
-    def _texts(self) -> AdaptiveBatches:
-        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
 
 
 # The CLIP text tower in plain torch, for prompts that are not cached.

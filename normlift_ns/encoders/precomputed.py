@@ -13,8 +13,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.base import ViewFeatures
-from normlift_ns.encoders.prompts import check_prompts, unit_rows
-from normlift_ns.encoders.text_files import look_up_embeddings
+from normlift_ns.encoders.text_files import check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
 
 
@@ -34,23 +33,11 @@ class PrecomputedFeatures:
     """Embeddings by text."""
 
     def __post_init__(self) -> None:
-        lengths = set()
         for name, (labels, vectors) in self.views.items():
-            if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
-                raise InputError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
-            low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
-            if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
-                raise InputError(
-                    f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
-                    f"{tuple(labels.shape)} with values in {low}..{high}"
-                )
-            lengths.add(vectors.shape[1])
+            _check_view(name, labels, vectors)
         for text, vector in self.texts.items():
-            if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
-                raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
-            if text.strip() == "" or text.endswith(".npy") or "\0" in text:
-                raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains NUL characters")
-            lengths.add(len(vector))
+            _check_text(text, vector)
+        lengths = {vectors.shape[1] for _, vectors in self.views.values()} | {len(x) for x in self.texts.values()}
         if len(lengths) > 1:
             raise InputError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
 
@@ -86,6 +73,26 @@ class PrecomputedFeatures:
         check_prompts(prompts)
         known = {text: vector.cpu() for text, vector in self.texts.items()}
         return torch.from_numpy(look_up_embeddings(prompts, known, "the given texts"))
+
+
+def _check_view(name: str, labels: Tensor, vectors: Tensor) -> None:
+    """Raise InputError unless the labels name regions that have a vector with a direction."""
+    if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
+        raise InputError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
+    low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
+    if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
+        raise InputError(
+            f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
+            f"{tuple(labels.shape)} with values in {low}..{high}"
+        )
+
+
+def _check_text(text: str, vector: Tensor) -> None:
+    """Raise InputError unless the text can be stored and its vector has a direction."""
+    if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
+        raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
+    if text.strip() == "" or text.endswith(".npy") or "\0" in text:
+        raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains NUL characters")
 
 
 def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> PrecomputedFeatures:

@@ -1,4 +1,4 @@
-"""Prompt templates, files of text embeddings, and the cache of embedded prompts."""
+"""Prompts, their templates, and their embeddings in files and in the cache. Imports no torch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from jaxtyping import Float32
 from xxhash import xxh3_128
 
-from normlift_ns.encoders.prompts import UNIT_TOLERANCE, check_prompts, unit_rows
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.io.arrays import array_digest, load_arrays, read_npy_bytes, save_arrays
 from normlift_ns.io.atomic import atomic_file, file_digest
@@ -28,7 +27,50 @@ from normlift_ns.io.atomic import atomic_file, file_digest
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from normlift_ns.encoders.base import TextEncoder
+
+class TextEncoder(Protocol):
+    """The part of an encoder that queries need."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """See `FeatureSource.identity`."""
+        ...
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """See `FeatureSource.text`."""
+        ...
+
+
+UNIT_TOLERANCE = 1e-3
+"""Largest deviation from length 1 of a unit vector; half precision leaves 5e-4."""
+
+
+def check_prompts(prompts: Sequence[str]) -> None:
+    """Raise ValueError unless `prompts` is a list of at least one text, none of them empty."""
+    if isinstance(prompts, str):
+        raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
+    if len(prompts) == 0:
+        raise InputError('no text given; name at least one object to search for, such as --text "orange"')
+    for prompt in prompts:
+        if not isinstance(prompt, str) or "\0" in prompt:
+            raise InputError(f"a text must be a str without NUL characters, got {prompt!r:.60}")
+    empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
+    if len(empty) > 0:
+        raise InputError(
+            f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or describe what "
+            "to search for"
+        )
+
+
+def unit_rows(vectors: Any) -> Float32[np.ndarray, "*n d"]:
+    """Return vectors normalized to unit length, without overflow or underflow; they must be finite and not zero.
+
+    >>> unit_rows(np.array([3e-320, 4e-320])), unit_rows(np.array([3e38, 3e38], np.float32))
+    (array([0.6, 0.8], dtype=float32), array([0.70710677, 0.70710677], dtype=float32))
+    """
+    rows = np.asarray(vectors).astype(np.float64)
+    rows = rows / np.abs(rows).max(axis=-1, keepdims=True)
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
 
 
 ENSEMBLE = "ensemble"

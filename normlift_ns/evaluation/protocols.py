@@ -21,7 +21,8 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
 from normlift_ns.core.relevancy import relevancy
 from normlift_ns.core.scene import Scene, Views
-from normlift_ns.encoders.base import TextEncoder, check_files_distinct
+from normlift_ns.encoders.base import check_files_distinct
+from normlift_ns.encoders.text_files import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.lerf import (
     FrameScores,

@@ -19,12 +19,12 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.registry import check_server
+from normlift_ns.encoders.weights import SAM_WEIGHT_FILES, check_server, is_local_path
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 
-WEIGHTS_FILE = "model.safetensors"
+WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
 _MIN_TORCH = (2, 6)
@@ -102,12 +102,8 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
         other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
-        hint = (
-            ""
-            if other is None
-            else f" ({other.name} takes {'text prompts' if kinds is POINT_PROMPT_FAMILIES else 'points'}: "
-        )
-        hint += "" if other is None else f"--regions {'sam3' if kinds is POINT_PROMPT_FAMILIES else 'sam'})"
+        prompts, regions = ("text prompts", "sam3") if kinds is POINT_PROMPT_FAMILIES else ("points", "sam")
+        hint = "" if other is None else f" ({other.name} takes {prompts}: --regions {regions})"
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
     _check_supported(kind)
@@ -233,7 +229,6 @@ SAM3_REMEDY = (
     "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment"
 )
 _REMEDIES = {"SAM": SAM_REMEDY, "SAM 3": SAM3_REMEDY}
-_FILES = (WEIGHTS_FILE, "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
@@ -292,7 +287,7 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
         return
     if os.path.lexists(path):
         raise InputError(f"{title} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
-    if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
+    if is_local_path(checkpoint, 2):
         raise FileNotFoundError(f"{title} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
     if len(path.parts) != 2:
         raise InputError(
@@ -305,12 +300,12 @@ def _title(kinds: Mapping[str, SamFamily]) -> str:
     return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
 
 
-def find_local_sam(checkpoint: str) -> Path | None:
+def _find_local_sam(checkpoint: str) -> Path | None:
     """Return the path of a checkpoint on this machine, including the cache of the hub; None if there is none."""
     if os.path.exists(checkpoint):
         return Path(checkpoint).resolve()
     hub = importlib.import_module("huggingface_hub")
-    for file in _FILES:
+    for file in SAM_WEIGHT_FILES:
         config, weights = (hub.try_to_load_from_cache(checkpoint, name) for name in ("config.json", file))
         if isinstance(config, str) and isinstance(weights, str):
             return Path(weights).parent
@@ -333,15 +328,11 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
         ValueError: If the checkpoint is damaged, its network does not take points, or the installed torch cannot run
             it.
     """
-    path = find_local_sam(checkpoint) or download_sam(checkpoint, POINT_PROMPT_FAMILIES)
+    path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
     folder = transformers_folder(path)
-    if folder is None:
-        return SAM, load_sam(str(path))
     with checkpoint_errors(path):
-        kind = read_sam_family(folder, POINT_PROMPT_FAMILIES)
-        if kind is not SAM:
-            return kind, load_pretrained_sam(folder, kind)
-    return kind, load_sam(str(path))
+        kind = SAM if folder is None else read_sam_family(folder, POINT_PROMPT_FAMILIES)
+        return kind, _load_first_sam(path) if folder is None or kind is SAM else load_pretrained_sam(folder, kind)
 
 
 def transformers_folder(path: Path) -> Path | None:
@@ -372,32 +363,37 @@ def load_sam(checkpoint: str) -> Any:
         FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
         ValueError: If the checkpoint is damaged or not of the first SAM.
     """
-    path = find_local_sam(checkpoint) or download_sam(checkpoint, POINT_PROMPT_FAMILIES)
+    path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
     with checkpoint_errors(path):
-        config, state = _read_folder(path) if path.is_dir() else _read_file(path)
-        for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
-            if other in state:
-                state.setdefault(name, state[other])
-        with torch.device("meta"):
-            model = import_transformers().SamModel(config)
-        model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
+        return _load_first_sam(path)
+
+
+def _load_first_sam(path: Path) -> Any:
+    config, state = _read_folder(path) if path.is_dir() else _read_file(path)
+    for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
+        if other in state:
+            state.setdefault(name, state[other])
+    with torch.device("meta"):
+        model = import_transformers().SamModel(config)
+    model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
     return model.eval().requires_grad_(False)
 
 
-def download_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[str] = ()) -> Path:
-    """Download a checkpoint from the hub: config.json first, the weights only if it names one of `kinds`.
+def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[str] = ()) -> Path:
+    """Return the path of a checkpoint. If it is not on this machine, download it from the hub: config.json first, the
+    weights only if it names one of `kinds`.
 
     Args:
         checkpoint: Name on the hub.
         kinds: Networks by the model type of config.json.
         more: Patterns of further files.
 
-    Returns:
-        The folder of the checkpoint.
-
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
+    local = _find_local_sam(checkpoint)
+    if local is not None:
+        return local
     hub = importlib.import_module("huggingface_hub")
     try:
         check_server(hub.constants.ENDPOINT)
@@ -418,7 +414,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
         raise InputError(f"the folder does not hold {_FIRST}")
     files = _weight_files(folder)
     if len(files) == 0:
-        raise InputError(f"the folder has no {_FILES[0]}")
+        raise InputError(f"the folder has no {WEIGHTS_FILE}")
     config = json.loads((folder / "config.json").read_text())
     check_config_sizes(config)
     return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
@@ -426,7 +422,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
 
 def _weight_files(folder: Path) -> list[Path]:
     """Return the weight file of a folder, or an empty list."""
-    return [folder / name for name in _FILES if (folder / name).is_file()][:1]
+    return [folder / name for name in SAM_WEIGHT_FILES if (folder / name).is_file()][:1]
 
 
 def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:

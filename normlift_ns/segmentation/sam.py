@@ -275,12 +275,12 @@ _MEAN = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
 _STD = torch.tensor([58.395, 57.12, 57.375])[:, None, None]
 _BATCHES = {"cuda": (5, 256, 64), "cpu": (1, 16, 16)}
 """Images, prompts and masks per batch."""
-_DEFAULT_PRECISION: dict[str, SamPrecision] = {"cuda": "float16", "cpu": "float32"}
 
 
 def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
     """Return the precision of a network on a device; "auto" becomes the default of the device."""
-    return _DEFAULT_PRECISION[torch.device(device).type] if precision == "auto" else precision
+    default: SamPrecision = "float16" if torch.device(device).type == "cuda" else "float32"
+    return default if precision == "auto" else precision
 
 
 class PromptedNetwork(ABC):

@@ -22,10 +22,9 @@ from normlift_ns.segmentation.checkpoint import (
     WEIGHTS_FILE,
     check_sam_checkpoint,
     checkpoint_errors,
-    download_sam,
-    find_local_sam,
     import_transformers,
     load_pretrained_sam,
+    locate_sam,
     read_sam_family,
     transformers_folder,
 )
@@ -79,7 +78,7 @@ class Sam3Network:
             ValueError: If the checkpoint is damaged or of another network, or if the installed torch or transformers
                 cannot run it.
         """
-        path = find_local_sam(checkpoint) or download_sam(checkpoint, TEXT_PROMPT_FAMILIES, _TOKENIZER_FILES)
+        path = locate_sam(checkpoint, TEXT_PROMPT_FAMILIES, _TOKENIZER_FILES)
         with checkpoint_errors(path, "SAM 3"):
             folder = transformers_folder(path)
             if folder is None:

@@ -57,7 +57,7 @@ def test_bad_options_say_what_to_do(tmp_path):
     for options, parts in (
         ({"regions": "patches"}, ["--regions patches", "--encoder colour"]),
         ({"regions": "patches", "level": "l"}, ["--level l", '"patches"']),
-        ({"regions": "sam", "level": "2"}, ["default, s, m, l", "'2'"]),
+        ({"regions": "sam", "level": "2"}, ["s, m, l, default", "'2'"]),
         ({"regions": "sam", "regions_dir": Path()}, ["--regions-dir .", '"sam"']),
         ({"regions": "superpixel", "regions_dir": tmp_path}, [f"--regions-dir {tmp_path}", "--regions files"]),
         ({"regions": "grid", "sam_model": "x/y"}, ["--sam-model x/y", "--regions sam", '"grid"']),

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from normlift_ns.encoders.base import PatchFeatures, resize_image
-from normlift_ns.encoders.batching import masked_crops, region_boxes
+from normlift_ns.encoders.crops import masked_crops, region_boxes
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from tests.encoders.tiny import HUB, noise
 

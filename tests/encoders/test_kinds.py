@@ -10,22 +10,23 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from normlift_ns.cli.preflight import check_source_options
-from normlift_ns.encoders.build import make_encoder
+from normlift_ns.encoders.build import make_encoder, make_source
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
 from normlift_ns.encoders.registry import (
-    BUILT_IN_ENCODERS,
-    ENTRY_POINT_GROUP,
+    ENCODERS,
     encoder_kind,
-    encoder_names,
     find_encoder_kind,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation.registry import MASK_SOURCES
 from tests.encoders.tiny import refused
 
 if sys.version_info >= (3, 11):
@@ -57,16 +58,17 @@ def plugged(folder: Path, package: str, points: str, code: str) -> Iterator[None
 
 
 def points(**encoders: str) -> str:
-    return f"[{ENTRY_POINT_GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
+    return f"[{ENCODERS.group}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
 
 
 def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     """So that they are found without metadata too, as in a source tree on PYTHONPATH."""
-    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][
-        ENTRY_POINT_GROUP
-    ]
-    assert registered == BUILT_IN_ENCODERS
-    assert sorted(registered) == encoder_names() == OURS
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"]
+    for registry in (ENCODERS, MASK_SOURCES):
+        assert registered[registry.group] == registry.built_in
+        assert sorted(registry.built_in) == registry.names()
+        assert all(registry.load(name) is not None for name in registry.names())
+    assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
         assert (kind.rule, kind.threshold) == (("cosine" if name == "colour" else "lerf"), 0.5)
@@ -91,11 +93,11 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
         ("plug:", "", ["cannot be loaded"]),
     )):  # fmt: skip
-        install(tmp_path / str(number), "worse", f"[{ENTRY_POINT_GROUP}]\nno value at all\n= = =\n[")
+        install(tmp_path / str(number), "worse", f"[{ENCODERS.group}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
             assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.builtin"
-            assert encoder_names() == ["bad", *OURS]
+            assert ENCODERS.names() == ["bad", *OURS]
 
 
 WRONG = """
@@ -123,6 +125,42 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
         code = WRONG.format(rows=rows, made=made)
         with plugged(tmp_path / str(number), "wrong_plug", points(wrong="wrong_plug:KIND"), code):
             refused(lambda: make_encoder(SourceOptions(encoder="wrong")).encode(image, labels), *parts)
+
+
+MASKS = """
+import torch
+from normlift_ns.segmentation.registry import MaskSource
+class Halves:
+    identity = {{"version": 1}}
+    def labels(self, image, name): return {labels}
+HALVES = MaskSource(lambda options, device: Halves(), options=("level",))
+"""
+
+
+def test_another_package_adds_masks(tmp_path: Path) -> None:
+    image, halves = torch.zeros(4, 2, 3, dtype=torch.uint8), "torch.arange(2).repeat(4, 1)"
+    entry = f"[{MASK_SOURCES.group}]\nhalves = halves_plug:HALVES\nlangsplat = halves_plug:HALVES\n"
+
+    def options(**more: Any) -> SourceOptions:
+        return SourceOptions(**{"encoder": "colour", "regions": "halves", **more})
+
+    refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
+    with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
+        check_source_options(options(level="2"), ())
+        source = make_source(options(level="2"))
+        assert source.identity["regions"] == {"kind": "halves", "version": 1}
+        view = source.view(image, "a.png")
+        assert len(view.features) == 2 and view.labels.tolist() == [[0, 1]] * 4
+        assert cached(source, tmp_path / "cache").view(image, "a.png").labels.equal(view.labels)
+        refused(lambda: check_source_options(options(sam_model="a/b"), ()), "--sam-model a/b", '"halves"')
+        refused(lambda: options(regions="langsplat"), "auto, sam, sam3, patches, superpixel, grid, files, halves")
+    for number, (labels, parts) in enumerate((
+        ("torch.zeros(2, 2)", ["torch.float32 (2, 2)", "(4, 2)", "[H, W]"]),
+        (f"{halves} * 2", ["0..2", "without gaps"]),
+        ("1 / 0", ["ZeroDivisionError"]),
+    )):  # fmt: skip
+        with plugged(tmp_path / str(number), "halves_plug", entry, MASKS.format(labels=labels)):
+            refused(lambda: make_source(options()).view(image, "a.png"), "'halves'", *parts)
 
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.segmentation.checkpoint import load_sam
 from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, resolve_precision
 from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
@@ -75,3 +76,8 @@ def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
     for precision, bound in {**BOUNDS, "float32": 1e-4}.items():
         network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
         close(network.decode(embedding.cuda(), POINTS), expected, bound)
+
+
+def test_other_devices_get_the_settings_of_the_cpu() -> None:
+    assert resolve_precision("auto", "mps") == "float32" and resolve_precision("float16", "mps") == "float16"
+    assert OpenClipEncoder(device="mps")._crops.size == OpenClipEncoder()._crops.size

@@ -243,7 +243,7 @@ def test_levels_of_sam(little, clip, tmp_path, monkeypatch, capsys):
 
     write_sam(tmp_path / "sam.pth", seed=1, gain=6)
     rules = MaskRules(points_per_side=4, predicted_iou=0.5, stability=0.3)
-    monkeypatch.setattr("normlift_ns.encoders.build.SamMasks", functools.partial(SamMasks, rules=rules))
+    monkeypatch.setattr("normlift_ns.segmentation.sam.SamMasks", functools.partial(SamMasks, rules=rules))
     flags = ("--load-config", little, *clip, "--sam-model", tmp_path / "sam.pth", "--output-dir", tmp_path)
     shares = []
     for level in ("l", "s"):

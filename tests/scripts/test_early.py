@@ -10,7 +10,7 @@ import pytest
 from normlift_ns.cli import evaluate, export, lift, query, view
 from normlift_ns.cli.preflight import check_unused_options
 from normlift_ns.data.nerfstudio.config_file import read_config_paths
-from normlift_ns.encoders import registry
+from normlift_ns.encoders import weights
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 from tests.scripts.conftest import run_entry, said
@@ -68,7 +68,7 @@ LIFT = [
     ("--regions-dir [/red]", "[/red], given with --regions-dir"),
     ("--regions files", '"files"', "--regions-dir"),
     ("--regions sam --level x", "--level must be one of s, m, l, default for sam, got 'x'"),
-    ("--regions grid --level l", "--level 'l'", '"grid"'),
+    ("--regions grid --level l", "--level l", '"grid"'),
     ("--regions-dir room --level x", "--level", "number of a map"),
     ("--sam-model a/b/c.pth", "a/b/c.pth, given with --sam-model"),
     ("--features langsplat", "'langsplat'", "--features-dir"),
@@ -204,7 +204,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
     def unreachable(address: str) -> None:
         raise ConnectionError(f"{address} cannot be reached")
 
-    monkeypatch.setattr(registry, "check_server", unreachable)
+    monkeypatch.setattr(weights, "check_server", unreachable)
     monkeypatch.setenv("HF_ENDPOINT", "https://hub")
     for there in (False, True, None):
         asked: list[tuple[str, ...]] = []
@@ -213,7 +213,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
             asked.append(name)
             return there
 
-        monkeypatch.setattr(registry, "has_local_clip_weights", at_hand, raising=False)
+        monkeypatch.setattr(weights, "has_local_clip_weights", at_hand, raising=False)
         code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, "--timestamp", "old")
         assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
         text = said(capsys)

@@ -1,0 +1,168 @@
+"""Adapters for encoders and mask sources of other packages: check their results and attribute their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float32, Int32, UInt8
+from torch import Tensor
+
+from normlift_ns.encoders.base import Encoder
+from normlift_ns.encoders.text_files import UNIT_TOLERANCE, check_prompts
+from normlift_ns.errors import InputError, summarize_error
+
+
+@dataclass(frozen=True)
+class PluginEncoder:
+    """An encoder of another package. The wrapped object needs only `identity`, `encode` and `text`; if it has
+    `patches`, so does the adapter. Error messages name the encoder that failed.
+
+    Raises (from every method):
+        InputError: If the encoder fails, or returns something that `Encoder` does not allow.
+    """
+
+    name: str
+    encoder: Encoder
+
+    @classmethod
+    def made(cls, name: str, make: Callable[[], Encoder]) -> PluginEncoder:
+        """Make an encoder, and check that it has the required attributes."""
+        with _attribute_errors("encoder", name):
+            encoder = make()
+        _check_attributes("encoder", name, encoder, ("identity", "encode", "text"))
+        return DensePluginEncoder(name, encoder) if hasattr(encoder, "patches") else cls(name, encoder)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        with _attribute_errors("encoder", self.name):
+            return {"kind": self.name, **self.encoder.identity}
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        with _attribute_errors("encoder", self.name):
+            rows = self.encoder.encode(image, labels)
+        return self._check_rows(rows, int(labels.max()) + 1, "regions")
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        return (self.encode(image, labels) for image, labels in views)
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        check_prompts(prompts)
+        with _attribute_errors("encoder", self.name):
+            rows = self.encoder.text(prompts)
+        return self._check_rows(rows, len(prompts), "texts")
+
+    def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
+        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length
+        1."""
+        if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
+            received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
+            raise InputError(
+                f"encoder {self.name!r} of another package returned {received} for {count} {units}, expected "
+                f"floats [{count}, D]; fix that package"
+            )
+        rows = rows.detach().float().cpu()
+        length = torch.linalg.vector_norm(rows, dim=1)
+        if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
+            raise InputError(
+                f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "
+                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them"
+            )
+        return rows
+
+
+@dataclass(frozen=True)
+class DensePluginEncoder(PluginEncoder):
+    """An encoder of another package that also has features of patches."""
+
+    @property
+    def why_not_dense(self) -> str | None:
+        return getattr(self.encoder, "why_not_dense", None)
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        with _attribute_errors("encoder", self.name):
+            features = self.encoder.patches(image, rows, columns)  # type: ignore[attr-defined]
+        return self._check_rows(features, rows * columns, "patches")
+
+
+@dataclass(frozen=True)
+class PluginRegions:
+    """A mask source of another package. The wrapped object needs only `identity` and `labels(image, name)`, which
+    returns integers [H, W], or as `Regions.labels`. Error messages name the mask source that failed.
+
+    Raises (from every method):
+        InputError: If the mask source fails, or returns something that `Regions` does not allow.
+    """
+
+    name: str
+    regions: Any
+
+    @classmethod
+    def made(cls, name: str, make: Callable[[], object]) -> PluginRegions:
+        """Make a mask source, and check that it has the required attributes."""
+        with _attribute_errors("mask source", name):
+            regions = make()
+        _check_attributes("mask source", name, regions, ("identity", "labels"))
+        return cls(name, regions)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        with _attribute_errors("mask source", self.name):
+            return {"kind": self.name, **self.regions.identity}
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return tuple(getattr(self.regions, "chosen", ()))
+
+    @property
+    def at_once(self) -> int:
+        return getattr(self.regions, "at_once", 1)
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        with _attribute_errors("mask source", self.name):
+            return tuple(self.regions.files(name)) if hasattr(self.regions, "files") else ()
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
+        with _attribute_errors("mask source", self.name):
+            returned = torch.as_tensor(self.regions.labels(image, name))
+        labels = returned[None, None] if returned.ndim == 2 else returned
+        fits = labels.ndim == 4 and labels.shape[2:] == image.shape[:2] and labels.numel() > 0
+        if not fits or labels.is_floating_point() or labels.is_complex():
+            raise InputError(
+                f"mask source {self.name!r} of another package returned {returned.dtype} {tuple(returned.shape)} for "
+                f"an image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that "
+                "package"
+            )
+        for level in labels:
+            ids = level.unique()
+            ids = ids[ids != -1]
+            if not torch.equal(ids, torch.arange(len(ids), device=ids.device).to(ids.dtype)):
+                raise InputError(
+                    f"mask source {self.name!r} of another package returned ids in {int(level.min())}.."
+                    f"{int(level.max())}, expected 0..R-1 without gaps, and -1 for none; fix that package"
+                )
+        return labels.int()
+
+
+def _check_attributes(noun: str, name: str, plugin: object, needed: Sequence[str]) -> None:
+    """Raise InputError if an object of another package lacks an attribute."""
+    missing = [x for x in needed if not hasattr(plugin, x)]
+    if len(missing) > 0:
+        raise InputError(f"{noun} {name!r} of another package has no {' and no '.join(missing)}; fix that package")
+
+
+@contextmanager
+def _attribute_errors(noun: str, name: str) -> Iterator[None]:
+    """Attribute exceptions to the plugin of another package."""
+    try:
+        yield
+    except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # a third-party module may raise anything
+        raise InputError(f"{noun} {name!r} of another package failed ({summarize_error(error)})") from error
