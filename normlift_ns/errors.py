@@ -99,7 +99,7 @@ def describe_error(error: BaseException) -> tuple[str, int]:
 
 
 def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).strip().splitlines()), "")[:_MAX_LINE]
+    return next(iter(str(error).strip().splitlines()), "")[:_MAX_SUMMARY]
 
 
 def _report_bug(error: BaseException) -> str:
