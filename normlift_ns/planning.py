@@ -593,9 +593,9 @@ def measure_capture(
     cached_s = observe(list(cached)[:_MAX_LOOKUPS], cached_source).seconds / len(cached) if len(cached) > 0 else None
     block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
-        rasterize = partial(_evidence, gaussians, block, scene, options, drawing, Path(folder))
+        rasterize = partial(batch_evidence, gaussians, block, Path(folder), drawing, reuse=True, done=lambda: None)
         if cuda:  # kernels for labels like these are compiled once for all lifts
-            _evidence(gaussians, block, scene, options, drawing, Path(folder) / "first")
+            batch_evidence(gaussians, block, Path(folder) / "first", drawing, reuse=True, done=lambda: None)
         evidence_s, evidence = timed(rasterize)
         cached_evidence_s, _ = timed(rasterize)
         saved_s, _ = timed(lambda: evidence.save(Path(folder) / "again.safetensors"))
@@ -620,7 +620,7 @@ def measure_capture(
         features_kept=len(cached) / len(chosen),
         evidence_s=evidence_s / count,
         kept_evidence_s=cached_evidence_s / count,
-        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), scene, options, drawing, cache),
+        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
@@ -653,22 +653,11 @@ def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
     return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
-def _evidence(
-    gaussians: GaussianScene, block: ViewBatch, scene: Scene, options: LiftOptions, drawing: RasterConfig, folder: Path
-) -> Evidence:
-    return batch_evidence(
-        gaussians, block, folder,
-        rasterize_mode=scene.rasterize_mode, settings=drawing.settings, backend=drawing.backend,
-        weight_power=options.weight_power, dtype=drawing.dtype, reuse=True, done=lambda: None,
-    )  # fmt: skip
-
-
 def _evidence_cached(
     gaussians: GaussianScene,
     observed: _Observed,
     cached: Mapping[int, ViewBatch],
     chosen: int,
-    scene: Scene,
     options: LiftOptions,
     drawing: RasterConfig,
     cache: Path,
@@ -676,10 +665,9 @@ def _evidence_cached(
     """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
     if not options.reuse_evidence:
         return 0.0
-    facts = [scene.rasterize_mode, options.weight_power, str(drawing.dtype), asdict(drawing.settings), drawing.backend]
     share = 0.0
     for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
-        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, facts))
+        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, drawing))
         share += sum(hits) / max(1, len(hits)) * views / chosen
     return share
 

@@ -22,11 +22,14 @@ from torch import Tensor
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import Neighbors
-from normlift_ns.core.partition import VIEW_STAGES, Communicator, Partition, ProgressCallback
+from normlift_ns.core.partition import Communicator, Partition
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.io.file_lock import try_claim
+from normlift_ns.progress import ProgressCallback
 
+VIEW_STAGES = ("features", "evidence")
+"""Stages of a lift that count views."""
 _STALE_SECONDS = 7 * 86400
 """Age at which a shared directory of killed processes is deleted."""
 
@@ -121,7 +124,7 @@ class TorchCommunicator(Communicator):
                 yield index
 
     def counted(self, report: ProgressCallback) -> ProgressCallback:
-        """See the base class."""
+        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
         previous: dict[str, int] = {}
 
         def report_total(stage: str, done: int, total: int) -> None:
@@ -168,6 +171,27 @@ class TorchCommunicator(Communicator):
     def _bytes(self, rows: Tensor) -> Tensor:
         flat = rows.to(self.device).reshape(len(rows), prod(rows.shape[1:]))
         return flat.contiguous().view(torch.uint8)
+
+
+def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
+    """Return the concatenated rows of all processes, in every process."""
+    lengths = team.join(rows.offsets.diff())
+    return SparseRows(_offsets(lengths), team.join(rows.column), team.join(rows.weight))
+
+
+def gather_sparse(portion: Partition, rows: SparseRows) -> SparseRows | None:
+    """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
+    parts = [portion.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
+    if any(part is None for part in parts):
+        return None
+    lengths, column, weight = (torch.cat(part) for part in parts if part is not None)
+    count = torch.arange(len(portion.order), device=portion.order.device)
+    row_of = torch.empty_like(portion.order).index_copy_(0, torch.cat(portion.by_owner), count)
+    return SparseRows(_offsets(lengths), column, weight).select_rows(row_of)
+
+
+def _offsets(lengths: Int64[Tensor, " n"]) -> Int64[Tensor, " n_plus_1"]:
+    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
 
 
 def _like(data: Tensor, rows: Tensor) -> Tensor:
@@ -228,7 +252,7 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
         pieces: evidence collected by this process, by chunk index; together, the processes have all chunks.
         chunks: number of chunks of all processes.
     """
-    device, local_chunks = portion.order.device, sorted(pieces)
+    local_chunks = sorted(pieces)
     matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
     counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
     gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
@@ -236,15 +260,20 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     regions = [count for chunk in range(chunks) for count in metadata[chunk][0]]
     widths = [(sum(metadata[chunk][0]), len(metadata[chunk][0])) for chunk in range(chunks)]  # columns of both matrices
     _, weight_power, num_excluded, weight_bytes = metadata[0]
-    dtype = torch.float64 if weight_bytes == 8 else torch.float32
     chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
     result = []
     for i, matrix in enumerate(matrices):
         first_column = [0, *accumulate(width[i] for width in widths)]
         received = [counts[portion.team.rank][i] for _, _, counts in gathered]
+        dtype = torch.float64 if weight_bytes == 8 else torch.float32
         result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
-    region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
-    return Evidence(result[0], region_view.to(device), result[1], len(regions), weight_power, num_excluded)
+    region_view = _region_view(regions).to(portion.order.device)
+    return Evidence(result[0], region_view, result[1], len(regions), weight_power, num_excluded)
+
+
+def _region_view(regions: Sequence[int]) -> Int32[Tensor, " s"]:
+    """Return the view of every region from the number of regions of every view."""
+    return torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
 
 
 def _exchange_rows(
@@ -315,8 +344,7 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
             [norm[rows.long()] for rows in requested],
         )
     )
-    lengths = torch.cat([evidence.rows.offsets.diff(), lengths])
-    offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    offsets = _offsets(torch.cat([evidence.rows.offsets.diff(), lengths]))
     rows = SparseRows(offsets, torch.cat([evidence.rows.column, column]), torch.cat([evidence.rows.weight, weight]))
     blank = SparseRows(torch.zeros_like(offsets), evidence.unlabeled.column[:0], evidence.unlabeled.weight[:0])
     scalars = lifted.scalars.map(lambda x: torch.cat([x, x.new_zeros(len(halo_norm))]))
