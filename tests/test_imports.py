@@ -47,7 +47,7 @@ FOREIGN = {
     "io": BASE | {"xxhash", "msgspec"},
     "kernels": TENSORS | {"triton"},
     "core": BASE,
-    "rasterization": TENSORS | {"numpy", "numba", "gsplat"},
+    "rasterization": TENSORS | {"numpy", "numba", "gsplat", "typing_extensions"},
     "encoders": BASE | {"xxhash", "open_clip", "PIL", "huggingface_hub", "torchvision", "skimage"},
     "segmentation": BASE | {"skimage", "PIL", "huggingface_hub", "torchvision"},
     "data": BASE | {"msgspec", "cv2", "PIL", "plyfile", "yaml"},

@@ -35,6 +35,7 @@ from normlift_ns.evidence_collection import (
     observe_views,
     region_levels,
 )
+from normlift_ns.options import GSPLAT_VERSIONS
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.sam import SamMasks
 

@@ -101,9 +101,10 @@ def _check_inputs(
     posterior: bool,
 ) -> None:
     """Raise ValueError if the inputs of a vote do not fit together."""
-    arguments = {"means": means, "directions": directions, "reliability": reliability, "own": own}
-    skipped = (None, directions) if callable(directions) else (None,)
-    check_tensors(**{name: value for name, value in arguments.items() if not any(value is x for x in skipped)})
+    tensors = {"means": means, "reliability": reliability}
+    tensors |= {} if callable(directions) else {"directions": directions}
+    tensors |= {} if own is None else {"own": own}
+    check_tensors(**tensors)
     n, table = means.shape[0], directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if table is None else tuple(table.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, chain
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -256,10 +256,10 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
     counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
     gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
-    metadata = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
-    regions = [count for chunk in range(chunks) for count in metadata[chunk][0]]
-    widths = [(sum(metadata[chunk][0]), len(metadata[chunk][0])) for chunk in range(chunks)]  # columns of both matrices
-    _, weight_power, num_excluded, weight_bytes = metadata[0]
+    facts = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
+    regions_of = [facts[chunk][0] for chunk in range(chunks)]
+    widths = [(sum(counts), len(counts)) for counts in regions_of]  # columns of both matrices
+    _, weight_power, num_excluded, weight_bytes = facts[0]
     chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
     result = []
     for i, matrix in enumerate(matrices):
@@ -267,13 +267,10 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
         received = [counts[portion.team.rank][i] for _, _, counts in gathered]
         dtype = torch.float64 if weight_bytes == 8 else torch.float32
         result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
-    region_view = _region_view(regions).to(portion.order.device)
+    regions = torch.tensor(list(chain.from_iterable(regions_of)))
+    region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), regions)
+    region_view = region_view.to(portion.order.device)
     return Evidence(result[0], region_view, result[1], len(regions), weight_power, num_excluded)
-
-
-def _region_view(regions: Sequence[int]) -> Int32[Tensor, " s"]:
-    """Return the view of every region from the number of regions of every view."""
-    return torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
 
 
 def _exchange_rows(
