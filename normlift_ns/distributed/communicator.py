@@ -202,6 +202,8 @@ def _like(data: Tensor, rows: Tensor) -> Tensor:
 # Exchange between processes: evidence from view owners to Gaussian owners, and neighbors for the vote.
 
 
+_WEIGHT_DTYPES = {4: torch.float32, 8: torch.float64}
+"""Types of evidence weights by their size in bytes."""
 _RENUMBER_BLOCK = 2**20
 """Number of rows of neighbors that are renumbered at a time."""
 
@@ -265,8 +267,9 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     for i, matrix in enumerate(matrices):
         first_column = [0, *accumulate(width[i] for width in widths)]
         received = [counts[portion.team.rank][i] for _, _, counts in gathered]
-        dtype = torch.float64 if weight_bytes == 8 else torch.float32
-        result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
+        result.append(
+            _exchange_rows(matrix, chunks_by_rank, received, first_column, portion, _WEIGHT_DTYPES[weight_bytes])
+        )
     regions = torch.tensor(list(chain.from_iterable(regions_of)))
     region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), regions)
     region_view = region_view.to(portion.order.device)
