@@ -126,7 +126,7 @@ def lift_scene(
         step()
     copied = None
     if options.refine:
-        copied, vote_facts = vote(means, lifted, own, options.vote, stages)
+        copied, vote_facts = vote_directions(means, lifted, own, options.vote, stages)
         facts |= vote_facts
     with stages("store") as step:
         statistics = lift_statistics(collection, views, lifted.scalars.reliability, facts)
@@ -263,7 +263,7 @@ def _describe(source: FeatureSource) -> str:
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
-def vote(
+def vote_directions(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
     own: Float[Tensor, " n"],

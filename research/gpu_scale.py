@@ -35,7 +35,7 @@ from normlift_ns.distributed.communicator import EvidenceShard, TorchCommunicato
 from normlift_ns.distributed.launch import distributed_context, launch_processes
 from normlift_ns.distributed.lift import vote_distributed
 from normlift_ns.evidence_collection import chunk_views
-from normlift_ns.pipeline import vote
+from normlift_ns.pipeline import vote_directions
 from normlift_ns.progress import StageTimer
 from research import rooms
 from research.command import joined as with_earlier
@@ -105,7 +105,7 @@ def core_alone(case: Case, device: str) -> Found:
     clock.lap("exchange")
     lifted = lift(evidence, case.table)
     clock.lap("lift")
-    copied, _ = vote(case.scene.means, lifted, lifted.scalars.own_evidence, RefineConfig(), stages)
+    copied, _ = vote_directions(case.scene.means, lifted, lifted.scalars.own_evidence, RefineConfig(), stages)
     clock.lap("vote")
     return Found(lifted.scalars, copied, {**clock.seconds, "neighbors": stages.seconds["neighbors"]}, evidence)
 

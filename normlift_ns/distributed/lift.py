@@ -201,7 +201,7 @@ def vote_distributed(
     portion: Partition,
     stages: StageTimer,
 ) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
-    """Run `vote` in several processes.
+    """Run `vote_directions` in several processes.
 
     Returns:
         For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians

@@ -19,7 +19,7 @@ from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evi
 from normlift_ns.distributed.lift import build_field_distributed, consensus_distributed, vote_distributed
 from normlift_ns.evidence_collection import ViewObservations
 from normlift_ns.options import Storage
-from normlift_ns.pipeline import vote as vote_alone
+from normlift_ns.pipeline import vote_directions
 from normlift_ns.progress import StageTimer
 from tests.scenes import generator, random_evidence, unit_rows
 from tests.team.threads import Threads, together
@@ -78,7 +78,7 @@ def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:
     means, evidence, features = world(seed)
     lifted = lift(evidence, consensus(evidence, features, sample=5).features)
     config, stages = RefineConfig(vote=vote, k=9), StageTimer(lambda stage, done, total: None)  # type: ignore[arg-type]
-    copied, shares = vote_alone(means, lifted, lifted.scalars.own_evidence, config, stages)
+    copied, shares = vote_directions(means, lifted, lifted.scalars.own_evidence, config, stages)
     return SemanticField.build(lifted, means, copied, tolerance=0.3, storage=storage, provenance=shares)
 
 
