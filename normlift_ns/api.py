@@ -15,7 +15,6 @@ from torch import Tensor
 
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.partition import SINGLE_PROCESS, ProgressCallback
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.data.extra_images import add_stored_images
 from normlift_ns.data.nerfstudio.load import SplitViews, load_nerfstudio_scene
@@ -26,7 +25,8 @@ from normlift_ns.io.atomic import complete_interrupted_writes
 from normlift_ns.io.run_dir import check_run, recorded_gsplat_version
 from normlift_ns.lifted_run import LiftedRun, load_field
 from normlift_ns.options import LiftOptions, SourceOptions, check_number, check_path
-from normlift_ns.pipeline import lift_run_distributed
+from normlift_ns.pipeline import LiftRequest, RunTarget, run_lift
+from normlift_ns.progress import ProgressCallback
 from normlift_ns.query.text_encoder import with_text_source
 
 
@@ -185,13 +185,12 @@ def lift_run(
     """
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
-    run = lift_run_distributed(
-        SINGLE_PROCESS, scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
-        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
-        device=device, export=export, report=report, say=say,
+    request = LiftRequest(
+        open_scene=scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
+        lift=lift, queries=queries, target=RunTarget(output_dir, timestamp, overwrite), check=check, device=device,
+        export=export, report=report, say=say,
     )  # fmt: skip
-    assert run is not None
-    return run
+    return run_lift(request)
 
 
 def scene_opener(

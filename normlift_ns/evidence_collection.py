@@ -1,4 +1,4 @@
-"""Evidence and features of the training views, chunk by chunk, so that an interrupted lift can resume."""
+"""Collection of 2D features and evidence from the views of a scene, in batches whose results are cached."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import json
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +18,7 @@ from xxhash import xxh3_128
 
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.partition import Communicator, Partition
 from normlift_ns.core.scene import Scene, View
-from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
 from normlift_ns.encoders.base import FeatureSource, RegionFeatures, iterate_view_features
 from normlift_ns.encoders.batching import prefetch_map
 from normlift_ns.encoders.cache import CachedRegions, cached
@@ -32,46 +31,6 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
 
-
-def check_undistorted(source: FeatureSource, *views: View) -> None:
-    """Check that the label map of an undistorted image was not made from the original, distorted image.
-
-    Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
-    show the distorted image, so only maps of exactly the undistorted size are accepted.
-
-    Args:
-        views: The same view at every size at which the source may have processed it.
-    Raises:
-        ValueError: If a map has another size, unless the source resamples maps; then the function warns.
-    """
-    original_size, name = views[0].original, views[0].name
-    maps = source.regions if isinstance(source, RegionFeatures) else source
-    maps = maps.regions if isinstance(maps, CachedRegions) else maps
-    if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
-        return
-    file, width, height = maps.size(name)
-    sizes = [(view.camera.width, view.camera.height) for view in views]
-    reason = "training undistorted the image, which moves and crops its content"
-    if (width, height) not in sizes:
-        kind = "the size of the original image" if (width, height) == original_size else "another size"
-        mismatch = f"is {width}x{height} (width x height), {kind}; {reason}, to {sizes[0][0]}x{sizes[0][1]}"
-        if not maps.resample:
-            raise InputError(
-                f"label map {file} of {name} {mismatch}. Make the maps from the undistorted images, or accept an error "
-                "of some pixels: --regions-resample True"
-            )
-        warnings.warn(f"label map {file} {mismatch}; it is stretched, and may be some pixels off", stacklevel=2)
-    elif (width, height) == original_size:
-        warnings.warn(
-            f"{reason} without changing its size: make sure that the label maps in {file.parent} were made from the "
-            "undistorted images",
-            stacklevel=2,
-        )
-
-
-# Evidence and features of a scene's views, computed in blocks and cached.
-
-
 _MAX_CHUNK = 16
 _READERS = 8
 """Images that are read in parallel while one is processed or a network loads."""
@@ -79,6 +38,109 @@ _MIN_SIDE = 8
 """Minimum side of a downscaled image, in pixels; smaller ones show too little."""
 _CACHE_VERSION = "normlift_ns.block/6"
 """Version in every cache key; increase it when evidence changes for the same input."""
+
+
+@dataclass(frozen=True)
+class RasterConfig:
+    """Rasterization of the evidence of a lift."""
+
+    rules: str
+    """Version of gsplat whose rasterization rules apply."""
+    backend: BackendName
+    """Backend that rasterizes."""
+    dtype: torch.dtype
+    rasterize_mode: RasterizeMode
+    weight_power: int
+    """Exponent of the summed weights."""
+
+    @property
+    def settings(self) -> RasterSettings:
+        """Constants of the rasterization rules."""
+        return RasterSettings.of_gsplat(self.rules)
+
+    @property
+    def key(self) -> list[Any]:
+        """Part of every cache key, as JSON types."""
+        return [self.rasterize_mode, self.weight_power, str(self.dtype), asdict(self.settings), self.backend]
+
+
+class FeatureExport(NamedTuple):
+    """Export of 2D features to files, in addition to the lift."""
+
+    folder: Path
+    overwrite: bool
+    """Replace files with other content."""
+
+
+class ViewObservations(NamedTuple):
+    """Evidence of some views, with features and levels of their regions."""
+
+    evidence: Evidence
+    features: Float[Tensor, "s d"]
+    level: Int64[Tensor, " s"]
+
+
+@dataclass(frozen=True)
+class EvidenceCollection:
+    """Collection of evidence from some training views, one chunk of views at a time.
+
+    The results of a chunk are cached, so an interrupted lift can resume.
+    """
+
+    scene: Scene
+    gaussians: GaussianScene
+    """Gaussians of the scene, on the device that rasterizes."""
+    views: Sequence[int]
+    """Indices of the training views."""
+    missing: Sequence[str]
+    """Names of the training images without features."""
+    source: FeatureSource
+    options: LiftOptions
+    config: RasterConfig
+    cache: Path
+    """Directory of cached features and evidence."""
+    export: FeatureExport | None
+    """Destination of the 2D features; None: no export."""
+
+    @cached_property
+    def _cached_source(self) -> FeatureSource:
+        return cached(self.source, self.cache) if self.options.reuse_evidence else self.source
+
+    def collect(self, stages: StageTimer, wait_for_kernels: Callable[[], None]) -> ViewObservations:
+        """Collect evidence, features and levels from all views.
+
+        Args:
+            stages: progress of the lift.
+            wait_for_kernels: function that waits until kernels are compiled.
+        """
+        parts = [self.collect_chunk(chunk, stages, wait_for_kernels) for chunk in chunk_views(self.views)]
+        with stages("evidence", len(self.views)):
+            evidence = Evidence.merge(*(part.evidence for part in parts))
+            features = torch.cat([part.features for part in parts])
+            level = torch.cat([part.level for part in parts])
+        return ViewObservations(evidence, features.to(self.gaussians.means.device, self.config.dtype), level)
+
+    def collect_chunk(
+        self, chunk: Sequence[int], stages: StageTimer, wait_for_kernels: Callable[[], None]
+    ) -> ViewObservations:
+        """Collect evidence, features and levels from one chunk of the views; see `collect`."""
+        source = self._cached_source
+        rendered = self.config.settings if self.options.image_source == "render" else None
+        with stages("features", len(self.views)) as step:
+
+            def done(view: View) -> None:
+                if self.export is not None:
+                    write_langsplat(source, view.image, view.name, *self.export)
+                step()
+
+            divisor = self.options.lift_downscale
+            block = observe_views(self.scene, chunk, source, rendered=rendered, divisor=divisor, done=done)
+        levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
+        with stages("evidence", len(self.views)) as step:
+            wait_for_kernels()
+            reuse, folder = self.options.reuse_evidence, self.cache / "evidence"
+            evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, done=step)
+        return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
 
 
 def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
@@ -192,12 +254,8 @@ def batch_evidence(
     gaussians: GaussianScene,
     block: ViewBatch,
     folder: Path,
+    config: RasterConfig,
     *,
-    rasterize_mode: RasterizeMode,
-    settings: RasterSettings,
-    backend: BackendName,
-    weight_power: int,
-    dtype: torch.dtype,
     reuse: bool,
     done: Callable[[], None],
 ) -> Evidence:
@@ -206,8 +264,7 @@ def batch_evidence(
     It is computed from the evidence of each view's cells, which the folder caches. A view is read from the cache if its
     scene, camera and labels are the same. Its regions, features and the other views of its block may differ.
     """
-    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
-    keys = evidence_keys(gaussians, block, facts)
+    keys = evidence_keys(gaussians, block, config)
     cached = find_cached_views(folder, keys) if reuse else {}
     missing = [view for view in range(len(keys)) if view not in cached]
     for _ in cached:
@@ -218,11 +275,11 @@ def batch_evidence(
             [block.cameras[view] for view in missing],
             [block.labels[view] for view in missing],
             num_regions=[block.regions[view].shape[1] for view in missing],
-            backend=backend,
-            rasterize_mode=rasterize_mode,
-            weight_power=weight_power,
-            settings=settings,
-            dtype=dtype,
+            backend=config.backend,
+            rasterize_mode=config.rasterize_mode,
+            weight_power=config.weight_power,
+            settings=config.settings,
+            dtype=config.dtype,
             progress=lambda *_: done(),
         )
         cache_views(evidence, folder, [keys[view] for view in missing])
@@ -231,29 +288,18 @@ def batch_evidence(
 
 
 def cached_batch_evidence(
-    gaussians: GaussianScene,
-    block: ViewBatch,
-    folder: Path,
-    *,
-    rasterize_mode: RasterizeMode,
-    settings: RasterSettings,
-    backend: BackendName,
-    weight_power: int,
-    dtype: torch.dtype,
+    gaussians: GaussianScene, block: ViewBatch, folder: Path, config: RasterConfig
 ) -> Evidence | None:
     """Return the evidence of a block from the cache, or None if a view would have to be rasterized again."""
-    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
-    cached = find_cached_views(folder, evidence_keys(gaussians, block, facts))
+    cached = find_cached_views(folder, evidence_keys(gaussians, block, config))
     return cells_to_regions(join_cached_views(cached), block) if len(cached) == len(block.cameras) else None
 
 
-def evidence_keys(gaussians: GaussianScene, block: ViewBatch, facts: Sequence[Any]) -> list[str]:
-    """Return the cache key of each view's cell evidence: a digest of everything it depends on.
-
-    Args:
-        facts: how it is rasterized, as JSON types.
-    """
-    scene = _digest([_CACHE_VERSION, *facts], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities])
+def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConfig) -> list[str]:
+    """Return the cache key of each view's cell evidence: a digest of everything it depends on."""
+    scene = _digest(
+        [_CACHE_VERSION, *config.key], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    )
     views = zip(block.cameras, block.labels, block.regions)
     return [
         _digest([scene, regions.shape[1]], [labels, camera.K, camera.world_to_camera])
@@ -299,126 +345,37 @@ def _averaged(image: Tensor, height: int, width: int) -> Tensor:
     return torch.nn.functional.interpolate(channels_first, (height, width), mode="area")[0].permute(1, 2, 0)
 
 
-# Collection of 2D features and evidence from views, by one process or several.
-#
-# Views are processed in chunks whose results are cached, so an interrupted lift can resume.
+def check_undistorted(source: FeatureSource, *views: View) -> None:
+    """Check that the label map of an undistorted image was not made from the original, distorted image.
 
-
-class FeatureExport(NamedTuple):
-    """Export of 2D features to files, in addition to the lift."""
-
-    folder: Path
-    overwrite: bool
-    """Replace files with other content."""
-
-
-class RasterConfig(NamedTuple):
-    """Rasterization settings of a lift."""
-
-    rules: str
-    """Version of gsplat whose rasterization rules apply."""
-    backend: BackendName
-    """Backend that rasterizes."""
-    dtype: torch.dtype
-
-    @property
-    def settings(self) -> RasterSettings:
-        """Constants of the rasterization rules."""
-        return RasterSettings.of_gsplat(self.rules)
-
-
-class ViewObservations(NamedTuple):
-    """Evidence, features and levels from some views, for the Gaussians of this process."""
-
-    evidence: Evidence
-    features: Float[Tensor, "s d"]
-    level: Int64[Tensor, " s"]
-
-
-def collect_evidence(
-    scene: Scene,
-    gaussians: GaussianScene,
-    used: Sequence[int],
-    source: FeatureSource,
-    options: LiftOptions,
-    drawing: RasterConfig,
-    cache: Path,
-    export: FeatureExport | None,
-    stages: StageTimer,
-    ready: Callable[[], None],
-    portion: Partition,
-) -> ViewObservations:
-    """Collect evidence, feature table and region levels from some training views.
+    Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
+    show the distorted image, so only maps of exactly the undistorted size are accepted.
 
     Args:
-        used: indices of the views.
-        source: encoder or files that the features come from.
-        cache: directory of cached features and evidence.
-        export: destination of the 2D features; None: no export.
-        stages: progress of the lift.
-        ready: function that waits until kernels are compiled.
-        portion: Gaussians of this process; its team divides the chunks of views.
+        views: The same view at every size at which the source may have processed it.
+    Raises:
+        ValueError: If a map has another size, unless the source resamples maps; then the function warns.
     """
-    team, views = portion.team, len(used)
-    source = cached(source, cache) if options.reuse_evidence else source
-    rendered = drawing.settings if options.image_source == "render" else None
-    chunks = chunk_views(used, team.size)
-    tables: dict[int, tuple[Tensor, Tensor]] = {}
-    parts: list[Evidence] = []
-    pieces: dict[int, EvidenceShard] = {}
-    for index in team.chunks(len(chunks)):
-        with stages("features", views) as step:
-
-            def done(view: View, step: Callable[[], None] = step) -> None:
-                if export is not None:
-                    write_langsplat(source, view.image, view.name, *export)
-                step()
-
-            block = observe_views(
-                scene, chunks[index], source, rendered=rendered, divisor=options.lift_downscale, done=done
+    original_size, name = views[0].original, views[0].name
+    maps = source.regions if isinstance(source, RegionFeatures) else source
+    maps = maps.regions if isinstance(maps, CachedRegions) else maps
+    if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
+        return
+    file, width, height = maps.size(name)
+    sizes = [(view.camera.width, view.camera.height) for view in views]
+    reason = "training undistorted the image, which moves and crops its content"
+    if (width, height) not in sizes:
+        kind = "the size of the original image" if (width, height) == original_size else "another size"
+        mismatch = f"is {width}x{height} (width x height), {kind}; {reason}, to {sizes[0][0]}x{sizes[0][1]}"
+        if not maps.resample:
+            raise InputError(
+                f"label map {file} of {name} {mismatch}. Make the maps from the undistorted images, or accept an error "
+                "of some pixels: --regions-resample True"
             )
-            tables[index] = _table(block)
-        with stages("evidence", views) as step:
-            ready()
-            evidence = batch_evidence(
-                gaussians,
-                block,
-                cache / "evidence",
-                rasterize_mode=scene.rasterize_mode,
-                settings=drawing.settings,
-                backend=drawing.backend,
-                weight_power=options.weight_power,
-                dtype=drawing.dtype,
-                reuse=options.reuse_evidence,
-                done=step,
-            )
-            if team.size > 1:
-                pieces[index] = EvidenceShard.of(evidence, portion)
-            else:
-                parts.append(evidence)
-    with stages("exchange") if team.size > 1 else stages("evidence", views):
-        evidence = Evidence.merge(*parts) if team.size == 1 else redistribute_evidence(pieces, portion, len(chunks))
-        features, level = _all_tables(tables, team)
-    return ViewObservations(evidence, features.to(gaussians.means.device, drawing.dtype), level)
-
-
-def _table(block: ViewBatch) -> tuple[Tensor, Tensor]:
-    """Return features and levels of the regions of a block."""
-    levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
-    return torch.cat(block.features), torch.cat(levels)
-
-
-def _all_tables(tables: dict[int, tuple[Tensor, Tensor]], team: Communicator) -> tuple[Tensor, Tensor]:
-    """Return features and levels of the regions of all chunks, in order."""
-    if team.size == 1:
-        features, levels = zip(*tables.values())
-        return torch.cat(features), torch.cat(levels)
-    local_chunks = sorted(tables)
-    gathered = team.tell_all([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
-    widths = {width for (shapes,) in gathered for _, _, width in shapes}
-    counts = [(chunk, count) for (shapes,) in gathered for chunk, count, _ in shapes]
-    empty = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
-    parts = (torch.cat([empty[i], *(tables[chunk][i] for chunk in local_chunks)]) for i in range(2))
-    features, levels = (team.join(part).split([count for _, count in counts]) for part in parts)
-    order = sorted(range(len(counts)), key=lambda i: counts[i][0])
-    return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])
+        warnings.warn(f"label map {file} {mismatch}; it is stretched, and may be some pixels off", stacklevel=2)
+    elif (width, height) == original_size:
+        warnings.warn(
+            f"{reason} without changing its size: make sure that the label maps in {file.parent} were made from the "
+            "undistorted images",
+            stacklevel=2,
+        )

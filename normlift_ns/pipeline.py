@@ -1,286 +1,78 @@
-"""The lift from a trained scene and its features to a lifted run: evidence, consensus, lift, vote, store, write."""
+"""Pipeline from a trained scene and a source of 2D features to a lifted run. Read this module first.
+
+`lift_scene` has the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `run_lift` opens the
+scene before them, and writes the run after them. Both run in one process; `distributed.lift` runs the same steps in
+several.
+"""
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.consensus import SAMPLING_SEED, consensus, with_original_reliability
+from normlift_ns.core.consensus import SAMPLING_SEED, Consensus, consensus, with_original_reliability
 from normlift_ns.core.device import choose_device, init_cuda
-from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.field import SemanticField, fingerprint
+from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.lift import Lifted, Scalars, lift
-from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition, ProgressCallback
-from normlift_ns.core.refine import clamp_k, decay_width, refine, refine_subset, unsupported
+from normlift_ns.core.lift import Lifted, lift
+from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.core.refine import clamp_k, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
-from normlift_ns.data.checkpoint import Checkpoint
-from normlift_ns.data.extra_images import EXTRA_IMAGES_FILE
-from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
-from normlift_ns.data.nerfstudio.config_classes import (
-    FullImageDatamanagerConfig,
-    NerfstudioDataParserConfig,
-    NormLiftModelConfig,
-    TrainerConfig,
-    VanillaPipelineConfig,
-    ViewerConfig,
-)
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatScene, save_splat, splatfacto_checkpoint
-from normlift_ns.data.transforms import write_transforms
-from normlift_ns.distributed.communicator import gather_halo
+from normlift_ns.data.open_splat import SplatScene
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.langsplat import check_unique_stems
 from normlift_ns.encoders.precomputed import PrecomputedFeatures, precomputed_features
-from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import FeatureExport, RasterConfig, collect_evidence, sample_evenly
-from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
+from normlift_ns.evidence_collection import (
+    EvidenceCollection,
+    FeatureExport,
+    RasterConfig,
+    ViewObservations,
+    sample_evenly,
+)
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
     TEXT_EMBEDDINGS_FILE,
-    add_digest_comment,
     cache_folder,
     complete_interrupted_lifts,
     refuse_existing_run,
     run_directory,
-    run_file_digests,
 )
 from normlift_ns.lifted_run import LiftedRun, resolve_field_paths
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,
-    BackendName,
     LiftOptions,
-    RasterizeMode,
     RefineConfig,
     SourceOptions,
     check_bool,
     check_path,
     check_prompt_list,
 )
-from normlift_ns.progress import StageTimer, lift_cost
+from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import Query, make_query, save_query
+from normlift_ns.query.question import Query, make_query
 from normlift_ns.query.text_encoder import encoder_settings, precomputed_settings
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 from normlift_ns.rasterization.settings import RasterSettings
-
-_GAUSSIANS, _REGIONS, _DIMENSION = 4096, 4, 512
-
-
-def warm_up_kernels(
-    gaussians: GaussianScene,
-    camera: Camera,
-    options: LiftOptions,
-    *,
-    rasterize_mode: RasterizeMode,
-    settings: RasterSettings,
-    backend: BackendName,
-    dtype: torch.dtype,
-) -> Thread:
-    """Lift random features onto some of the Gaussians in a thread, and discard the result.
-
-    Errors are suppressed here, because the lift itself will raise them again.
-    """
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    sample = GaussianScene(*(array[:_GAUSSIANS] for array in arrays))
-
-    def work() -> None:
-        with suppress(Exception), torch.no_grad():  # as the docstring says
-            evidence = rasterize_evidence(
-                sample, [camera], [_quarters(camera)], num_regions=[_REGIONS], backend=backend,
-                rasterize_mode=rasterize_mode, settings=settings, dtype=dtype, weight_power=options.weight_power,
-            )  # fmt: skip
-            features = torch.eye(_REGIONS, _DIMENSION, dtype=dtype, device=sample.means.device)
-            if options.consensus:
-                consensus(evidence, features)
-            lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
-            if options.refine and len(sample) > options.vote.k:
-                neighbors = nearest_neighbors(sample.means, options.vote.k)
-                own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-                refine(sample.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
-
-    thread = Thread(target=work, name="kernel warm-up", daemon=True)
-    thread.start()
-    return thread
-
-
-def _quarters(camera: Camera) -> torch.Tensor:
-    """Return labels of the four quarters of an image."""
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    return (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()
-
-
-# The config.yml of a run lifted from a PLY file or gsplat checkpoint, for which nerfstudio has written none.
-
-
-def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
-    """Return a config with which stock nerfstudio loads the cameras in the run directory without transforming them.
-
-    All paths except that of the field are absolute, because there is no training directory for relative paths.
-    """
-    cameras = run_dir / TRANSFORMS_FILE
-    dataparser = NerfstudioDataParserConfig(
-        data=cameras,
-        downscale_factor=1,
-        orientation_method="none",
-        center_method="none",
-        auto_scale_poses=False,
-        eval_mode="all",
-        load_3D_points=False,
-    )
-    model = NormLiftModelConfig(
-        sh_degree=max(1, scene.splat.degree),
-        background_color=scene.background_name,
-        rasterize_mode=scene.rasterize_mode,
-        semantics=Path(FIELD_FOLDER),
-    )
-    datamanager = FullImageDatamanagerConfig(
-        data=cameras,
-        dataparser=dataparser,
-        cache_images="gpu",  # means the pipeline's device; "cpu" would pin memory, which needs CUDA
-        cache_images_type="uint8",
-    )
-    return TrainerConfig(
-        method_name="normlift",
-        experiment_name=scene.name,
-        output_dir=run_dir.parents[2],
-        timestamp=run_dir.name,
-        relative_model_dir=Path(CHECKPOINT_DIR),
-        data=cameras,
-        pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
-        vis="viewer",
-    )
-
-
-# Writing the directory of a lifted run: the files that stock nerfstudio loads, and the semantic field.
-
-
-def write_run(
-    source: NerfstudioScene | SplatScene,
-    field: SemanticField,
-    run_dir: Path,
-    *,
-    question: Query | None = None,
-    texts: Mapping[str, Tensor] | None = None,
-    overwrite: bool = False,
-    exact: bool = True,
-) -> Path:
-    """Write a lifted run, completely or not at all, and return its directory.
-
-    The directory holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
-    without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
-    checkpoint also has its cameras in transforms.json, and other settings for reopening it in splat.json.
-
-    Relative paths in the config of the source run stay relative. Stock ns-* commands therefore run from the directory
-    that the source run was trained in; ns-normlift commands run from any directory.
-
-    Args:
-        run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
-        question: query to render as relevancy_0, relevancy_1, …
-        texts: embeddings provided by the user, by prompt.
-        overwrite: replace an existing directory.
-        exact: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
-    Raises:
-        FileExistsError: the directory exists, `exact` is True and `overwrite` is False.
-        ValueError: the field was lifted from other Gaussians.
-        OSError: writing failed, for instance because the disk is full; no files are left then.
-    """
-    complete_interrupted_lifts(run_dir)
-    if exact:
-        refuse_existing_run(run_dir, overwrite)
-    if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
-        raise InputError(
-            f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
-            f"{source.checkpoint_path}; lift that checkpoint again."
-        )
-    with draft_directory(run_dir) as folder:
-        if isinstance(source, SplatScene):
-            save_splat(folder, source)
-            transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
-        else:
-            if len(source.added) > 0:
-                write_transforms(folder / EXTRA_IMAGES_FILE, source.added, ())
-            transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
-        write_text_file(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
-        _write_tensors(folder, source, field, question, texts)
-        for path in (run_dir,) if exact else numbered_paths(run_dir):
-            is_splat = isinstance(source, SplatScene)
-            config = splat_config(source, path) if is_splat else _lifted_config(source, path)
-            write_text_file(folder / "config.yml", add_digest_comment(dump_config(config)), overwrite=True)
-            if commit_directory(folder, path, overwrite=overwrite and exact):
-                return path
-    refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
-    raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
-
-
-def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
-    config, location = deepcopy(source.config), source.location
-    config.method_name = "normlift"
-    config.output_dir = location.portable(run_dir.parents[2])
-    config.timestamp = run_dir.name
-    config.relative_model_dir = Path(CHECKPOINT_DIR)
-    config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    config.pipeline.model = NormLiftModelConfig.upgrade(source.model_config, semantics=Path(FIELD_FOLDER))
-    if location.moved_data or config.output_dir.is_absolute():
-        set_dataset(config, location.data)  # a relative path would not be found
-    skip_seed_points(config)
-    # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
-    config.pipeline.datamanager.cache_images = "gpu"
-    return config
-
-
-def _write_tensors(
-    folder: Path,
-    source: NerfstudioScene | SplatScene,
-    field: SemanticField,
-    question: Query | None,
-    texts: Mapping[str, Tensor] | None,
-) -> None:
-    checkpoint = (
-        splatfacto_checkpoint(source) if isinstance(source, SplatScene) else _model_checkpoint(source.checkpoint)
-    )
-    path = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
-    with atomic_file(path) as draft:
-        torch.save(checkpoint, draft)
-    field_dir = folder / FIELD_FOLDER
-    if texts:
-        write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, texts)
-    field.save(
-        field_dir, beside=run_file_digests(field_dir, [path, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")])
-    )
-    if question is not None:
-        save_query(field_dir, question)
-
-
-def _model_checkpoint(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return the step and the model of a checkpoint, without optimizers."""
-    pipeline = {f"_model.{name}": tensor for name, tensor in checkpoint.model.items()}
-    return {"step": checkpoint.step, "pipeline": pipeline}
-
-
-# Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first.
-
+from normlift_ns.run_writer import write_run
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features below which to warn: something is wrong, or almost no pixel was labeled."""
+_WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
 
 
 class LiftResult(NamedTuple):
@@ -315,87 +107,61 @@ def lift_scene(
             pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
     """
-    result = lift_scene_distributed(
-        SINGLE_PROCESS, scene, source, options, cache, device=device, encoder=encoder, export=export, report=report
-    )
-    assert result is not None
-    return result
+    stages, facts = StageTimer(report), {}
+    collection = plan_collection(scene, source, options, cache, device=device, export=export)
+    options, means = collection.options, collection.gaussians.means
+    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
+    views = collection.collect(stages, wait_for_kernels)
+    table = views.features
+    if options.consensus:
+        with stages("consensus") as step:
+            agreed = consensus(
+                views.evidence, table, level=views.level, sample=options.consensus_sample, **consensus_options(options)
+            )
+            step()
+        table, facts = agreed.features, consensus_facts(options, agreed)
+    with stages("lift") as step:
+        lifted, own = lift_features(views, table, options)
+        check_directions(count_directions(lifted), len(means), source)
+        step()
+    copied = None
+    if options.refine:
+        copied, vote_facts = vote_directions(means, lifted, own, options.vote, stages)
+        facts |= vote_facts
+    with stages("store") as step:
+        statistics = lift_statistics(collection, views, lifted.scalars.reliability, facts)
+        provenance = lift_provenance(collection, encoder, statistics)
+        field = SemanticField.build(
+            lifted, means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
+        )
+        step()
+    return LiftResult(with_cost(field, stages, device), stages.seconds)
 
 
-def lift_scene_distributed(
-    team: Communicator,
+def plan_collection(
     scene: Scene,
     source: FeatureSource,
     options: LiftOptions,
     cache: Path,
     *,
     device: str,
-    encoder: Mapping[str, Any],
     export: FeatureExport | None,
-    report: ProgressCallback,
-) -> LiftResult | None:
-    """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
+) -> EvidenceCollection:
+    """Choose views and rasterizer of a lift, and raise before any image is read if the lift is impossible.
 
-    The result does not depend on the number of processes. The evidence of a view does not depend on other views, and
-    Gaussians are processed in the same blocks.
+    Args:
+        scene, source, options, cache, device, export: as in `lift_scene`.
     """
-    stages = StageTimer(team.counted(report))
-    gaussians, views = scene.gaussians.to(device), scene.train
+    gaussians, names = scene.gaussians.to(device), scene.train.names
     options = replace(options, vote=clamp_k(options.vote, len(gaussians))) if options.refine else options
     config = choose_raster_config(scene, gaussians, options)
-    names = set(source.available(views.names))
-    usable = [index for index, name in enumerate(views.names) if name in names]
+    available = set(source.available(names))
+    usable = [index for index, name in enumerate(names) if name in available]
     used = [usable[i] for i in sample_evenly(len(usable), options.max_views)]
     if export is not None:
-        check_unique_stems([views.names[index] for index in used])
-    wait_for_kernels = start_kernel_warm_up(scene, gaussians, options, config)
-    portion = Partition.of(team, gaussians.means)
-    evidence, features, level = collect_evidence(
-        scene, gaussians, used, source, options, config, cache, export, stages, wait_for_kernels, portion
-    )
-    table, consensus_facts = features, {}
-    if options.consensus:
-        table, consensus_facts = _run_consensus(evidence, features, level, options, portion, stages)
-    with stages("lift") as step:
-        kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
-        lifted = lift(evidence, table, **kwargs)
-        _check_directions(evidence, lifted.scalars, source, portion)
-        own = lifted.scalars.own_evidence
-        if options.consensus:
-            before = lift(evidence, features, **kwargs).scalars
-            own = torch.where(lifted.scalars.norm > 0, before.own_evidence, 0.0)
-            lifted = replace(lifted, scalars=with_original_reliability(lifted.scalars, before))
-        step()
-    counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
-    copied, vote_facts = None, {}
-    if options.refine:
-        copied, vote_facts = vote_distributed(gaussians.means, lifted, own, options.vote, portion, stages)
-    with stages("store") as step:
-        provenance = {
-            **scene.identity,
-            "encoder": dict(encoder),
-            "cameras": camera_summary(scene.train.cameras),
-            "cameras_held_out": camera_summary(scene.held_out.cameras),
-            "features": source.identity,
-            "options": asdict(options),
-            "views_lifted": [views.names[index] for index in used],
-            "views_without_features": [name for name in views.names if name not in names],
-            "gsplat_rules": config.rules,
-            "backend": config.backend,
-            "statistics": {
-                **counts,
-                **consensus_facts,
-                **_statistics(portion.join(lifted.scalars.reliability)),
-                **vote_facts,
-            },
-        }
-        kwargs = {"tolerance": options.tolerance, "storage": options.storage}
-        field = SemanticField.build_together(lifted, gaussians.means, copied, portion, provenance=provenance, **kwargs)
-        step()
-    if field is None:
-        return None
-    field = replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
-    return LiftResult(field, stages.seconds)
+        check_unique_stems([names[index] for index in used])
+    missing = [name for name in names if name not in available]
+    return EvidenceCollection(scene, gaussians, used, missing, source, options, config, cache, export)
 
 
 def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
@@ -414,34 +180,61 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     settings = RasterSettings.of_gsplat(rules)
     power = options.weight_power
     backend = resolve_backend(gaussians, options.backend, settings=settings, dtype=dtype, weight_power=power)
-    return RasterConfig(rules, backend, dtype)
+    return RasterConfig(rules, backend, dtype, scene.rasterize_mode, power)
 
 
-def start_kernel_warm_up(
-    scene: Scene, gaussians: GaussianScene, options: LiftOptions, drawing: RasterConfig
-) -> Callable[[], None]:
-    """Start to compile or load kernels in the background; return a function that waits for them."""
-    if drawing.backend == "numba":
-        from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
-
-        return compile_kernels(drawing.dtype).join
-    if drawing.backend != "triton" or len(scene.train) == 0:
-        return lambda: None
-    kwargs = {"settings": drawing.settings, "backend": drawing.backend, "dtype": drawing.dtype}
-    return warm_up_kernels(
-        gaussians, scene.train.cameras[0], options, rasterize_mode=scene.rasterize_mode, **kwargs
-    ).join
+def consensus_options(options: LiftOptions) -> dict[str, Any]:
+    """Return the options of a lift for `sampled_consensus`."""
+    return {"power": options.consensus_power, "least": options.consensus_least}
 
 
-def _check_directions(evidence: Evidence, scalars: Scalars, source: FeatureSource, portion: Partition) -> None:
-    """Raise if no Gaussian received a direction.
+def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
+    """Return the entry of the manifest about the consensus."""
+    facts = {
+        "power": options.consensus_power,
+        "sample": options.consensus_sample,
+        "least": options.consensus_least,
+        "seed": SAMPLING_SEED,
+        "gaussians": result.gaussians,
+        "agreement": result.agreement,
+    }
+    return {"consensus": facts}
 
+
+def lift_features(
+    views: ViewObservations, table: Float[Tensor, "s d"], options: LiftOptions
+) -> tuple[Lifted, Float[Tensor, " n"]]:
+    """Lift a feature table; return also the own evidence of every Gaussian for the vote.
+
+    Args:
+        table: features of the views, after consensus if enabled. R is that of the features before the consensus.
+    """
+    kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
+    lifted = lift(views.evidence, table, **kwargs)
+    own = lifted.scalars.own_evidence
+    if options.consensus:
+        before = lift(views.evidence, views.features, **kwargs).scalars
+        own = torch.where(lifted.scalars.norm > 0, before.own_evidence, 0.0)
+        lifted = replace(lifted, scalars=with_original_reliability(lifted.scalars, before))
+    return lifted, own
+
+
+def count_directions(lifted: Lifted) -> Int64[Tensor, " 2"]:
+    """Return the number of Gaussians with a direction, and the number of entries of the evidence."""
+    norm = lifted.scalars.norm
+    return torch.stack([(norm > 0).sum(), torch.tensor(lifted.evidence.nnz, device=norm.device)])
+
+
+def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSource) -> None:
+    """Raise if no Gaussian received a direction, and warn if few did.
+
+    Args:
+        counts: counts from `count_directions`, of all Gaussians.
+        total: number of Gaussians.
     Raises:
         ValueError: no Gaussian has a direction.
     """
-    entries = torch.tensor(evidence.nnz, device=scalars.norm.device)
-    lifted, entries = portion.team.add(torch.stack([(scalars.norm > 0).sum(), entries])).tolist()
-    total = len(portion.order)
+    lifted, entries = counts.tolist()
     if lifted == 0 and entries == 0:
         raise InputError(
             f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
@@ -470,175 +263,265 @@ def _describe(source: FeatureSource) -> str:
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
-def _run_consensus(
-    evidence: Evidence,
-    features: Float[Tensor, "s d"],
-    level: Int64[Tensor, " s"],
-    options: LiftOptions,
-    portion: Partition,
-    stages: StageTimer,
-) -> tuple[Float[Tensor, "s d"], dict[str, Any]]:
-    """Return the features after consensus, and what the manifest records about it."""
-    with stages("consensus") as step:
-        kwargs = {
-            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
-        }  # fmt: skip
-        result = consensus(evidence, features, level=level, portion=portion, **kwargs)
-        step()
-    facts = {**kwargs, "seed": SAMPLING_SEED, "gaussians": result.gaussians, "agreement": result.agreement}
-    return result.features, {"consensus": facts}
-
-
-def vote_distributed(
+def vote_directions(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
-    own: Float[Tensor, " m"],
+    own: Float[Tensor, " n"],
     config: RefineConfig,
-    portion: Partition,
     stages: StageTimer,
-) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
-    """Vote in one or several processes.
+) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
+    """Vote among neighbors.
 
     Returns:
-        For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians
-        that change their direction and that have no support.
+        For every Gaussian, the Gaussian whose direction it takes. Also the shares of Gaussians that change their
+        direction and that have no support.
     """
-    gaussians = portion.gaussians
-    with stages("neighbors", len(gaussians)):
-        progress = partial(stages.tell, "neighbors")
-        of = gaussians if portion.team.size > 1 else None
-        neighbors = nearest_neighbors(means, config.k, of=of, progress=progress, team=portion.team)
-    with stages("vote", len(gaussians)):
+    reliability, n = lifted.scalars.reliability, len(means)
+    with stages("neighbors", n):
+        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
+    with stages("vote", n):
         progress = partial(stages.tell, "vote")
-        if portion.team.size == 1:
-            reliability = lifted.scalars.reliability
-            copied = refine(
-                means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress
-            )
-        else:
-            halo = gather_halo(lifted, neighbors, portion)
-            neighbors, reliability = halo.neighbors, portion.join(lifted.scalars.reliability)[halo.gaussians]
-            own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
-            kwargs = {"own": None if config.vote == "paper" else own, "progress": progress}
-            width = decay_width(portion.team.join(neighbors.spacing), config)
-            directions = halo.lifted.directions
-            rows = refine_subset(portion.along, neighbors, directions, reliability, config, width=width, **kwargs)
-            copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        changed, lost = (copied != gaussians).sum(), unsupported(neighbors, reliability).sum()
-        changed, lost = portion.team.add(torch.stack([changed, lost])).tolist()
-    return copied, {"refined_share": changed / len(means), "unsupported_share": lost / len(means)}
+        copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress)
+        counts = count_votes(copied, torch.arange(n, device=means.device), neighbors, reliability)
+    return copied, vote_shares(counts, n)
 
 
-def _statistics(reliability: Float[Tensor, " n"]) -> dict[str, Any]:
+def count_votes(
+    copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
+) -> Int64[Tensor, " 2"]:
+    """Return how many Gaussians changed their direction, and how many have no support."""
+    return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
+
+
+def vote_shares(counts: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
+    """Return the counts from `count_votes` as shares of n Gaussians, for the manifest."""
+    changed, lost = counts.tolist()
+    return {"refined_share": changed / n, "unsupported_share": lost / n}
+
+
+def lift_statistics(
+    collection: EvidenceCollection,
+    views: ViewObservations,
+    reliability: Float[Tensor, " n"],
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the statistics of a lift for the manifest.
+
+    Args:
+        reliability: R of all Gaussians.
+        facts: statistics of the consensus and the vote.
+    """
     positive = reliability[reliability > 0].double().sort().values
     n, count, shares = reliability.numel(), len(positive), (0.05, 0.25, 0.5, 0.75, 0.95)
     quantiles = {str(q): float(positive[round(q * (count - 1))]) for q in shares} if count > 0 else {}
-    return {"gaussians": n, "zero_evidence_share": 1 - count / max(1, n), "reliability_quantiles": quantiles}
+    return {
+        "views": len(collection.views),
+        "left_out": len(collection.missing),
+        "excluded": views.evidence.num_excluded,
+        "gaussians": n,
+        "zero_evidence_share": 1 - count / max(1, n),
+        "reliability_quantiles": quantiles,
+        **facts,
+    }
 
 
-# Lifting into a new run, in one or several processes.
+def lift_provenance(
+    collection: EvidenceCollection, encoder: Mapping[str, Any], statistics: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the metadata of a lift for the manifest."""
+    scene, config = collection.scene, collection.config
+    return {
+        **scene.identity,
+        "encoder": dict(encoder),
+        "cameras": camera_summary(scene.train.cameras),
+        "cameras_held_out": camera_summary(scene.held_out.cameras),
+        "features": collection.source.identity,
+        "options": asdict(collection.options),
+        "views_lifted": [scene.train.names[index] for index in collection.views],
+        "views_without_features": list(collection.missing),
+        "gsplat_rules": config.rules,
+        "backend": config.backend,
+        "statistics": dict(statistics),
+    }
 
 
-def lift_run_distributed(
-    team: Communicator,
-    opened: Callable[[], Scene],
-    *,
-    source: SourceOptions | None,
-    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None,
-    texts: Mapping[str, Float[Tensor, " d"]] | None,
-    lift: LiftOptions | None,
-    queries: Sequence[str],
-    output_dir: str | Path | None,
-    timestamp: str | None,
-    overwrite: bool,
-    check: bool,
-    device: str,
-    export: FeatureExport | None,
-    report: ProgressCallback,
-    say: Callable[[str], None],
-) -> LiftedRun | None:
-    """Run `lift_run` in several processes, all with the same arguments. Only rank 0 writes and returns the run.
+def with_cost(field: SemanticField, stages: StageTimer, device: str) -> SemanticField:
+    """Return a field whose manifest records the time and memory of the lift."""
+    return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
 
-    Args:
-        opened: opens the trained scene. It is called after all checks that do not need the scene.
-    """
-    if features is None and texts is not None:
-        raise InputError("texts are for your own features; pass features, too, or omit texts")
-    if features is not None and source is not None:
-        raise InputError("features replace source; pass only one of the two")
-    check_prompt_list("queries", queries)
-    check_bool("overwrite", overwrite)
-    check_bool("check", check)
-    target = None if output_dir is None else check_path("output_dir", output_dir)
-    if timestamp is not None:
-        run_directory(Path(), "run", timestamp)  # raise for a bad name before the scene loads
-    for name, value, kind in (
-        ("source", source, SourceOptions),
-        ("lift", lift, LiftOptions),
-        ("export", export, FeatureExport),
-    ):
-        if value is not None and not isinstance(value, kind):
-            raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
-    device, options = choose_device(device), (source or SourceOptions()).looking_for(queries)
+
+# Lifting into a new run.
+
+
+@dataclass(frozen=True)
+class RunTarget:
+    """Directory of a new run."""
+
+    output_dir: str | Path | None = None
+    """Output folder; None: that of the trained run."""
+    timestamp: str | None = None
+    """Name of the run directory; None: the current time, with a number if such a run exists."""
+    overwrite: bool = False
+    """Replace a run directory of that name."""
+
+    def __post_init__(self) -> None:
+        check_bool("overwrite", self.overwrite)
+        if self.output_dir is not None:
+            check_path("output_dir", self.output_dir)
+        if self.timestamp is not None:
+            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
+
+    def directory(self, scene: NerfstudioScene | SplatScene) -> Path:
+        """Return the directory of a run lifted from this scene."""
+        folder = scene.runs_dir if self.output_dir is None else check_path("output_dir", self.output_dir)
+        return run_directory(folder, scene.name, self.timestamp)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftRequest:
+    """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
+
+    open_scene: Callable[[], Scene]
+    """Opens the trained scene. It is called after all checks that do not need the scene."""
+    source: SourceOptions | None = None
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None
+    texts: Mapping[str, Float[Tensor, " d"]] | None = None
+    lift: LiftOptions | None = None
+    queries: Sequence[str] = ()
+    target: RunTarget = RunTarget()
+    check: bool = True
+    device: str = "auto"
+    export: FeatureExport | None = None
+    report: ProgressCallback = lambda stage, done, total: None
+    say: Callable[[str], None] = lambda text: None
+
+    def __post_init__(self) -> None:
+        if self.features is None and self.texts is not None:
+            raise InputError("texts are for your own features; pass features, too, or omit texts")
+        if self.features is not None and self.source is not None:
+            raise InputError("features replace source; pass only one of the two")
+        check_prompt_list("queries", self.queries)
+        check_bool("check", self.check)
+        for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
+
+
+@dataclass(frozen=True)
+class PreparedLift:
+    """Lift whose scene is open and whose inputs are checked."""
+
+    request: LiftRequest
+    scene: NerfstudioScene | SplatScene
+    source: FeatureSource
+    options: SourceOptions
+    device: str
+    run_dir: Path
+
+    @property
+    def lift(self) -> LiftOptions:
+        """Options of the lift."""
+        return self.request.lift or LiftOptions()
+
+    @property
+    def texts(self) -> Mapping[str, Float[Tensor, " d"]] | None:
+        """Prompts of the user's own features, with their embeddings."""
+        return self.source.texts if isinstance(self.source, PrecomputedFeatures) else None
+
+    @property
+    def encoder(self) -> dict[str, Any]:
+        """Options that queries need to encode prompts as the features were encoded."""
+        if self.request.features is None:
+            return encoder_settings(self.options)
+        return precomputed_settings(TEXT_EMBEDDINGS_FILE if self.texts else None)
+
+
+def run_lift(request: LiftRequest) -> LiftedRun:
+    """Lift features onto a trained scene, write the lifted run, and return it."""
+    prepared, stages = prepare_lift(request), StageTimer(request.report)
+    check_target(prepared)
+    announce(prepared)
+    check_alignment(prepared, stages)
+    result = lift_scene(
+        prepared.scene, prepared.source, prepared.lift, cache_folder(prepared.run_dir), device=prepared.device,
+        encoder=prepared.encoder, export=request.export, report=request.report,
+    )  # fmt: skip
+    return write_lifted_run(prepared, result, stages)
+
+
+def prepare_lift(request: LiftRequest) -> PreparedLift:
+    """Load encoders, open the scene, and name the new run; nothing is written."""
+    device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
-    feature_source = None if features is not None else make_source(options, device)  # raises before the scene loads
-    if feature_source is not None and len(queries) > 0:
-        feature_source.text(queries)
-    scene = opened()
+    source = None if request.features is not None else make_source(options, device)  # raises before the scene loads
+    if source is not None and len(request.queries) > 0:
+        source.text(request.queries)
+    scene = request.open_scene()
     if not isinstance(scene, NerfstudioScene | SplatScene):
         raise TypeError(
             "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
             f"{type(scene).__name__}"
         )
-    run_dir = run_directory(target or scene.runs_dir, scene.name, timestamp)
-    run_dir = run_dir.with_name(team.tell(run_dir.name))  # clocks differ
-    if team.rank == 0:
-        complete_interrupted_lifts(run_dir)
-    if timestamp is not None and team.rank == 0:
-        refuse_existing_run(run_dir, overwrite)
-    lift, stages = lift or LiftOptions(), StageTimer(report)
-    used = "" if lift.max_views is None else f"{min(lift.max_views, len(scene.train))} of "
-    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {device}")
+    if request.export is not None:
+        _refuse_equal_stems(scene.train.names)
+    if source is None:
+        source = precomputed_features(request.features, request.texts, scene.train.names)
+        if len(request.queries) > 0:
+            source.text(request.queries)
+    return PreparedLift(request, scene, source, options, device, request.target.directory(scene))
+
+
+def check_target(prepared: PreparedLift) -> None:
+    """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
+    complete_interrupted_lifts(prepared.run_dir)
+    if prepared.request.target.timestamp is not None:
+        refuse_existing_run(prepared.run_dir, prepared.request.target.overwrite)
+
+
+def announce(prepared: PreparedLift) -> None:
+    """Report the size of the lift, and the warnings of the scene."""
+    scene, most, say = prepared.scene, prepared.lift.max_views, prepared.request.say
+    used = "" if most is None else f"{min(most, len(scene.train))} of "
+    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
     for remark in scene.remarks:
         say(f"Warning: {remark}")
-    if export is not None:
-        _refuse_equal_stems(scene.train.names)
-    settings = encoder_settings(options)
-    if feature_source is None:
-        feature_source = precomputed_features(features, texts, scene.train.names)
-        texts = feature_source.texts
-        settings = precomputed_settings(TEXT_EMBEDDINGS_FILE if texts else None)
-        if len(queries) > 0:
-            feature_source.text(queries)
-    if check and team.rank == 0:
-        with stages("check") as step:
-            match = measure_alignment(
-                scene, RasterSettings.of_gsplat(resolve_gsplat_version(scene, lift)), device=device
-            )
-            warning = alignment_warning(match, own_cameras=not isinstance(scene, SplatScene))
-            step()
-        if warning is not None:
-            say(f"Warning: {warning}")
-    cache = cache_folder(run_dir)
-    with team.shares(cache):
-        result = lift_scene_distributed(
-            team, scene, feature_source, lift, cache, device=device, encoder=settings, export=export, report=report
-        )
-    if result is None:
-        return None
-    field, seconds = result
-    if features is None:
-        field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
-    seconds = {**stages.seconds, **seconds}
+
+
+def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
+    """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
+    if not prepared.request.check:
+        return
+    scene = prepared.scene
+    with stages("check") as step:
+        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
+        match = measure_alignment(scene, settings, device=prepared.device)
+        warning = alignment_warning(match, own_cameras=not isinstance(scene, SplatScene))
+        step()
+    if warning is not None:
+        prepared.request.say(f"Warning: {warning}")
+
+
+def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTimer) -> LiftedRun:
+    """Write the run of a finished lift, and return it."""
+    request, field, target = prepared.request, result.field, prepared.request.target
+    if request.features is None:
+        settings = source_settings(prepared.options, prepared.device)
+        field = replace(field, manifest={**field.manifest, "source": settings})
+    seconds = {**stages.seconds, **result.seconds}
     with stages("write") as step:
-        question = _question(field, scene.gaussians.means, feature_source, queries)
+        question = _question(field, prepared.scene.gaussians.means, prepared.source, request.queries)
+        exact = target.timestamp is not None
         run_dir = write_run(
-            scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
-        )
+            prepared.scene, field, prepared.run_dir,
+            question=question, texts=prepared.texts, overwrite=target.overwrite, exact=exact,
+        )  # fmt: skip
         field = field.to("cpu")
         step()
     seconds["write"] = stages.seconds["write"]
-    return LiftedRun(run_dir, scene, resolve_field_paths(field, run_dir / FIELD_FOLDER), device, seconds)
+    return LiftedRun(
+        run_dir, prepared.scene, resolve_field_paths(field, run_dir / FIELD_FOLDER), prepared.device, seconds
+    )
 
 
 def _refuse_equal_stems(names: Sequence[str]) -> None:
@@ -667,3 +550,54 @@ def _question(
     if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
     return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
+
+
+# Warm-up of kernels in the background, while images are read and networks process them.
+
+
+def start_kernel_warm_up(
+    scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
+) -> Callable[[], None]:
+    """Start to compile or load kernels in the background; return a function that waits for them."""
+    if config.backend == "numba":
+        from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
+
+        return compile_kernels(config.dtype).join
+    if config.backend != "triton" or len(scene.train) == 0:
+        return lambda: None
+    return warm_up_kernels(gaussians, scene.train.cameras[0], options, config).join
+
+
+def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig) -> Thread:
+    """Lift random features onto some of the Gaussians in a thread, and discard the result.
+
+    Errors are suppressed here, because the lift itself will raise them again.
+    """
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    sample = GaussianScene(*(array[:_WARM_UP_GAUSSIANS] for array in arrays))
+
+    def work() -> None:
+        with suppress(Exception), torch.no_grad():  # as the docstring says
+            evidence = rasterize_evidence(
+                sample, [camera], [_quarters(camera)], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
+                rasterize_mode=config.rasterize_mode, settings=config.settings, dtype=config.dtype,
+                weight_power=config.weight_power,
+            )  # fmt: skip
+            features = torch.eye(_WARM_UP_REGIONS, _WARM_UP_DIMENSION, dtype=config.dtype, device=sample.means.device)
+            if options.consensus:
+                consensus(evidence, features)
+            lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+            if options.refine and len(sample) > options.vote.k:
+                neighbors = nearest_neighbors(sample.means, options.vote.k)
+                own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
+                refine(sample.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
+
+    thread = Thread(target=work, name="kernel warm-up", daemon=True)
+    thread.start()
+    return thread
+
+
+def _quarters(camera: Camera) -> torch.Tensor:
+    """Return labels of the four quarters of an image."""
+    x, y = torch.arange(camera.width), torch.arange(camera.height)
+    return (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()

@@ -596,7 +596,11 @@ def measure_capture(
     observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
     cached_s = _per_view(observe_cached(list(cached))) if len(cached) > 0 else None
     block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
-    rasterized = _measure_evidence(partial(_evidence, gaussians, block, scene, options, drawing), timed, cuda=cuda)
+
+    def rasterize(folder: Path) -> Evidence:
+        return batch_evidence(gaussians, block, folder, drawing, reuse=True, done=lambda: None)
+
+    rasterized = _measure_evidence(rasterize, timed, cuda=cuda)
     evidence, count = rasterized.evidence, len(block.cameras)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
     rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
@@ -616,7 +620,7 @@ def measure_capture(
         features_kept=len(cached) / len(chosen),
         evidence_s=rasterized.seconds / count,
         kept_evidence_s=rasterized.cached_seconds / count,
-        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), scene, options, drawing, cache),
+        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
@@ -681,22 +685,11 @@ def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
     return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
-def _evidence(
-    gaussians: GaussianScene, block: ViewBatch, scene: Scene, options: LiftOptions, drawing: RasterConfig, folder: Path
-) -> Evidence:
-    return batch_evidence(
-        gaussians, block, folder,
-        rasterize_mode=scene.rasterize_mode, settings=drawing.settings, backend=drawing.backend,
-        weight_power=options.weight_power, dtype=drawing.dtype, reuse=True, done=lambda: None,
-    )  # fmt: skip
-
-
 def _evidence_cached(
     gaussians: GaussianScene,
     observed: _Observed,
     cached: Mapping[int, ViewBatch],
     chosen: int,
-    scene: Scene,
     options: LiftOptions,
     drawing: RasterConfig,
     cache: Path,
@@ -704,10 +697,9 @@ def _evidence_cached(
     """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
     if not options.reuse_evidence:
         return 0.0
-    facts = [scene.rasterize_mode, options.weight_power, str(drawing.dtype), asdict(drawing.settings), drawing.backend]
     share = 0.0
     for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
-        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, facts))
+        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, drawing))
         share += sum(hits) / max(1, len(hits)) * views / chosen
     return share
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import torch
 
-from normlift_ns.core.partition import ProgressCallback
+ProgressCallback = Callable[[str, int, int], None]
+"""Progress callback, called with (stage, steps done, total steps)."""
 
 
 class StageTimer:

@@ -30,11 +30,12 @@ from torch import Tensor
 
 from normlift_ns import Camera, Evidence, GaussianScene, RefineConfig, lift, rasterize_evidence
 from normlift_ns.core.lift import Scalars
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
-from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.core.partition import Partition
+from normlift_ns.distributed.communicator import EvidenceShard, TorchCommunicator, redistribute_evidence
 from normlift_ns.distributed.launch import distributed_context, launch_processes
+from normlift_ns.distributed.lift import vote_distributed
 from normlift_ns.evidence_collection import chunk_views
-from normlift_ns.pipeline import vote_distributed
+from normlift_ns.pipeline import vote_directions
 from normlift_ns.progress import StageTimer
 from research import rooms
 from research.command import joined as with_earlier
@@ -73,14 +74,15 @@ class Found(NamedTuple):
 class Clock:
     """Seconds from barrier to barrier."""
 
-    def __init__(self, team: Communicator, device: str) -> None:
+    def __init__(self, team: TorchCommunicator | None, device: str) -> None:
         self.team, self.device, self.seconds = team, device, dict[str, float]()
         self.last = self.now()
 
     def now(self) -> float:
         if self.device == "cuda":
             torch.cuda.synchronize()
-        self.team.add(torch.zeros(1))
+        if self.team is not None:
+            self.team.add(torch.zeros(1))
         return time.perf_counter()
 
     def lap(self, name: str) -> None:
@@ -88,25 +90,37 @@ class Clock:
         self.seconds[name], self.last = now - self.last, now
 
 
-def core(team: Communicator, case: Case, folder: Path, device: str) -> Found:
+def rasterized(case: Case, views: Sequence[int]) -> Evidence:
+    labels = [case.labels[v % len(case.labels)] for v in views]
+    return rasterize_evidence(case.scene, [case.cameras[v] for v in views], labels, num_regions=[REGIONS] * len(views))
+
+
+def core_alone(case: Case, device: str) -> Found:
+    """What all Gaussians become in one process, and the seconds of every step."""
+    clock, stages = Clock(None, device), StageTimer(lambda stage, done, total: None)
+    whole = [rasterized(case, views) for views in chunk_views(range(len(case.cameras)))]
+    clock.lap("evidence")
+    evidence = Evidence.merge(*whole)
+    whole.clear()
+    clock.lap("exchange")
+    lifted = lift(evidence, case.table)
+    clock.lap("lift")
+    copied, _ = vote_directions(case.scene.means, lifted, lifted.scalars.own_evidence, RefineConfig(), stages)
+    clock.lap("vote")
+    return Found(lifted.scalars, copied, {**clock.seconds, "neighbors": stages.seconds["neighbors"]}, evidence)
+
+
+def core(team: TorchCommunicator, case: Case, folder: Path, device: str) -> Found:
     """What the Gaussians of this process become, and the seconds of every step."""
     clock = Clock(team, device)
     portion = Partition.of(team, case.scene.means)
     chunks = chunk_views(range(len(case.cameras)), team.size)
-    pieces, whole = dict[int, EvidenceShard](), list[Evidence]()
+    pieces = dict[int, EvidenceShard]()
     with team.shares(folder):
         for number in team.chunks(len(chunks)):
-            cameras = [case.cameras[v] for v in chunks[number]]
-            labels = [case.labels[v % len(case.labels)] for v in chunks[number]]
-            found = rasterize_evidence(case.scene, cameras, labels, num_regions=[REGIONS] * len(cameras))
-            if team.size > 1:
-                pieces[number] = EvidenceShard.of(found, portion)
-            else:
-                whole.append(found)
-            del found
+            pieces[number] = EvidenceShard.of(rasterized(case, chunks[number]), portion)
         clock.lap("evidence")
-    evidence = Evidence.merge(*whole) if team.size == 1 else redistribute_evidence(pieces, portion, len(chunks))
-    whole.clear()
+    evidence = redistribute_evidence(pieces, portion, len(chunks))
     pieces.clear()
     clock.lap("exchange")
     lifted = lift(evidence, case.table)
@@ -134,11 +148,11 @@ def difference(a: Found, b: Found) -> float:
 
 
 def compare_core(
-    team: Communicator, report: Report, name: str, case: Case, folder: Path, device: str, rounds: int
+    team: TorchCommunicator, report: Report, name: str, case: Case, folder: Path, device: str, rounds: int
 ) -> None:
     one, two, wrong, entries = list[dict[str, float]](), list[dict[str, float]](), 0.0, 0
     for turn in range(rounds + 1):
-        alone = core(SINGLE_PROCESS, case, folder, device) if team.rank == 0 else None
+        alone = core_alone(case, device) if team.rank == 0 else None
         team.add(torch.zeros(1))
         together = core(team, case, folder, device)
         entries = together.evidence.nnz
@@ -165,7 +179,7 @@ def compare_core(
     report.add(f"exchange_gib_s{name}", moved / spent, "GiB/s, sorting what came included")
 
 
-def large(team: Communicator, report: Report, case: Case, folder: Path, device: str) -> None:
+def large(team: TorchCommunicator, report: Report, case: Case, folder: Path, device: str) -> None:
     if device == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -190,7 +204,7 @@ def large(team: Communicator, report: Report, case: Case, folder: Path, device: 
     report.add("n100m.copied", changed, "share of Gaussians")
 
 
-def front(team: Communicator, report: Report, folder: Path, device: str, quick: bool) -> None:
+def front(team: TorchCommunicator, report: Report, folder: Path, device: str, quick: bool) -> None:
     """SAM and CLIP over photographs, in chunks."""
     from normlift_ns.encoders.base import RegionFeatures, iterate_view_features  # noqa: PLC0415
     from research.front_end_inputs import SMALL, Size, injected_sam, random_clip, random_sam  # noqa: PLC0415
@@ -203,21 +217,31 @@ def front(team: Communicator, report: Report, folder: Path, device: str, quick: 
     g = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (count, size.height, size.width, 3), generator=g, dtype=torch.uint8)
 
-    def see(some: Communicator) -> float:
-        clock, chunks = Clock(some, device), chunk_views(range(count), some.size)
-        with some.shares(folder):
-            for number in some.chunks(len(chunks)):
-                for _ in iterate_view_features(source, ((images[v], str(v)) for v in chunks[number])):
-                    pass
+    def see_chunk(chunk: Sequence[int]) -> None:
+        for _ in iterate_view_features(source, ((images[v], str(v)) for v in chunk)):
+            pass
+
+    def see_alone() -> float:
+        clock = Clock(None, device)
+        for chunk in chunk_views(range(count)):
+            see_chunk(chunk)
+        clock.lap("all")
+        return clock.seconds["all"]
+
+    def see() -> float:
+        clock, chunks = Clock(team, device), chunk_views(range(count), team.size)
+        with team.shares(folder):
+            for number in team.chunks(len(chunks)):
+                see_chunk(chunks[number])
             clock.lap("all")
         return clock.seconds["all"]
 
     for _ in iterate_view_features(source, ((images[v], str(v)) for v in range(2))):  # compiles
         pass
-    one = [see(SINGLE_PROCESS)] if team.rank == 0 else []
+    one = [see_alone()] if team.rank == 0 else []
     team.add(torch.zeros(1))
-    two = [see(team), see(team)]
-    one += [see(SINGLE_PROCESS)] if team.rank == 0 else []
+    two = [see(), see()]
+    one += [see_alone()] if team.rank == 0 else []
     team.add(torch.zeros(1))
     if team.rank == 0:
         unit = f"one GPU over two, {count} images"
@@ -275,7 +299,7 @@ SIZES = (("", 1_930_000, 177), ("_10m", 10_000_000, 20))
 TINY = (("", 20_000, 21), ("_10m", 30_000, 5))
 
 
-def work(team: Communicator, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
+def work(team: TorchCommunicator, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
     """What both processes do."""
     make: Callable[[int, int], Case] = partial(Case.of, device=device, **(SMALL_VIEWS if quick else {}))
     if part == "core":
@@ -290,6 +314,7 @@ def work(team: Communicator, part: str, report: Report, folder: Path, device: st
 
 def worker(only: Sequence[str], output: Path, folder: Path, device: str, quick: bool) -> None:
     with distributed_context(device, print) as team, torch.no_grad():
+        assert team is not None
         for part in only:
             report = Report("scale")
             work(team, part, report, folder, device, quick)

@@ -13,7 +13,6 @@ from torch import Tensor
 from normlift_ns import Evidence, Lifted, RefineConfig, lift, nearest_neighbors, refine
 from normlift_ns.analysis.objects import best_prompt
 from normlift_ns.core.lowrank import basis_of_rank, half_precision_error, spectral_table, store_directions
-from normlift_ns.core.partition import SINGLE_PROCESS, Partition
 from normlift_ns.core.sparse import SparseRows
 from research.hard_case import Case, Setting
 from tests.scenes import generator, unit_rows
@@ -180,9 +179,7 @@ def _cosine_errors(setting: Setting, table: Tensor, rank: int | None) -> tuple[T
     texts = torch.cat([unit_rows(40, d, 5), exact[:5], -exact[:5]])
     lifted = lift(evidence_of(weights, region_view).to(setting.device), table.to(setting.device))
     basis = None if rank is None else basis_of_rank(lifted, spectral_table(lifted.features), rank)
-    every = Partition(SINGLE_PROCESS, torch.arange(n, device=setting.device))
-    stored = store_directions(lifted, None if basis is None else basis.rows, every)
-    assert stored is not None
+    stored = store_directions(lifted, None if basis is None else basis.rows, torch.arange(n, device=setting.device))
     found = stored.products(texts.float().to(setting.device), lifted.scalars).cpu()
     bound = torch.full((n,), half_precision_error(d if rank is None else rank)) + 1e-6
     if basis is not None:

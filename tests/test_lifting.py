@@ -36,7 +36,7 @@ from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
 from normlift_ns.evaluation.studies import voting_scalars
-from normlift_ns.evidence_collection import FeatureExport
+from normlift_ns.evidence_collection import FeatureExport, RasterConfig
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.progress import lift_cost
 from normlift_ns.rendering.figures import training_cameras, unique_file_names
@@ -231,8 +231,8 @@ def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
         return rasterize(scene, cameras, labels, **how)
 
     monkeypatch.setattr(pipeline, "rasterize_evidence", watched)
-    how = {"rasterize_mode": "classic", "settings": RasterSettings(), "backend": "numba", "dtype": torch.float32}
-    pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, LiftOptions(), **how).join()
+    config = RasterConfig("1.4", "numba", torch.float32, "classic", 1)
+    pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, LiftOptions(), config).join()
     assert seen[0].shape == (HEIGHT, WIDTH)
     assert torch.bincount(seen[0].flatten()).tolist() == [HEIGHT * WIDTH // 4] * 4
 

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns import Evidence, LiftOptions, RasterSettings, evidence_collection
+from normlift_ns import Evidence, LiftOptions, evidence_collection
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
-from normlift_ns.evidence_collection import ViewBatch, batch_evidence
+from normlift_ns.evidence_collection import RasterConfig, ViewBatch, batch_evidence
 from normlift_ns.options import BackendName
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.segmentation.regions import Superpixels
@@ -103,9 +103,8 @@ def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendNa
     labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
     block = ViewBatch([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
     found = batch_evidence(
-        random_scene(30, dtype=torch.float32), block, folder, rasterize_mode="classic",
-        settings=RasterSettings.of_gsplat(rules), backend=backend, weight_power=1, dtype=torch.float32, reuse=True,
-        done=lambda: done.append(1),
+        random_scene(30, dtype=torch.float32), block, folder,
+        RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, done=lambda: done.append(1),
     )  # fmt: skip
     assert done == [1]
     return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])

@@ -27,7 +27,15 @@ from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import ViewBatch, cached_batch_evidence, chunk_views, observe_views, region_levels
+from normlift_ns.evidence_collection import (
+    RasterConfig,
+    ViewBatch,
+    cached_batch_evidence,
+    chunk_views,
+    observe_views,
+    region_levels,
+)
+from normlift_ns.options import GSPLAT_VERSIONS
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.sam import SamMasks
 
@@ -137,11 +145,13 @@ class RecordedVotes:
             self.scene.gaussians,
             block,
             self.cache / "evidence",
-            rasterize_mode=self.scene.rasterize_mode,
-            settings=RasterSettings.recorded(self.field.manifest),
-            backend=self.field.manifest.get("backend", "auto"),
-            weight_power=self._option("weight_power", int, 1),
-            dtype=torch.float64 if self._option("precision", str, "standard") == "double" else torch.float32,
+            RasterConfig(
+                rules=str(self.field.manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])),
+                backend=self.field.manifest.get("backend", "auto"),
+                dtype=torch.float64 if self._option("precision", str, "standard") == "double" else torch.float32,
+                rasterize_mode=self.scene.rasterize_mode,
+                weight_power=self._option("weight_power", int, 1),
+            ),
         )
         if evidence is None:
             raise InputError(

@@ -50,14 +50,15 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
 
 if TYPE_CHECKING:
-    from normlift_ns.core.partition import Communicator, ProgressCallback
     from normlift_ns.core.scene import Scene
+    from normlift_ns.distributed.communicator import TorchCommunicator
     from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.progress import ProgressCallback
 
 
 @contextmanager
-def join_processes(device: str) -> Iterator[Communicator]:
-    """Join the processes that this one was started with, if any; only the first process prints.
+def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
+    """Join the processes that this one was started with, if any; only the first process prints. None: there are none.
 
     Args:
         device: cpu, cuda or auto.
@@ -65,7 +66,7 @@ def join_processes(device: str) -> Iterator[Communicator]:
     started_by_us = LAUNCHED_VARIABLE in os.environ  # the process that started this one reports failures
     try:
         with distributed_context(device, print_error) as team:
-            if team.rank > 0:
+            if team is not None and team.rank > 0:
                 CONSOLE.quiet = True
                 warnings.simplefilter("ignore")
             yield team
@@ -155,12 +156,12 @@ class NormLift:
         CONSOLE.print(plan_table(plan))
         info(describe_needs(plan))
 
-    def _lift(self, team: Communicator) -> LiftedRun | None:
+    def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.api import scene_opener  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
-        from normlift_ns.pipeline import lift_run_distributed  # noqa: PLC0415
+        from normlift_ns.pipeline import LiftRequest, RunTarget, run_lift  # noqa: PLC0415
 
         import_time = time.perf_counter()
         message_times: list[float] = []
@@ -172,23 +173,26 @@ class NormLift:
         with progress_bars() as report:
             trained = self.trained()
             is_config = isinstance(trained, Path)
-            run = lift_run_distributed(
-                team,
-                scene_opener(trained, self.data if is_config else None, self.load_step if is_config else None),
+            request = LiftRequest(
+                open_scene=scene_opener(
+                    trained, self.data if is_config else None, self.load_step if is_config else None
+                ),
                 source=self.source,
-                features=None,
-                texts=None,
                 lift=self.lift,
                 queries=self.queries,
-                output_dir=self.output_dir,
-                timestamp=self.timestamp,
-                overwrite=self.overwrite,
+                target=RunTarget(self.output_dir, self.timestamp, self.overwrite),
                 check=self.check,
                 device=self.device,
                 export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),
                 report=report,
                 say=on_message,
             )
+            if team is None:
+                run = run_lift(request)
+            else:
+                from normlift_ns.distributed.lift import run_lift_distributed  # noqa: PLC0415
+
+                run = run_lift_distributed(team, request)
         if run is None:
             return None
         before = {"start": import_time - start_time, "open": (message_times or [import_time])[0] - import_time}

@@ -36,7 +36,7 @@ from torch import Tensor
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Scalars
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition, all_gather_sparse
+from normlift_ns.core.partition import Partition
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.core.validation import check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
@@ -97,7 +97,6 @@ def consensus(
     power: float = 1.0,
     sample: int = 50,
     least: float = CHANCE_AGREEMENT,
-    portion: Partition | None = None,
 ) -> Consensus:
     """Compute F' of every region with the formulas at the top of this file.
 
@@ -107,7 +106,6 @@ def consensus(
         power: q, the exponent of c_ts, >= 0.
         sample: smallest number of Gaussians to sample in a region, >= 1; regions with fewer use all of them.
         least: largest B at which regions overlap by chance and keep their features, in 0..1.
-        portion: Gaussians of the evidence, if other processes have the rest; None: all Gaussians.
     Raises:
         ValueError: if the table or the levels have another length, a row is neither a unit vector nor 0, a level is
             negative, or `power`, `sample` or `least` is out of range.
@@ -120,7 +118,16 @@ def consensus(
     >>> consensus(evidence, torch.tensor([[0.6, 0.8], [0.6, -0.8], [0.6, 0.8]])).features[1]
     tensor([0.9138, 0.4061])
     """
-    size = evidence.num_regions
+    check_consensus_inputs(evidence.num_regions, features, level)
+    _check_numbers(power, sample, least)
+    chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample)
+    return sampled_consensus(
+        evidence.select_gaussians(chosen), probability, features, level=level, power=power, least=least
+    )
+
+
+def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) -> None:
+    """Raise ValueError if the features or levels do not fit evidence of `size` regions."""
     check_tensors(features=features, **({} if level is None else {"level": level}))
     for name, length in (("features", len(features)), ("level", size if level is None else len(level))):
         if length != size:
@@ -129,43 +136,46 @@ def consensus(
         raise InputError(f"features must be floating-point rows [S, D], got {features.dtype} {tuple(features.shape)}")
     if level is not None and (level.ndim != 1 or level.dtype.is_floating_point or bool((level < 0).any())):
         raise InputError(f"level must be whole numbers >= 0 of shape [S], got {level.dtype} {tuple(level.shape)}")
+    check_unit_rows(features, "feature rows", "normalize them, or set those without a feature to 0", allow_zeros=True)
+
+
+def _check_numbers(power: float, sample: int, least: float) -> None:
     if not isinstance(power, int | float) or not 0 <= power < float("inf"):
         raise InputError(f"power must be a number >= 0, got {power!r}")
     if not isinstance(sample, int) or sample < 1:
         raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
     if not isinstance(least, int | float) or not 0 <= least <= 1:
         raise InputError(f"least must be a number in 0..1, got {least!r}")
-    check_unit_rows(features, "feature rows", "normalize them, or set those without a feature to 0", allow_zeros=True)
-    device = evidence.rows.weight.device
-    chosen, probability = sample_gaussians(evidence.rows, size, sample, portion)
-    sampled = evidence.select_gaussians(chosen)
+
+
+def sampled_consensus(
+    sampled: Evidence,
+    probability: Float64[Tensor, " m"],
+    features: Float[Tensor, "s d"],
+    *,
+    level: Int[Tensor, " s"] | None = None,
+    power: float = 1.0,
+    least: float = CHANCE_AGREEMENT,
+) -> Consensus:
+    """Compute the consensus from the evidence of sampled Gaussians.
+
+    Args:
+        sampled: evidence of the Gaussians from `sample_gaussians`.
+        probability: sampling probability of each.
+        features, level, power, least: as in `consensus`.
+    """
+    rows, size, device = sampled.rows, sampled.num_regions, sampled.rows.weight.device
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
     out, agreement = features.to(device, copy=True), []
     levels = level.unique().tolist()
-    if portion is not None and portion.team.size > 1:
-        sampled, probability = _gather_sampled(sampled, portion.gaussians[chosen], probability, portion.team)
-        if portion.team.rank > 0:
-            return Consensus(portion.team.spread(out), portion.team.tell(None), len(probability))
-    rows = sampled.rows
     total = total_view_weights(sampled, torch.arange(len(rows), device=device), max(1, len(levels)))
     for number in levels:
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
-        overlaps = region_overlaps(part, evidence.region_view[columns], probability, total)
+        overlaps = region_overlaps(part, sampled.region_view[columns], probability, total)
         out[columns] = apply_consensus(out[columns], overlaps, power, least)
         agreement.append(overlaps.agreement)
-    if portion is not None:
-        out, agreement = portion.team.spread(out), portion.team.tell(agreement)
     return Consensus(out, agreement, len(probability))
-
-
-def _gather_sampled(
-    sampled: Evidence, gaussians: Int64[Tensor, " m"], probability: Float64[Tensor, " m"], team: Communicator
-) -> tuple[Evidence, Float64[Tensor, " all"]]:
-    """Gather the sampled Gaussians of all processes and their sampling probabilities, ordered by index."""
-    order = team.join(gaussians).argsort()
-    rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
-    return replace(sampled, rows=rows, unlabeled=unlabeled), team.join(probability)[order]
 
 
 def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
@@ -207,15 +217,19 @@ def sample_gaussians(
     Returns:
         The sampled rows, and the sampling probability of each.
     """
-    add = SINGLE_PROCESS.add if portion is None else portion.team.add
-    count = add(torch.bincount(rows.column, minlength=num_columns))
+
+    def count_entries(entries: SparseRows) -> Int64[Tensor, " columns"]:
+        counts = torch.bincount(entries.column, minlength=num_columns)
+        return counts if portion is None else portion.team.add(counts)
+
+    count = count_entries(rows)
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
     index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.gaussians
     number = _hash_to_unit(index)
     while True:
         probability = _largest_share(rows, share)
         chosen = (number < probability).nonzero().squeeze(1)
-        sampled = add(torch.bincount(rows.select_rows(chosen).column, minlength=num_columns))
+        sampled = count_entries(rows.select_rows(chosen))
         lacking = sampled < count.clamp(max=least)
         if not bool(lacking.any()):
             return chosen, probability[chosen]

@@ -25,9 +25,8 @@ from normlift_ns.core.lowrank import (
     sizes_and_bounds,
     smallest_basis,
     store_directions,
-    store_evidence,
 )
-from normlift_ns.core.partition import SINGLE_PROCESS, Partition
+from normlift_ns.core.partition import spatial_order
 from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_tensors
@@ -102,69 +101,45 @@ class SemanticField:
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
                 f"{None if source is None else len(source)}"
             )
-        options = {"tolerance": tolerance, "storage": storage, "provenance": provenance}
-        result = SemanticField.build_together(lifted, means, source, Partition.of(SINGLE_PROCESS, means), **options)
-        assert result is not None
-        return result
+        check_storage(storage, tolerance)
+        basis = smallest_basis(lifted, tolerance)
+        forms = sizes_and_bounds(lifted, basis)
+        form = choose_form(forms, storage, tolerance)
+        if form == "evidence":
+            store = StoredEvidence(lifted.evidence, lifted.features.float())
+        else:
+            rows = basis.rows if form == "low_rank" and basis is not None else None
+            store = store_directions(lifted, rows, spatial_order(means))
+        source = torch.arange(n, device=means.device) if source is None else source
+        facts = {"form": form, "tolerance": tolerance, "forms": forms}
+        return SemanticField.assemble(lifted.scalars, source, store, means, provenance=provenance or {}, facts=facts)
 
     @staticmethod
-    def build_together(
-        lifted: Lifted,
+    def assemble(
+        scalars: Scalars,
+        source: Int[Tensor, " n"],
+        store: StoredEvidence | StoredDirections,
         means: Float[Tensor, "n 3"],
-        source: Int[Tensor, " m"] | None,
-        portion: Partition,
         *,
-        tolerance: float,
-        storage: Storage | Literal["auto"],
-        provenance: Mapping[str, Any] | None,
-    ) -> SemanticField | None:
-        """Build a field from the lifts of several processes; return it in process 0 and None in the others.
+        provenance: Mapping[str, Any],
+        facts: Mapping[str, Any],
+    ) -> SemanticField:
+        """Return a field with float32 scalars, and a manifest that identifies the Gaussians.
 
         Args:
-            lifted: lift of this process's Gaussians.
-            means: centers of all Gaussians.
-            source: result of `refine` for this process's Gaussians.
-            portion: Gaussians of this process.
-            tolerance, storage: as in `build`.
-            provenance: as in `build`; only that of process 0 is used.
+            provenance: as in `build`.
+            facts: choice of the storage form, for the manifest.
         """
-        dimension, team = lifted.features.shape[1], portion.team
-        if not tolerance > 0:
-            raise InputError(f"tolerance must be positive, got {tolerance}")
-        if storage not in (*get_args(Storage), "auto"):
-            raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
-        basis = smallest_basis(lifted, tolerance, team)
-        forms = sizes_and_bounds(lifted, basis, portion)
-        if storage == "auto":
-            storage = min(
-                (name for name, form in forms.items() if form["bound"] <= tolerance),
-                key=lambda name: forms[name]["bytes"],
-            )  # type: ignore[assignment]
-        if storage not in forms:
-            raise InputError(
-                f"no basis keeps every Gaussian within tolerance {tolerance}; raise the tolerance, or use storage "
-                "float16 or evidence"
-            )
-        if storage == "evidence":
-            store = store_evidence(lifted, portion)
-        else:
-            rows = basis.rows if storage == "low_rank" and basis is not None else None
-            store = store_directions(lifted, rows, portion)
-        scalars = lifted.scalars.map(_to_single).map(portion.join)
-        sources = portion.join(portion.gaussians.int() if source is None else source.int())
-        if store is None:
-            return None
+        dimension = store.features.shape[1] if isinstance(store, StoredEvidence) else store.dimension
         manifest = {
-            **(provenance or {}),
+            **provenance,
             "schema_version": SCHEMA_VERSION,
             "num_gaussians": len(means),
             "dimension": dimension,
             "means_fingerprint": fingerprint(means),
-            "form": storage,
-            "tolerance": tolerance,
-            "forms": forms,
+            **facts,
         }
-        return SemanticField(scalars, sources, store, manifest, means.detach().float())
+        return SemanticField(scalars.map(_to_single), source.int(), store, manifest, means.detach().float())
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
@@ -273,6 +248,31 @@ class SemanticField:
         else:
             store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
         return SemanticField(scalars, tensors["source"], store, manifest, tensors.get("means"))
+
+
+def check_storage(storage: str, tolerance: float) -> None:
+    """Raise ValueError if the storage is unknown or the tolerance is not positive."""
+    if not tolerance > 0:
+        raise InputError(f"tolerance must be positive, got {tolerance}")
+    if storage not in (*get_args(Storage), "auto"):
+        raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
+
+
+def choose_form(forms: Mapping[str, Mapping[str, Any]], storage: str, tolerance: float) -> str:
+    """Return the storage form: the requested one, or for "auto" the smallest whose bound is within the tolerance.
+
+    Raises:
+        ValueError: if no rank meets the tolerance of "low_rank".
+    """
+    if storage == "auto":
+        allowed = (name for name, form in forms.items() if form["bound"] <= tolerance)
+        return min(allowed, key=lambda name: forms[name]["bytes"])
+    if storage not in forms:
+        raise InputError(
+            f"no basis keeps every Gaussian within tolerance {tolerance}; raise the tolerance, or use storage "
+            "float16 or evidence"
+        )
+    return storage
 
 
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float64, Int
+from jaxtyping import Float, Float16, Float64, Int, Int64
 from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
+from normlift_ns.core.partition import PARTITION_BLOCK, Communicator, Partition
 
 _ROUNDING = 1e-6
 """Relative rounding error of weights, norms and directions stored in float32, added to x_j."""
@@ -43,10 +44,11 @@ class SpectralTable(NamedTuple):
     """|F_s - F_s B B^T| in column r, with B the first r eigenvectors, r = 0 ... D."""
 
 
-def spectral_table(features: Float[Tensor, "s d"], team: Communicator = SINGLE_PROCESS) -> SpectralTable:
+def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = None) -> SpectralTable:
     """Compute the eigenvectors of the feature table in float64; all processes use those of process 0."""
     exact = features.double()
-    vectors = team.spread(torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1))
+    vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
+    vectors = vectors if team is None else team.spread(vectors)
     power = (exact @ vectors) ** 2
     tail = power.flip(1).cumsum(1).flip(1)  # energy in directions r, r + 1, ...
     return SpectralTable(vectors, torch.cat([tail, tail.new_zeros(len(tail), 1)], dim=1).sqrt())
@@ -67,7 +69,7 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
     return Basis(table.vectors[:, :rank].T.contiguous(), torch.where(x > 1, 2.0, bound))
 
 
-def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator = SINGLE_PROCESS) -> Basis | None:
+def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None = None) -> Basis | None:
     """Return the basis of lowest rank for which the bound of every Gaussian is within `tolerance`, or None.
 
     The bound includes the rounding of coordinates to float16. Processes with different Gaussians get the same basis.
@@ -78,7 +80,8 @@ def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator = SINGLE
         rank = (low + high) // 2
         basis = basis_of_rank(lifted, table, rank)
         worst = torch.cat([basis.bound.new_zeros(1), basis.bound]).max()
-        if float(team.join(worst[None]).max()) + half_precision_error(rank) <= tolerance:
+        worst = worst if team is None else team.join(worst[None]).max()
+        if float(worst) + half_precision_error(rank) <= tolerance:
             best, high = basis, rank
         else:
             low = rank + 1
@@ -126,6 +129,11 @@ class StoredDirections:
     coordinates: Float16[Tensor, "m r"]
     basis: Float[Tensor, "r d"] | None
 
+    @property
+    def dimension(self) -> int:
+        """D, the length of the directions."""
+        return (self.coordinates if self.basis is None else self.basis).shape[1]
+
     def to(self, device: torch.device | str) -> StoredDirections:
         """Return a copy on another device."""
         return StoredDirections(self.coordinates.to(device), None if self.basis is None else self.basis.to(device))
@@ -146,61 +154,77 @@ class StoredDirections:
         return torch.where(mask[gaussians][:, None], torch.nn.functional.normalize(rows, dim=1), 0.0)
 
 
-def store_evidence(lifted: Lifted, portion: Partition) -> StoredEvidence | None:
-    """Return E and F of all portions in process 0, and None in the others."""
-    rows, unlabeled = (portion.deliver_sparse(x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
-    if rows is None or unlabeled is None:
-        return None
-    return StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
+def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, " n"]) -> StoredDirections:
+    """Return the directions of all Gaussians with evidence.
+
+    Args:
+        basis: rows of the basis for coordinates; None: directions are stored directly.
+        order: indices of all Gaussians from `spatial_order`.
+    """
+    coordinates, gaussians = encode_directions(lifted, basis, order.split(PARTITION_BLOCK))
+    return arrange_directions([coordinates], [gaussians], basis, len(order))
 
 
-def store_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> StoredDirections | None:
-    """Return the directions of all Gaussians with evidence in process 0, and None in the others.
+def encode_directions(
+    lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " b"]]
+) -> tuple[Float16[Tensor, "m r"], Int64[Tensor, " m"]]:
+    """Return float16 coordinates and the row of the lift for every Gaussian with evidence, block by block.
 
     Rounding may depend on which rows are multiplied together. Blocks are therefore the same for any number of
     processes.
 
     Args:
-        basis: rows of the basis for coordinates; None: directions are stored directly.
+        blocks: rows of the lift that are encoded together.
     """
     dimension = lifted.features.shape[1] if basis is None else len(basis)
-    mask, blocks = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
+    mask, coordinates = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
     rows_of = [mask.new_zeros(0, dtype=torch.int64)]
-    for block in portion.blocks():
+    for block in blocks:
         rows_of.append(block[mask[block]])
         rows = lifted.directions(rows_of[-1])
-        blocks.append((rows if basis is None else torch.nn.functional.normalize(rows.double() @ basis.T, dim=1)).half())
-    coordinates, gaussians = torch.cat(blocks), portion.gaussians[torch.cat(rows_of)]
-    blocks.clear()
-    parts, indices = portion.team.deliver(coordinates), portion.team.deliver(gaussians)
-    if parts is None or indices is None:
-        return None
-    row_of = torch.zeros(len(portion.order) + 1, dtype=torch.int64, device=mask.device)
-    for index in indices:
+        rows = rows if basis is None else torch.nn.functional.normalize(rows.double() @ basis.T, dim=1)
+        coordinates.append(rows.half())
+    return torch.cat(coordinates), torch.cat(rows_of)
+
+
+def arrange_directions(
+    parts: Sequence[Float16[Tensor, "_ r"]], gaussians: Sequence[Int64[Tensor, " _"]], basis: Tensor | None, n: int
+) -> StoredDirections:
+    """Return the directions of n Gaussians by index, from parts and the index of each of their rows."""
+    row_of = torch.zeros(n + 1, dtype=torch.int64, device=parts[0].device)
+    for index in gaussians:
         row_of[index + 1] = 1
     row_of = row_of.cumsum(0)
-    stored = coordinates.new_empty(sum(map(len, parts)), dimension)
-    for index, part in zip(indices, parts):
+    stored = parts[0].new_empty(sum(map(len, parts)), parts[0].shape[1])
+    for index, part in zip(gaussians, parts):
         stored[row_of[index]] = part
     return StoredDirections(stored, None if basis is None else basis.float())
 
 
-def sizes_and_bounds(lifted: Lifted, basis: Basis | None, portion: Partition) -> dict[str, dict[str, Any]]:
-    """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error."""
-    mask, evidence, team = lifted.scalars.norm > 0, lifted.evidence, portion.team
-    sizes = [mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]]
-    with_evidence, *entries = team.add(torch.stack(sizes)).tolist()
+def sizes_and_bounds(
+    lifted: Lifted, basis: Basis | None, portion: Partition | None = None
+) -> dict[str, dict[str, Any]]:
+    """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
+
+    Args:
+        portion: Gaussians of the lift, if other processes have the rest; None: all Gaussians.
+    """
+    mask, evidence = lifted.scalars.norm > 0, lifted.evidence
+    sizes = torch.stack([mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]])
+    with_evidence, *entries = (sizes if portion is None else portion.team.add(sizes)).tolist()
+    n = len(mask) if portion is None else len(portion.order)
     dimension, matrices = lifted.features.shape[1], (evidence.rows, evidence.unlabeled)
     exact = 4 * (lifted.features.numel() + evidence.num_regions)
     for count, rows in zip(entries, matrices):
-        exact += 8 * (len(portion.order) + 1) + count * (4 + rows.weight.element_size())
+        exact += 8 * (n + 1) + count * (4 + rows.weight.element_size())
     forms: dict[str, dict[str, Any]] = {
         "evidence": {"bytes": exact, "bound": 0.0},
         "float16": {"bytes": 2 * with_evidence * dimension, "bound": half_precision_error(dimension)},
     }
     if basis is not None:
         rank = len(basis.rows)
-        bounds = team.join(basis.bound[mask]).cpu().numpy() if with_evidence > 0 else np.zeros(1)
+        bounds = basis.bound[mask] if portion is None else portion.team.join(basis.bound[mask])
+        bounds = bounds.cpu().numpy() if with_evidence > 0 else np.zeros(1)
         quantiles = np.quantile(bounds, _QUANTILES) + half_precision_error(rank)
         forms["low_rank"] = {
             "bytes": 2 * with_evidence * rank + 4 * rank * dimension,

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.device import can_use_triton
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator
+from normlift_ns.core.partition import Communicator
 from normlift_ns.errors import InputError
 from normlift_ns.options import check_number
 
@@ -54,7 +54,7 @@ def nearest_neighbors(
     *,
     of: Int64[Tensor, " m"] | None = None,
     progress: Progress | None = None,
-    team: Communicator = SINGLE_PROCESS,
+    team: Communicator | None = None,
 ) -> Neighbors:
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
@@ -66,7 +66,7 @@ def nearest_neighbors(
     Args:
         of: Gaussians to find neighbors for, one row of the result each; None: all n.
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
-        team: processes that call this function together, each for a part of the same Gaussians, and share the work.
+        team: processes that call this function together, each for a part of the same Gaussians; None: this one only.
     Raises:
         ValueError: if `k` is less than 1 or more than `MAX_NEIGHBORS`.
 
@@ -86,7 +86,11 @@ def nearest_neighbors(
 
 
 def _on_gpu(
-    means: Float[Tensor, "n 3"], k: int, of: Int64[Tensor, " m"] | None, progress: Progress | None, team: Communicator
+    means: Float[Tensor, "n 3"],
+    k: int,
+    of: Int64[Tensor, " m"] | None,
+    progress: Progress | None,
+    team: Communicator | None,
 ) -> Neighbors | None:
     """Find neighbors on the GPU; return None if the kernel does not apply or cannot certify its result."""
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
@@ -94,15 +98,34 @@ def _on_gpu(
     finite = means.isfinite().all(dim=1)
     if means.dtype != torch.float32 or k > nearest.MAX_TREE_NEIGHBORS or not bool(finite.any()):
         return None
-    all_finite = bool(finite.all())
-    points, queries = means if all_finite else means[finite], of
-    if not all_finite:
-        of = torch.arange(len(means), device=means.device) if of is None else of
-        queries = (finite.cumsum(0) - 1)[of[finite[of]]]
-    rows = len(means) if of is None else len(of)
+    if bool(finite.all()):
+        return _on_gpu_finite(means, k, of, len(means) if of is None else len(of), progress, team)
+    of = torch.arange(len(means), device=means.device) if of is None else of
+    mask, gaussian = finite[of], finite.nonzero().squeeze(1).int()
+    queries = (finite.cumsum(0) - 1)[of[mask]]
+    result = _on_gpu_finite(means[finite], k, queries, len(of), progress, team)
+    if result is None:
+        return None
+    index, distance = result.index.new_full((len(of), k), -1), result.distance.new_full((len(of), k), torch.inf)
+    spacing = result.spacing.new_full((len(of),), torch.inf)
+    index[mask] = torch.where(result.index < 0, -1, gaussian[result.index.clamp(min=0)])
+    distance[mask], spacing[mask] = result.distance, result.spacing
+    return Neighbors(index, distance, spacing)
+
+
+def _on_gpu_finite(
+    points: Float[Tensor, "n 3"],
+    k: int,
+    queries: Int64[Tensor, " m"] | None,
+    rows: int,
+    progress: Progress | None,
+    team: Communicator | None,
+) -> Neighbors | None:
+    """Find neighbors among finite points, and report progress as a share of `rows`."""
+    from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
     def report(done: int) -> None:
-        torch.cuda.synchronize(means.device)  # wait for the kernels that were launched
+        torch.cuda.synchronize(points.device)  # wait for the kernels that were launched
         if progress is not None and done < rows:
             progress(done, rows)
 
@@ -114,14 +137,7 @@ def _on_gpu(
         uncertain_points = uncertain if queries is None else queries[uncertain]
         for array, exact in zip(result, nearest.brute_force_nearest(points, uncertain_points, k)):
             array[uncertain] = exact
-    if all_finite or of is None:
-        return Neighbors(result.index, result.distance, result.spacing)
-    mask, gaussian = finite[of], finite.nonzero().squeeze(1).int()
-    index, distance = result.index.new_full((len(of), k), -1), result.distance.new_full((len(of), k), torch.inf)
-    spacing = result.spacing.new_full((len(of),), torch.inf)
-    index[mask] = torch.where(result.index < 0, -1, gaussian[result.index.clamp(min=0)])
-    distance[mask], spacing[mask] = result.distance, result.spacing
-    return Neighbors(index, distance, spacing)
+    return Neighbors(result.index, result.distance, result.spacing)
 
 
 def _on_cpu(

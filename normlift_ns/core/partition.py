@@ -2,88 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.sparse import SparseRows
-
-ProgressCallback = Callable[[str, int, int], None]
-"""Progress callback, called with (stage, steps done, total steps)."""
-VIEW_STAGES = ("features", "evidence")
-"""Stages of a lift that count views."""
 PARTITION_BLOCK = 2**13
 """Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks, so the shapes of
 products do not depend on the number of processes; their rounding may depend on shapes."""
 
 
-class Communicator:
-    """Communication between processes, implemented here for a single process.
+class Communicator(ABC):
+    """Communication between processes. All of them must call the same methods in the same order."""
 
-    All processes must call the same methods in the same order.
-    """
-
-    rank: int = 0
+    rank: int
     """Rank of this process, in 0..size-1."""
-    size: int = 1
+    size: int
     """Number of processes."""
 
+    @abstractmethod
     def join(self, rows: Tensor) -> Tensor:
         """Return the concatenated rows of all processes, in every process."""
-        return rows
 
+    @abstractmethod
     def deliver(self, rows: Tensor) -> list[Tensor] | None:
         """Return the rows of every process in process 0, and None in the others."""
-        return [rows]
 
+    @abstractmethod
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """Send parts[r] to process r, and return the parts that all processes sent to this one."""
-        return list(parts)
 
+    @abstractmethod
     def add(self, values: Tensor) -> Tensor:
         """Return the sum over all processes, in every process."""
-        return values
 
+    @abstractmethod
     def spread(self, values: Tensor) -> Tensor:
         """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
-        return values
 
+    @abstractmethod
     def tell(self, value: Any) -> Any:
         """Return the JSON-ready object of process 0 in every process."""
-        return value
 
+    @abstractmethod
     def tell_all(self, value: Any) -> list[Any]:
         """Return the JSON-ready objects of all processes in every process."""
-        return [value]
-
-    def counted(self, report: ProgressCallback) -> ProgressCallback:
-        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
-        return report
-
-    @contextmanager
-    def shares(self, folder: Path) -> Iterator[None]:
-        """Provide a context in which `chunks` can be called.
-
-        Args:
-            folder: directory that all processes share.
-        """
-        yield
-
-    def chunks(self, count: int) -> Iterator[int]:
-        """Yield indices in 0..count-1 of the work items of this process; each item belongs to one process only."""
-        return iter(range(count))
-
-
-SINGLE_PROCESS = Communicator()
-"""The communication of a single process."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +60,6 @@ class Partition:
     """Partition of the Gaussians by segments of a curve through space, so most neighbors are in the same process.
 
     Arrays of a portion have one row for each Gaussian of this process, in index order.
-
-    >>> import torch
-    >>> means = torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])
-    >>> portion = Partition.of(SINGLE_PROCESS, means)
-    >>> portion.gaussians.tolist(), portion.along.tolist()
-    ([0, 1, 2], [1, 2, 0])
     """
 
     team: Communicator
@@ -117,8 +80,6 @@ class Partition:
         n, size = len(self.order), self.team.size
         blocks = -(-n // PARTITION_BLOCK)
         bounds = [min(n, blocks * rank // size * PARTITION_BLOCK) for rank in range(size + 1)]
-        if size == 1:
-            return [torch.arange(n, device=self.order.device)]
         return [self.order[first:last].sort().values for first, last in pairwise(bounds)]
 
     @property
@@ -138,8 +99,6 @@ class Partition:
     @cached_property
     def along(self) -> Int64[Tensor, " m"]:
         """Rows of the portion in curve order."""
-        if self.team.size == 1:
-            return self.order
         first = sum(map(len, self.by_owner[: self.team.rank]))
         return self.place[1][self.order[first : first + len(self)]].long()
 
@@ -149,29 +108,8 @@ class Partition:
 
     def join(self, rows: Tensor) -> Tensor:
         """Combine the arrays of all portions into one, in index order, in every process."""
-        if self.team.size == 1:
-            return rows
         joined = self.team.join(rows)
         return torch.empty_like(joined).index_copy_(0, torch.cat(self.by_owner), joined)
-
-    def deliver_sparse(self, rows: SparseRows) -> SparseRows | None:
-        """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
-        if self.team.size == 1:
-            return rows
-        parts = [self.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
-        if any(part is None for part in parts):
-            return None
-        lengths, column, weight = (torch.cat(part) for part in parts if part is not None)
-        joined = SparseRows(torch.cat([lengths.new_zeros(1), lengths.cumsum(0)]), column, weight)
-        count = torch.arange(len(self.order), device=self.order.device)
-        return joined.select_rows(torch.empty_like(self.order).index_copy_(0, torch.cat(self.by_owner), count))
-
-
-def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
-    """Return the concatenated rows of all processes, in every process."""
-    lengths = team.join(rows.offsets.diff())
-    offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
-    return SparseRows(offsets, team.join(rows.column), team.join(rows.weight))
 
 
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
@@ -179,6 +117,9 @@ def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
 
     The curve has 1,024 steps per side. Its sides end at the 1st and 99th percentile, because far outliers would
     otherwise put all other Gaussians into one cell.
+
+    >>> spatial_order(torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])).tolist()
+    [1, 2, 0]
     """
     sample = means[:: max(1, len(means) // 100_000)]
     sample = sample[sample.isfinite().all(dim=1)].double()

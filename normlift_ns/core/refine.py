@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
@@ -78,37 +78,62 @@ def refine(
     >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2), own=own).tolist()
     [0, 0, 2]
     """
-    arguments = {"means": means, "directions": directions, "reliability": reliability, "own": own}
-    skipped = (None, directions) if callable(directions) else (None,)
-    check_tensors(**{name: value for name, value in arguments.items() if not any(value is x for x in skipped)})
-    n, config = means.shape[0], config or RefineConfig(vote="paper" if own is None else "posterior")
-    config = config if neighbors is not None else clamp_k(config, n)
-    table = directions if isinstance(directions, Tensor) else None
+    config = config or RefineConfig(vote="paper" if own is None else "posterior")
+    _check_inputs(means, directions, reliability, own, posterior=config.vote != "paper")
+    own = None if config.vote == "paper" else own
+    config = config if neighbors is not None else clamp_k(config, len(means))
+    neighbors = neighbors or nearest_neighbors(means, config.k)
+    if tuple(neighbors.index.shape) != (len(means), config.k):
+        raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(len(means), config.k)}")
+    neighbors = Neighbors(*(x.contiguous() for x in neighbors))
+    if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
+        directions = directions.__getitem__  # in blocks, because the kernel needs as much memory again
+    order, width = spatial_order(means), decay_width(neighbors.spacing, config)
+    return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
+
+
+def _check_inputs(
+    means: Tensor,
+    directions: Tensor | Callable[[Tensor], Tensor],
+    reliability: Tensor,
+    own: Tensor | None,
+    *,
+    posterior: bool,
+) -> None:
+    """Raise ValueError if the inputs of a vote do not fit together."""
+    tensors = {"means": means, "reliability": reliability}
+    tensors |= {} if callable(directions) else {"directions": directions}
+    tensors |= {} if own is None else {"own": own}
+    check_tensors(**tensors)
+    n, table = means.shape[0], directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if table is None else tuple(table.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
         raise InputError(
             f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
         )
-    if config.vote == "paper":
-        own = None
-    elif own is None or tuple(own.shape) != (n,):
+    if posterior and (own is None or tuple(own.shape) != (n,)):
         got = "none" if own is None else f"shape {tuple(own.shape)}"
         raise InputError(f"a posterior vote needs own, the scalars.own_evidence of a lift, of shape {(n,)}; got {got}")
     check_not_negative("reliability", reliability)
-    if own is not None:
+    if posterior and own is not None:
         check_not_negative("own", own)
     if table is not None:
         check_unit_rows(
             table, "rows of directions", "normalize them, or set those without a direction to 0", allow_zeros=True
         )
-    neighbors = neighbors or nearest_neighbors(means, config.k)
-    if tuple(neighbors.index.shape) != (n, config.k):
-        raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
-    neighbors = Neighbors(*(x.contiguous() for x in neighbors))
-    if table is not None and can_use_triton(means) and table.dtype == torch.float32:
-        directions = table.__getitem__  # in blocks, because the kernel needs as much memory again
-    order, width = spatial_order(means), decay_width(neighbors.spacing, config)
-    return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
+
+
+@dataclass(frozen=True)
+class _VoteInputs:
+    """Inputs that all blocks of a vote share."""
+
+    neighbors: Neighbors
+    reliability: Float[Tensor, " n"]
+    own: Float[Tensor, " n"] | None
+    """None: the paper's vote."""
+    config: RefineConfig
+    width: Float64[Tensor, ""]
+    """sigma_d, in the units of the distances."""
 
 
 def refine_subset(
@@ -133,6 +158,7 @@ def refine_subset(
         progress: as in `refine`.
     """
     n, device, on_gpu = len(reliability), reliability.device, can_use_triton(reliability)
+    inputs = _VoteInputs(neighbors, reliability, own, config, width)
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
     can_change = _any_reliable(neighbors, reliability)[voters]  # without a reliable neighbor, none can win
@@ -145,9 +171,9 @@ def refine_subset(
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
         if on_gpu and rows.dtype != torch.float64 and config.k <= _MAX_KERNEL_NEIGHBORS:
-            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, own, source, config, decay)
+            _vote_on_gpu(inputs, voters, rows, row_of, source, decay)
         else:
-            _vote(voters, neighbors, rows, row_of, reliability, own, source, config, width)
+            _vote(inputs, voters, rows, row_of, source)
 
     size, done = _BLOCK[on_gpu] if callable(directions) else max(1, n), 0
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
@@ -184,20 +210,11 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     return replace(config, k=k)
 
 
-def _vote(
-    voters: Tensor,
-    neighbors: Neighbors,
-    directions: Tensor,
-    row_of: Tensor,
-    reliability: Tensor,
-    own: Tensor | None,
-    source: Tensor,
-    config: RefineConfig,
-    width: Tensor,
-) -> None:
+def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tensor, source: Tensor) -> None:
     """Write source[voters]; row_of[j] is the row of u_j in `directions`."""
+    neighbors, config, own, width = inputs.neighbors, inputs.config, inputs.own, inputs.width
     dtype, numbers = torch.promote_types(directions.dtype, torch.float32), config.numbers
-    reliability = reliability.to(dtype)
+    reliability = inputs.reliability.to(dtype)
     step = max(1, _CHUNK_ELEMENTS[reliability.is_cuda] // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
     for i in voters.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
@@ -217,25 +234,18 @@ def _vote(
 
 
 def _vote_on_gpu(
-    voters: Tensor,
-    neighbors: Neighbors,
-    directions: Tensor,
-    row_of: Tensor,
-    reliability: Tensor,
-    own: Tensor | None,
-    source: Tensor,
-    config: RefineConfig,
-    width: float,
+    inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tensor, source: Tensor, width: float
 ) -> None:
     from normlift_ns.kernels.vote import vote  # noqa: PLC0415 (needs triton)
 
+    config, own = inputs.config, inputs.own
     vote(
         voters,
-        neighbors.index,
-        neighbors.distance,
+        inputs.neighbors.index,
+        inputs.neighbors.distance,
         directions.contiguous(),
         row_of,
-        reliability.float().contiguous(),
+        inputs.reliability.float().contiguous(),
         source,
         own=None if own is None else own.float().contiguous(),
         prior=config.prior,

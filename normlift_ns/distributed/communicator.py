@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, chain
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,11 +22,14 @@ from torch import Tensor
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import Neighbors
-from normlift_ns.core.partition import VIEW_STAGES, Communicator, Partition, ProgressCallback
+from normlift_ns.core.partition import Communicator, Partition
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.io.file_lock import try_claim
+from normlift_ns.progress import ProgressCallback
 
+VIEW_STAGES = ("features", "evidence")
+"""Stages of a lift that count views."""
 _STALE_SECONDS = 7 * 86400
 """Age at which a shared directory of killed processes is deleted."""
 
@@ -121,7 +124,7 @@ class TorchCommunicator(Communicator):
                 yield index
 
     def counted(self, report: ProgressCallback) -> ProgressCallback:
-        """See the base class."""
+        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
         previous: dict[str, int] = {}
 
         def report_total(stage: str, done: int, total: int) -> None:
@@ -170,6 +173,27 @@ class TorchCommunicator(Communicator):
         return flat.contiguous().view(torch.uint8)
 
 
+def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
+    """Return the concatenated rows of all processes, in every process."""
+    lengths = team.join(rows.offsets.diff())
+    return SparseRows(_offsets(lengths), team.join(rows.column), team.join(rows.weight))
+
+
+def gather_sparse(portion: Partition, rows: SparseRows) -> SparseRows | None:
+    """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
+    parts = [portion.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
+    if any(part is None for part in parts):
+        return None
+    lengths, column, weight = (torch.cat(part) for part in parts if part is not None)
+    count = torch.arange(len(portion.order), device=portion.order.device)
+    row_of = torch.empty_like(portion.order).index_copy_(0, torch.cat(portion.by_owner), count)
+    return SparseRows(_offsets(lengths), column, weight).select_rows(row_of)
+
+
+def _offsets(lengths: Int64[Tensor, " n"]) -> Int64[Tensor, " n_plus_1"]:
+    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+
+
 def _like(data: Tensor, rows: Tensor) -> Tensor:
     """Convert bytes to rows with the shape, type and device of others."""
     return data.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)
@@ -178,6 +202,8 @@ def _like(data: Tensor, rows: Tensor) -> Tensor:
 # Exchange between processes: evidence from view owners to Gaussian owners, and neighbors for the vote.
 
 
+_WEIGHT_DTYPES = {4: torch.float32, 8: torch.float64}
+"""Types of evidence weights by their size in bytes."""
 _RENUMBER_BLOCK = 2**20
 """Number of rows of neighbors that are renumbered at a time."""
 
@@ -228,23 +254,26 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
         pieces: evidence collected by this process, by chunk index; together, the processes have all chunks.
         chunks: number of chunks of all processes.
     """
-    device, local_chunks = portion.order.device, sorted(pieces)
+    local_chunks = sorted(pieces)
     matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
     counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
     gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
-    metadata = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
-    regions = [count for chunk in range(chunks) for count in metadata[chunk][0]]
-    widths = [(sum(metadata[chunk][0]), len(metadata[chunk][0])) for chunk in range(chunks)]  # columns of both matrices
-    _, weight_power, num_excluded, weight_bytes = metadata[0]
-    dtype = torch.float64 if weight_bytes == 8 else torch.float32
+    facts = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
+    regions_of = [facts[chunk][0] for chunk in range(chunks)]
+    widths = [(sum(counts), len(counts)) for counts in regions_of]  # columns of both matrices
+    _, weight_power, num_excluded, weight_bytes = facts[0]
     chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
     result = []
     for i, matrix in enumerate(matrices):
         first_column = [0, *accumulate(width[i] for width in widths)]
         received = [counts[portion.team.rank][i] for _, _, counts in gathered]
-        result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
-    region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
-    return Evidence(result[0], region_view.to(device), result[1], len(regions), weight_power, num_excluded)
+        result.append(
+            _exchange_rows(matrix, chunks_by_rank, received, first_column, portion, _WEIGHT_DTYPES[weight_bytes])
+        )
+    regions = torch.tensor(list(chain.from_iterable(regions_of)))
+    region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), regions)
+    region_view = region_view.to(portion.order.device)
+    return Evidence(result[0], region_view, result[1], len(regions), weight_power, num_excluded)
 
 
 def _exchange_rows(
@@ -315,8 +344,7 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
             [norm[rows.long()] for rows in requested],
         )
     )
-    lengths = torch.cat([evidence.rows.offsets.diff(), lengths])
-    offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    offsets = _offsets(torch.cat([evidence.rows.offsets.diff(), lengths]))
     rows = SparseRows(offsets, torch.cat([evidence.rows.column, column]), torch.cat([evidence.rows.weight, weight]))
     blank = SparseRows(torch.zeros_like(offsets), evidence.unlabeled.column[:0], evidence.unlabeled.weight[:0])
     scalars = lifted.scalars.map(lambda x: torch.cat([x, x.new_zeros(len(halo_norm))]))

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from normlift_ns.errors import InputError
 
 if TYPE_CHECKING:
-    from normlift_ns.core.partition import Communicator
+    from normlift_ns.distributed.communicator import TorchCommunicator
 
 
 HEARTBEAT_INTERVAL = 2.0
@@ -303,8 +303,8 @@ def _use_single_gpu(local_rank: int, device: str) -> None:
 
 
 @contextmanager
-def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Communicator]:
-    """Provide a context with the team of this process, or `SINGLE_PROCESS` if the environment describes none.
+def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[TorchCommunicator | None]:
+    """Provide a context with the team of this process, or None if the environment describes no other processes.
 
     Args:
         device: cpu, cuda or auto.
@@ -314,13 +314,10 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Com
         LostError: if another process fails or is lost.
     """
     ranks = rank_and_world_size(os.environ)
-    if ranks is not None:  # hide torch's warnings for developers; torch reads the variable when it is imported
-        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
-    from normlift_ns.core.partition import SINGLE_PROCESS  # noqa: PLC0415 (torch, as above)
-
     if ranks is None:
-        yield SINGLE_PROCESS
+        yield None
         return
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # hides warnings for developers; torch reads it on import
     rank, size = ranks
     _use_single_gpu(int(os.environ.get("LOCAL_RANK", "0")), device)
     import torch  # noqa: PLC0415 (as above)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby, islice, zip_longest
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, TypedDict, cast, get_args
 
 import torch
 from jaxtyping import Float, Int, Int64, UInt8
 from torch import Tensor
+from typing_extensions import Unpack
 
 from normlift_ns.core.device import has_triton, retry_in_halves
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
@@ -112,6 +113,21 @@ ViewProgress = Callable[[int, int | None], None]
 _ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
 
 
+class RasterOptions(TypedDict, total=False):
+    """Keywords of `rasterize_evidence` that define the weights A_ij and their sums."""
+
+    rasterize_mode: RasterizeMode
+    """`rasterize_mode` of splatfacto in the training of the scene (default: classic)."""
+    weight_power: int
+    """Exponent of the summed A_ij. 1: the paper (default). 2: the code of SFS. 0: number of pixels that a Gaussian
+    contributes to."""
+    settings: RasterSettings | None
+    """Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`."""
+    dtype: torch.dtype | None
+    """Precision of the computation and of the weights (default: that of the scene). Sums are always taken in float64.
+    """
+
+
 def rasterize_evidence(
     scene: GaussianScene,
     cameras: Iterable[Camera],
@@ -119,11 +135,8 @@ def rasterize_evidence(
     *,
     num_regions: Iterable[int] | None = None,
     backend: BackendName = "auto",
-    rasterize_mode: RasterizeMode = "classic",
-    weight_power: int = 1,
-    settings: RasterSettings | None = None,
-    dtype: torch.dtype | None = None,
     progress: ViewProgress | None = None,
+    **options: Unpack[RasterOptions],
 ) -> Evidence:
     """Compute the evidence E_js = sum of A_ij over the pixels i of region s, for all views.
 
@@ -142,13 +155,8 @@ def rasterize_evidence(
         backend: "torch" (reference; any device and precision), "numba" (compiled; CPU), "triton" (fast; GPU, float32),
             "gsplat" (stock gsplat; GPU, float32, weight_power 1, rules of the installed version or older) or "auto"
             (the fastest for the device of the scene and the precision).
-        rasterize_mode: `rasterize_mode` of splatfacto in the training of the scene.
-        weight_power: Exponent of the summed A_ij. 1: the paper. 2: the code of SFS. 0: number of pixels that a Gaussian
-            contributes to.
-        settings: Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`.
-        dtype: Precision of the computation and of the weights (default: that of the scene). Sums are always taken in
-            float64.
         progress: Function called after every view with (views done, number of views or None).
+        options: rasterize_mode, weight_power, settings and dtype; see `RasterOptions`.
 
     Raises:
         ValueError: If an option is unknown, labels are not integers or differ from their camera in size, or an id is
@@ -164,9 +172,10 @@ def rasterize_evidence(
     >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: behind the first one
     ([0.5, 0.25], [0.5, 0.25])
     """
+    weight_power = options.get("weight_power", 1)
     if weight_power not in (0, 1, 2):
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
-    job = _job(scene, rasterize_mode, settings, dtype, weight_power)
+    job = _job(scene, **options)
     _, chosen = choose_backend(backend, job, pictures=False)
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
@@ -290,9 +299,9 @@ def render_image(
 
 def _job(
     scene: GaussianScene,
-    rasterize_mode: str,
-    settings: RasterSettings | None,
-    dtype: torch.dtype | None,
+    rasterize_mode: str = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
     weight_power: int = 1,
 ) -> RasterJob:
     if rasterize_mode not in ("classic", "antialiased"):

@@ -16,9 +16,9 @@ from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.io.run_dir import run_directory
 from normlift_ns.lifted_run import load_field
 from normlift_ns.options import SourceOptions
-from normlift_ns.pipeline import write_run
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import ENCODER_KEYS
+from normlift_ns.run_writer import write_run
 from tests.captures import SHARED
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 

@@ -29,7 +29,7 @@ from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
 from normlift_ns.data.nerfstudio.load import TrainedViews, _reading
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.pipeline import _lifted_config
+from normlift_ns.run_writer import _lifted_config
 from tests.examples import examples
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun

@@ -14,13 +14,15 @@ from normlift_ns.core import partition
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.lowrank import StoredEvidence
-from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
+from normlift_ns.core.partition import Partition
 from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.distributed.lift import build_field_distributed, consensus_distributed, vote_distributed
+from normlift_ns.evidence_collection import ViewObservations
 from normlift_ns.options import Storage
-from normlift_ns.pipeline import vote_distributed
+from normlift_ns.pipeline import vote_directions
 from normlift_ns.progress import StageTimer
 from tests.scenes import generator, random_evidence, unit_rows
-from tests.team.threads import together
+from tests.team.threads import Threads, together
 
 N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
 
@@ -42,7 +44,7 @@ def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
 def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
     means = torch.randn(n, 3, generator=generator(seed))
 
-    def work(team: Communicator) -> tuple[torch.Tensor, torch.Tensor]:
+    def work(team: Threads) -> tuple[torch.Tensor, torch.Tensor]:
         portion = Partition.of(team, means)
         assert torch.equal(portion.gaussians, portion.gaussians.sort().values)
         assert torch.equal(torch.cat([*portion.blocks(), portion.along[:0]]).sort().values, torch.arange(len(portion)))
@@ -58,7 +60,7 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
     means, evidence, _ = world(seed)
     chunks = [[0], [1, 2], [3], [4]]
 
-    def work(team: Communicator) -> tuple[Evidence, torch.Tensor]:
+    def work(team: Threads) -> tuple[Evidence, torch.Tensor]:
         portion = Partition.of(team, means)
         pieces = {c: EvidenceShard.of(evidence.select_views(chunks[c]), portion) for c in team.chunks(len(chunks))}
         return redistribute_evidence(pieces, portion, len(chunks)), portion.gaussians
@@ -71,17 +73,27 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
             assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("offsets", "column", "weight"))
 
 
-def lifted_by(team: Communicator, seed: int, vote: str, storage: Storage) -> SemanticField | None:
+def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:
+    """All that follows from evidence, by one process."""
+    means, evidence, features = world(seed)
+    lifted = lift(evidence, consensus(evidence, features, sample=5).features)
+    config, stages = RefineConfig(vote=vote, k=9), StageTimer(lambda stage, done, total: None)  # type: ignore[arg-type]
+    copied, shares = vote_directions(means, lifted, lifted.scalars.own_evidence, config, stages)
+    return SemanticField.build(lifted, means, copied, tolerance=0.3, storage=storage, provenance=shares)
+
+
+def lifted_by(team: Threads, seed: int, vote: str, storage: Storage) -> SemanticField | None:
     """All that follows from evidence, by the process of a team."""
     means, evidence, features = world(seed)
     portion = Partition.of(team, means)
     mine = evidence.select_gaussians(portion.gaussians)
-    table = consensus(mine, features, portion=portion, sample=5).features
+    levels = torch.zeros(REGIONS, dtype=torch.int64)
+    table = consensus_distributed(ViewObservations(mine, features, levels), portion, sample=5).features
     lifted = lift(mine, table)
     config, stages = RefineConfig(vote=vote, k=9), StageTimer(lambda stage, done, total: None)  # type: ignore[arg-type]
     copied, shares = vote_distributed(means, lifted, lifted.scalars.own_evidence, config, portion, stages)
     how = {"tolerance": 0.3, "storage": storage, "provenance": shares}
-    return SemanticField.build_together(lifted, means, copied, portion, **how)
+    return build_field_distributed(lifted, means, copied, portion, **how)
 
 
 def stored(field: SemanticField) -> list[torch.Tensor]:
@@ -95,10 +107,9 @@ def stored(field: SemanticField) -> list[torch.Tensor]:
     [("posterior", "low_rank", 0), ("paper", "float16", 1), ("posterior", "evidence", 2), ("posterior", "auto", 3)],
 )
 def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
-    expected = lifted_by(SINGLE_PROCESS, seed, vote, storage)
-    assert expected is not None
+    expected = lifted_alone(seed, vote, storage)
     assert float((expected.source != torch.arange(N)).float().mean()) > 0.1
-    for size in (2, 13):  # of which some have nothing
+    for size in (1, 2, 13):  # of which some have nothing
         found, *others = together(size, lambda team: lifted_by(team, seed, vote, storage))
         assert others == [None] * (size - 1)
         assert found is not None

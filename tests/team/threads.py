@@ -59,7 +59,7 @@ class Threads(Communicator):
         return iter(range(count)[::-1][self.rank :: self.size])  # in an order that nobody expects
 
 
-def together(size: int, work: Callable[[Communicator], T]) -> list[T]:
+def together(size: int, work: Callable[[Threads], T]) -> list[T]:
     """What every thread of a team makes of the same work."""
     board, barrier, found = [None] * size, threading.Barrier(size), [None] * size
     errors: list[BaseException] = []

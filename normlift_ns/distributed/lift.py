@@ -1,0 +1,279 @@
+"""Lifting in several processes: the steps of `pipeline`, with the Gaussians and views divided among the processes.
+
+The result does not depend on the number of processes. The evidence of a view does not depend on other views, and
+Gaussians are processed in the same blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, Int32
+from torch import Tensor
+
+from normlift_ns.core.consensus import (
+    CHANCE_AGREEMENT,
+    Consensus,
+    check_consensus_inputs,
+    sample_gaussians,
+    sampled_consensus,
+)
+from normlift_ns.core.field import SemanticField, check_storage, choose_form
+from normlift_ns.core.lift import Lifted
+from normlift_ns.core.lowrank import (
+    StoredDirections,
+    StoredEvidence,
+    arrange_directions,
+    encode_directions,
+    sizes_and_bounds,
+    smallest_basis,
+)
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.partition import Communicator, Partition
+from normlift_ns.core.refine import decay_width, refine_subset
+from normlift_ns.distributed.communicator import (
+    EvidenceShard,
+    TorchCommunicator,
+    all_gather_sparse,
+    gather_halo,
+    gather_sparse,
+    redistribute_evidence,
+)
+from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations, chunk_views
+from normlift_ns.io.run_dir import cache_folder
+from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.options import RefineConfig
+from normlift_ns.pipeline import (
+    LiftRequest,
+    LiftResult,
+    announce,
+    check_alignment,
+    check_directions,
+    check_target,
+    consensus_facts,
+    consensus_options,
+    count_directions,
+    count_votes,
+    lift_features,
+    lift_provenance,
+    lift_statistics,
+    plan_collection,
+    prepare_lift,
+    start_kernel_warm_up,
+    vote_shares,
+    with_cost,
+    write_lifted_run,
+)
+from normlift_ns.progress import ProgressCallback, StageTimer
+
+
+def run_lift_distributed(team: TorchCommunicator, request: LiftRequest) -> LiftedRun | None:
+    """Run `run_lift` in several processes, all with the same request. Only rank 0 writes and returns the run."""
+    prepared, stages = prepare_lift(request), StageTimer(request.report)
+    run_dir = prepared.run_dir.with_name(team.tell(prepared.run_dir.name))  # clocks differ
+    prepared = replace(prepared, run_dir=run_dir)
+    if team.rank == 0:
+        check_target(prepared)
+    announce(prepared)
+    if team.rank == 0:
+        check_alignment(prepared, stages)
+    cache, device = cache_folder(run_dir), prepared.device
+    collection = plan_collection(
+        prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
+    )
+    with team.shares(cache):
+        result = lift_scene_distributed(team, collection, device, prepared.encoder, request.report)
+    return None if result is None else write_lifted_run(prepared, result, stages)
+
+
+def lift_scene_distributed(
+    team: TorchCommunicator,
+    collection: EvidenceCollection,
+    device: str,
+    encoder: Mapping[str, Any],
+    report: ProgressCallback,
+) -> LiftResult | None:
+    """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
+
+    Args:
+        device, encoder, report: as in `lift_scene`.
+    """
+    stages, facts = StageTimer(team.counted(report)), {}
+    options, means = collection.options, collection.gaussians.means
+    wait_for_kernels = start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
+    portion = Partition.of(team, means)
+    views = _collect(team, collection, portion, stages, wait_for_kernels)
+    table = views.features
+    if options.consensus:
+        with stages("consensus") as step:
+            agreed = consensus_distributed(
+                views, portion, sample=options.consensus_sample, **consensus_options(options)
+            )
+            step()
+        table, facts = agreed.features, consensus_facts(options, agreed)
+    with stages("lift") as step:
+        lifted, own = lift_features(views, table, options)
+        check_directions(team.add(count_directions(lifted)), len(means), collection.source)
+        step()
+    copied = None
+    if options.refine:
+        copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
+        facts |= vote_facts
+    with stages("store") as step:
+        statistics = lift_statistics(collection, views, portion.join(lifted.scalars.reliability), facts)
+        provenance = lift_provenance(collection, encoder, statistics)
+        field = build_field_distributed(
+            lifted, means, copied, portion,
+            tolerance=options.tolerance, storage=options.storage, provenance=provenance,
+        )  # fmt: skip
+        step()
+    return None if field is None else LiftResult(with_cost(field, stages, device), stages.seconds)
+
+
+def _collect(
+    team: TorchCommunicator,
+    collection: EvidenceCollection,
+    portion: Partition,
+    stages: StageTimer,
+    wait_for_kernels: Callable[[], None],
+) -> ViewObservations:
+    """Collect chunks of views that no other process has claimed; return all views, for this process's Gaussians."""
+    chunks = chunk_views(collection.views, team.size)
+    tables: dict[int, tuple[Tensor, Tensor]] = {}
+    pieces: dict[int, EvidenceShard] = {}
+    for index in team.chunks(len(chunks)):
+        evidence, features, level = collection.collect_chunk(chunks[index], stages, wait_for_kernels)
+        tables[index] = features, level
+        with stages("evidence", len(collection.views)):
+            pieces[index] = EvidenceShard.of(evidence, portion)
+    with stages("exchange"):
+        evidence = redistribute_evidence(pieces, portion, len(chunks))
+        features, level = _gather_tables(tables, team)
+    return ViewObservations(evidence, features.to(portion.order.device, collection.config.dtype), level)
+
+
+def _gather_tables(tables: Mapping[int, tuple[Tensor, Tensor]], team: Communicator) -> tuple[Tensor, Tensor]:
+    """Return features and levels of the regions of all chunks, in order."""
+    local_chunks = sorted(tables)
+    gathered = team.tell_all([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
+    widths = {width for (shapes,) in gathered for _, _, width in shapes}
+    counts = [(chunk, count) for (shapes,) in gathered for chunk, count, _ in shapes]
+    empty = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
+    parts = (torch.cat([empty[i], *(tables[chunk][i] for chunk in local_chunks)]) for i in range(2))
+    features, levels = (team.join(part).split([count for _, count in counts]) for part in parts)
+    order = sorted(range(len(counts)), key=lambda i: counts[i][0])
+    return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])
+
+
+def consensus_distributed(
+    views: ViewObservations,
+    portion: Partition,
+    *,
+    power: float = 1.0,
+    sample: int = 50,
+    least: float = CHANCE_AGREEMENT,
+) -> Consensus:
+    """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes."""
+    team, (evidence, features, level) = portion.team, views
+    check_consensus_inputs(evidence.num_regions, features, level)
+    chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
+    sampled = evidence.select_gaussians(chosen)
+    order = team.join(portion.gaussians[chosen]).argsort()
+    rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
+    probability = team.join(probability)[order]
+    if team.rank > 0:
+        out = features.to(evidence.rows.weight.device, copy=True)
+        return Consensus(team.spread(out), team.tell(None), len(order))
+    sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
+    result = sampled_consensus(sampled, probability, features, level=level, power=power, least=least)
+    return result._replace(features=team.spread(result.features), agreement=team.tell(result.agreement))
+
+
+def vote_distributed(
+    means: Float[Tensor, "n 3"],
+    lifted: Lifted,
+    own: Float[Tensor, " m"],
+    config: RefineConfig,
+    portion: Partition,
+    stages: StageTimer,
+) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
+    """Run `vote_directions` in several processes.
+
+    Returns:
+        For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians
+        that change their direction and that have no support.
+    """
+    team, gaussians = portion.team, portion.gaussians
+    with stages("neighbors", len(gaussians)):
+        progress = partial(stages.tell, "neighbors")
+        neighbors = nearest_neighbors(means, config.k, of=gaussians, progress=progress, team=team)
+    with stages("vote", len(gaussians)):
+        halo = gather_halo(lifted, neighbors, portion)
+        neighbors, reliability = halo.neighbors, portion.join(lifted.scalars.reliability)[halo.gaussians]
+        own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
+        rows = refine_subset(
+            portion.along, neighbors, halo.lifted.directions, reliability, config,
+            own=None if config.vote == "paper" else own,
+            width=decay_width(team.join(neighbors.spacing), config),
+            progress=partial(stages.tell, "vote"),
+        )  # fmt: skip
+        copied = halo.gaussians[rows[: len(gaussians)].long()].int()
+        counts = team.add(count_votes(copied, gaussians, neighbors, reliability))
+    return copied, vote_shares(counts, len(means))
+
+
+def build_field_distributed(
+    lifted: Lifted,
+    means: Float[Tensor, "n 3"],
+    source: Int[Tensor, " m"] | None,
+    portion: Partition,
+    *,
+    tolerance: float,
+    storage: str,
+    provenance: Mapping[str, Any],
+) -> SemanticField | None:
+    """Run `SemanticField.build` in several processes; return the field in process 0 and None in the others.
+
+    Args:
+        lifted: lift of this process's Gaussians.
+        means: centers of all Gaussians.
+        source: result of the vote for this process's Gaussians; None: unrefined.
+        portion: Gaussians of this process.
+        tolerance, storage: as in `SemanticField.build`.
+        provenance: as in `SemanticField.build`; only that of process 0 is used.
+    """
+    check_storage(storage, tolerance)
+    basis = smallest_basis(lifted, tolerance, portion.team)
+    forms = sizes_and_bounds(lifted, basis, portion)
+    form = choose_form(forms, storage, tolerance)
+    if form == "evidence":
+        store = _gather_evidence(lifted, portion)
+    else:
+        store = _gather_directions(lifted, basis.rows if form == "low_rank" and basis is not None else None, portion)
+    scalars = lifted.scalars.map(portion.join)
+    sources = portion.join(portion.gaussians.int() if source is None else source.int())
+    if store is None:
+        return None
+    facts = {"form": form, "tolerance": tolerance, "forms": forms}
+    return SemanticField.assemble(scalars, sources, store, means, provenance=provenance, facts=facts)
+
+
+def _gather_evidence(lifted: Lifted, portion: Partition) -> StoredEvidence | None:
+    """Return E and F of all portions in process 0, and None in the others."""
+    rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
+    if rows is None or unlabeled is None:
+        return None
+    return StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
+
+
+def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> StoredDirections | None:
+    """Return the directions of all Gaussians with evidence in process 0, and None in the others."""
+    coordinates, rows = encode_directions(lifted, basis, portion.blocks())
+    parts, gaussians = portion.team.deliver(coordinates), portion.team.deliver(portion.gaussians[rows])
+    if parts is None or gaussians is None:
+        return None
+    return arrange_directions(parts, gaussians, basis, len(portion.order))
