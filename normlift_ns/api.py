@@ -57,7 +57,7 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     if config.is_file() and is_saved_splat(run_dir):
         scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
-        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, by_nerfstudio=_by_nerfstudio)
+        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
         scene = add_stored_images(scene, run_dir)
     rules = recorded_gsplat_version(run_dir)
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
@@ -102,7 +102,7 @@ def open_run(
     changed = changed_cameras_warning(loaded, scene)
     for remark in (*scene.remarks, *([] if changed is None else [changed])):
         warnings.warn(remark, stacklevel=2)
-    return LiftedRun(folder, scene, with_text_source(loaded, vectors=vectors, template=text_template), device)
+    return LiftedRun(folder, scene, with_text_source(loaded, text_embeddings=vectors, template=text_template), device)
 
 
 def changed_cameras_warning(field: SemanticField, scene: Scene) -> str | None:

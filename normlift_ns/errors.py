@@ -50,13 +50,13 @@ def escape_unprintable(text: str, keep: str = "") -> str:
 _MAX_SUMMARY = 300
 
 
-def truncate_text(text: str, most: int = 40) -> str:
-    """Cut a text to at most `most` characters.
+def truncate_text(text: str, max_length: int = 40) -> str:
+    """Cut a text to at most `max_length` characters.
 
     >>> truncate_text("a red bowl", 8)
     'a red b…'
     """
-    return text if len(text) <= most else text[: most - 1] + "…"
+    return text if len(text) <= max_length else text[: max_length - 1] + "…"
 
 
 def summarize_error(error: BaseException) -> str:

@@ -44,7 +44,7 @@ _CACHE_VERSION = "normlift_ns.block/6"
 class RasterConfig:
     """Rasterization of the evidence of a lift."""
 
-    rules: str
+    gsplat_version: str
     """Version of gsplat whose rasterization rules apply."""
     backend: BackendName
     """Backend that rasterizes."""
@@ -56,7 +56,7 @@ class RasterConfig:
     @property
     def settings(self) -> RasterSettings:
         """Constants of the rasterization rules."""
-        return RasterSettings.of_gsplat(self.rules)
+        return RasterSettings.of_gsplat(self.gsplat_version)
 
     @property
     def key(self) -> list[Any]:
@@ -134,12 +134,12 @@ class EvidenceCollection:
                 step()
 
             divisor = self.options.lift_downscale
-            block = observe_views(self.scene, chunk, source, rendered=rendered, divisor=divisor, done=done)
+            block = observe_views(self.scene, chunk, source, render_settings=rendered, downscale=divisor, on_view=done)
         levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
         with stages("evidence", len(self.views)) as step:
             wait_for_kernels()
             reuse, folder = self.options.reuse_evidence, self.cache / "evidence"
-            evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, done=step)
+            evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, on_view=step)
         return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
 
 
@@ -181,15 +181,15 @@ def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
-def sample_evenly(count: int, most: int | None) -> list[int]:
-    """Return at most `most` of `count` indices, evenly spaced, including the first and the last.
+def sample_evenly(count: int, maximum: int | None) -> list[int]:
+    """Return at most `maximum` of `count` indices, evenly spaced, including the first and the last.
 
     >>> sample_evenly(10, 4)
     [0, 3, 6, 9]
     """
-    if most is None or most >= count:
+    if maximum is None or maximum >= count:
         return list(range(count))
-    return torch.linspace(0, count - 1, most).round().long().tolist() if most > 1 else [0]
+    return torch.linspace(0, count - 1, maximum).round().long().tolist() if maximum > 1 else [0]
 
 
 def observe_views(
@@ -197,17 +197,17 @@ def observe_views(
     indices: Sequence[int],
     source: FeatureSource,
     *,
-    rendered: RasterSettings | None,
-    divisor: int,
-    done: Callable[[View], None],
+    render_settings: RasterSettings | None,
+    downscale: int,
+    on_view: Callable[[View], None],
 ) -> ViewBatch:
     """Compute labels and features of some training views.
 
     Args:
-        rendered: rasterizer settings to render the trained scene from the cameras, as a substitute for the images. If
-            None, use the images.
-        divisor: factor by which to downscale images and cameras.
-        done: called after every view, with the view as the source received it.
+        render_settings: rasterizer settings to render the trained scene from the cameras, as a substitute for the
+            images. If None, use the images.
+        downscale: factor by which to downscale images and cameras.
+        on_view: called after every view, with the view as the source received it.
     Raises:
         ValueError, FileNotFoundError: raised by `FeatureSource.view` and `check_undistorted`. Also if an image, a mask
             or a label map differs in size from its camera.
@@ -217,10 +217,12 @@ def observe_views(
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
             view = (
-                read if rendered is None else read._replace(image=render_image(scene, read.camera, settings=rendered))
+                read
+                if render_settings is None
+                else read._replace(image=render_image(scene, read.camera, settings=render_settings))
             )
             _check_sizes(view)
-            waiting.append(_downscaled(view, divisor) if divisor > 1 else view)
+            waiting.append(_downscaled(view, downscale) if downscale > 1 else view)
             check_undistorted(source, view, waiting[-1])
             yield waiting[-1].image, view.name
 
@@ -236,7 +238,7 @@ def observe_views(
         block.labels.append(labels if view.mask is None else labels.where(view.mask, MASKED))
         block.regions.append(result.region_of_cell)
         block.features.append(result.features)
-        done(view)
+        on_view(view)
     return block
 
 
@@ -257,7 +259,7 @@ def batch_evidence(
     config: RasterConfig,
     *,
     reuse: bool,
-    done: Callable[[], None],
+    on_view: Callable[[], None],
 ) -> Evidence:
     """Return evidence of the regions in a block.
 
@@ -268,7 +270,7 @@ def batch_evidence(
     cached = find_cached_views(folder, keys) if reuse else {}
     missing = [view for view in range(len(keys)) if view not in cached]
     for _ in cached:
-        done()
+        on_view()
     if len(missing) > 0:
         evidence = rasterize_evidence(
             gaussians,
@@ -280,7 +282,7 @@ def batch_evidence(
             weight_power=config.weight_power,
             settings=config.settings,
             dtype=config.dtype,
-            progress=lambda *_: done(),
+            progress=lambda *_: on_view(),
         )
         cache_views(evidence, folder, [keys[view] for view in missing])
         cached.update((view, CachedView(evidence, index)) for index, view in enumerate(missing))

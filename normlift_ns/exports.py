@@ -153,7 +153,7 @@ def write_splat_ply(
     contents = {names_file: None if instances is None else instances.to_json(), objects_file: objects}
     documents = {file: _to_json(content) for file, content in contents.items() if content is not None}
     stale = [file for file in contents if file not in documents] if overwrite else []
-    with atomic_files(ply, indices, *documents, overwrite=overwrite, remove=stale) as drafts:
+    with atomic_files(ply, indices, *documents, overwrite=overwrite, delete=stale) as drafts:
         with drafts[0].open("wb") as file:
             PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(file)
         np.save(drafts[1], rows)
@@ -248,7 +248,7 @@ class NearestGaussians(NamedTuple):
     """The nearest Gaussian of every point."""
 
     row: Int64[np.ndarray, " p"]
-    near: Bool[np.ndarray, " p"]
+    within_limit: Bool[np.ndarray, " p"]
     """Whether that Gaussian is within the maximum distance."""
 
 
@@ -273,15 +273,15 @@ class LabelTransfer(NamedTuple):
 
 
 def nearest_gaussians(
-    points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], most: float
+    points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], max_distance: float
 ) -> NearestGaussians:
     """Find the Gaussian whose center is nearest to each point, with a k-d tree.
 
     Args:
         means: centers of at least one Gaussian.
-        most: maximum distance, inclusive.
+        max_distance: maximum distance, inclusive.
 
-    >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), most=2.0)
+    >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
     NearestGaussians(row=array([1, 0]), near=array([ True, False]))
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 (nothing else here needs it)
@@ -289,7 +289,7 @@ def nearest_gaussians(
     finite = np.asarray(np.isfinite(points).all(axis=1))
     distance, row = (np.asarray(x) for x in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
     has_row = np.isfinite(distance)  # the tree returns no row if the squared distance overflows
-    return NearestGaussians(np.where(has_row, row, 0), finite & (distance <= most))
+    return NearestGaussians(np.where(has_row, row, 0), finite & (distance <= max_distance))
 
 
 def read_cloud(path: Path) -> PlyData:
@@ -335,7 +335,7 @@ def label_cloud(
     path: Path,
     means: Float64[np.ndarray, "m 3"],
     columns: dict[str, np.ndarray],
-    most: float,
+    max_distance: float,
     *,
     overwrite: bool = False,
 ) -> LabelTransfer:
@@ -345,7 +345,7 @@ def label_cloud(
         path: path of the new PLY file.
         means: centers of the Gaussians to take labels from, in the coordinates of the cloud.
         columns: labels of these Gaussians, by property name.
-        most: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
+        max_distance: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
         ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
@@ -358,11 +358,11 @@ def label_cloud(
         raise InputError(
             "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
         )
-    limit = most * float(spacing.median())
+    limit = max_distance * float(spacing.median())
     nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
-    labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
+    labels = {name: np.where(nearest.within_limit, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
     write_cloud(path, cloud, labels, overwrite=overwrite)
-    return LabelTransfer(len(nearest.near), float(nearest.near.mean()), limit)
+    return LabelTransfer(len(nearest.within_limit), float(nearest.within_limit.mean()), limit)
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
@@ -436,7 +436,7 @@ def transfer_labels(
     columns = TrainedSplat.of(scene).columns()
     rows = exportable_rows(columns, torch.ones(len(field), dtype=torch.bool))
     means = scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
-    means = means if transfer.to_cloud is None else transfer.to_cloud.points(means)
+    means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     labels = semantic_columns(field, answer, instances)
     labels = {name: x[rows] for name, x in labels.items() if name not in ("reliability", "n_eff")}
     return label_cloud(transfer.cloud, path, means, labels, transfer.max_distance, overwrite=overwrite)

@@ -145,9 +145,10 @@ class LiftedRun:
         question = question.question if isinstance(question, Answer) else question
         if not isinstance(question, Query):
             raise InputError(f"save takes an answer from this run or its question, got {type(question).__name__}")
-        if question.vectors.shape[1] != self.field.dimension:
+        if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
-                f"the question has vectors of {question.vectors.shape[1]} numbers, but the features of {self.folder} "
+                f"the question has vectors of {question.embeddings.shape[1]} numbers, but the features of "
+                f"{self.folder} "
                 f"have {self.field.dimension}; ask this run, then save its answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
@@ -237,7 +238,7 @@ class LiftedRun:
         (True, '.png')
         """
         settings, folder = RasterSettings.recorded(self.field.manifest), check_path("folder", folder)
-        return write_masks(self.scene, self._mask(part), folder, rest=rest, settings=settings, overwrite=overwrite)
+        return write_masks(self.scene, self._mask(part), folder, invert=rest, settings=settings, overwrite=overwrite)
 
     def transfer(
         self,
@@ -361,7 +362,7 @@ class LiftedRun:
         """
         transform = SimilarityTransform.identity()
         for world in capture_transforms(self.folder, self.scene.identity):
-            transform = SimilarityTransform.undoing(world.transform, world.scale).then(transform)
+            transform = SimilarityTransform.inverse_of(world.transform, world.scale).compose(transform)
         return transform
 
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:

@@ -40,7 +40,7 @@ class OptionRange:
 
     low: float
     high: float
-    words: str
+    description: str
 
 
 def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
@@ -151,9 +151,9 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
         raise _error(name, f"a {'whole ' if integer else ''}number", value)
     bounds, number = OPTION_RANGES[name], cast(Any, value)
     if not bounds.low <= number <= bounds.high:  # also true for nan
-        too_large = number > bounds.high and not bounds.words.startswith("in ")
+        too_large = number > bounds.high and not bounds.description.startswith("in ")
         limit = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
-        raise _error(name, limit if too_large else bounds.words, value)
+        raise _error(name, limit if too_large else bounds.description, value)
     return kind(number)
 
 

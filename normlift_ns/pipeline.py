@@ -278,9 +278,9 @@ def vote_directions(
     """
     reliability, n = lifted.scalars.reliability, len(means)
     with stages("neighbors", n):
-        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
+        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.report, "neighbors"))
     with stages("vote", n):
-        progress = partial(stages.tell, "vote")
+        progress = partial(stages.report, "vote")
         copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress)
         counts = count_votes(copied, torch.arange(n, device=means.device), neighbors, reliability)
     return copied, vote_shares(counts, n)
@@ -339,7 +339,7 @@ def lift_provenance(
         "options": asdict(collection.options),
         "views_lifted": [scene.train.names[index] for index in collection.views],
         "views_without_features": list(collection.missing),
-        "gsplat_rules": config.rules,
+        "gsplat_rules": config.gsplat_version,
         "backend": config.backend,
         "statistics": dict(statistics),
     }
@@ -496,7 +496,7 @@ def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
     with stages("check") as step:
         settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
         match = measure_alignment(scene, settings, device=prepared.device)
-        warning = alignment_warning(match, own_cameras=not isinstance(scene, SplatScene))
+        warning = alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
         step()
     if warning is not None:
         prepared.request.say(f"Warning: {warning}")
@@ -514,7 +514,7 @@ def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTi
         exact = target.timestamp is not None
         run_dir = write_run(
             prepared.scene, field, prepared.run_dir,
-            question=question, texts=prepared.texts, overwrite=target.overwrite, exact=exact,
+            question=question, text_embeddings=prepared.texts, overwrite=target.overwrite, exact_name=exact,
         )  # fmt: skip
         field = field.to("cpu")
         step()

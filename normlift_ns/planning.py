@@ -62,17 +62,17 @@ class Rate:
     """Cost of a stage: a fixed part, and a part for each item."""
 
     fixed: float
-    each: float
+    per_item: float
     count: float
     """Number of items in the whole lift."""
 
-    def of(self, share: float = 1.0) -> float:
+    def cost(self, share: float = 1.0) -> float:
         """Return the cost of a share of the items.
 
-        >>> Rate(fixed=2.0, each=0.5, count=10).of(0.5)
+        >>> Rate(fixed=2.0, per_item=0.5, count=10).cost(0.5)
         4.5
         """
-        return self.fixed + self.each * self.count * share
+        return self.fixed + self.per_item * self.count * share
 
 
 @dataclass(frozen=True)
@@ -91,21 +91,21 @@ class Measurements:
     """Evidence entries per view."""
     entry_bytes: int
     """Bytes per evidence entry."""
-    before_s: Mapping[str, float]
+    preparation_s: Mapping[str, float]
     """Seconds of steps that were done already and will be repeated, by name (start, open, kernels, check)."""
     load_s: float
     """Seconds until the network is loaded."""
     features_s: float | None
     """Seconds per view with new features; None if all are cached."""
-    kept_features_s: float | None
+    cached_features_s: float | None
     """Seconds per view with cached features; None if none are cached."""
-    features_kept: float
+    cached_features_share: float
     """Share of the views with cached features, in 0..1."""
     evidence_s: float
     """Seconds per view that is rasterized."""
-    kept_evidence_s: float
+    cached_evidence_s: float
     """Seconds per view with cached evidence."""
-    evidence_kept: float
+    cached_evidence_share: float
     """Share of the views with cached evidence, in 0..1."""
     core_s: Mapping[str, Rate]
     """Cost of consensus, lift, neighbors, vote and store, as far as they are enabled."""
@@ -121,7 +121,7 @@ class Measurements:
     """Peak memory of this process so far."""
     device_bytes: int | None
     """Peak GPU memory until the evidence was computed; None without a GPU."""
-    looked_at: int = 0
+    measured_views: int = 0
     """Number of views that were measured."""
 
 
@@ -182,19 +182,19 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
         raise ValueError(f"num_devices must be at least 1, got {num_devices}")
     views, share = facts.views, 1 / num_devices
     features_cached, evidence_cached = (
-        _share_of(views, cached) for cached in (facts.features_kept, facts.evidence_kept)
+        _share_of(views, cached) for cached in (facts.cached_features_share, facts.cached_evidence_share)
     )
     new = views - features_cached
-    features = share * (new * (facts.features_s or 0.0) + features_cached * (facts.kept_features_s or 0.0))
+    features = share * (new * (facts.features_s or 0.0) + features_cached * (facts.cached_features_s or 0.0))
     features += facts.load_s if new > 0 else 0.0
-    evidence = share * ((views - evidence_cached) * facts.evidence_s + evidence_cached * facts.kept_evidence_s)
-    field_bytes = facts.field_bytes.of()
+    evidence = share * ((views - evidence_cached) * facts.evidence_s + evidence_cached * facts.cached_evidence_s)
+    field_bytes = facts.field_bytes.cost()
     evidence_bytes = facts.entries * views * facts.entry_bytes
     stages = (
-        *(PlannedStage(name, seconds) for name, seconds in facts.before_s.items()),
+        *(PlannedStage(name, seconds) for name, seconds in facts.preparation_s.items()),
         PlannedStage("features", features, _cached(features_cached, views)),
         PlannedStage("evidence", evidence, _cached(evidence_cached, views)),
-        *(PlannedStage(name, rate.of(share)) for name, rate in facts.core_s.items()),
+        *(PlannedStage(name, rate.cost(share)) for name, rate in facts.core_s.items()),
         PlannedStage("write", (field_bytes + facts.run_bytes) / facts.write_bytes_s),
     )
     table = facts.regions * views * facts.dimension * 4
@@ -215,7 +215,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
         host_bytes=round(facts.host_bytes + (table if on_gpu else lift_bytes)),
         device_bytes=None if facts.device_bytes is None else round(facts.device_bytes + lift_bytes),
         disk_bytes=round(files + new * facts.view_bytes + field_bytes + facts.run_bytes),
-        looked_at=facts.looked_at,
+        looked_at=facts.measured_views,
     )
 
 
@@ -262,7 +262,7 @@ def measure_core(
     features: Float[Tensor, "s d"],
     options: LiftOptions,
     views: int,
-    timed: Timed,
+    time: Timed,
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each stage of the core of a lift, and the bytes that it stores.
 
@@ -285,7 +285,7 @@ def measure_core(
         rows = rows.to(gaussians.means.device)
         parts = {"rows": evidence.rows.select_rows(rows), "unlabeled": evidence.unlabeled.select_rows(rows)}
         sample = replace(evidence, **parts, num_excluded=0)
-        costs.append(_costs(gaussians.means[rows], sample, times, table, options, timed))
+        costs.append(_costs(gaussians.means[rows], sample, times, table, options, time))
     items = _items(evidence, times, len(gaussians), options)
     counts = {name: value * (factor if name != "neighbors" else 1.0) for name, value in items.items()}
     counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
@@ -583,7 +583,7 @@ def measure_capture(
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
-        kwargs = {"rendered": rendered, "divisor": options.lift_downscale, "done": lambda view: None}
+        kwargs = {"render_settings": rendered, "downscale": options.lift_downscale, "on_view": lambda view: None}
         seconds, block = timed(lambda: observe_views(scene, indices, source, **kwargs))
         return _Observed(block, seconds)
 
@@ -598,7 +598,7 @@ def measure_capture(
     block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
 
     def rasterize(folder: Path) -> Evidence:
-        return batch_evidence(gaussians, block, folder, drawing, reuse=True, done=lambda: None)
+        return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
     rasterized = _measure_evidence(rasterize, timed, cuda=cuda)
     evidence, count = rasterized.evidence, len(block.cameras)
@@ -613,14 +613,14 @@ def measure_capture(
         regions=sum(map(len, block.features)) / count,
         entries=entries / count,
         entry_bytes=4 + evidence.rows.weight.element_size(),
-        before_s=before or {},
+        preparation_s=before or {},
         load_s=load_s,
         features_s=_per_view(observed),
-        kept_features_s=cached_s,
-        features_kept=len(cached) / len(chosen),
+        cached_features_s=cached_s,
+        cached_features_share=len(cached) / len(chosen),
         evidence_s=rasterized.seconds / count,
-        kept_evidence_s=rasterized.cached_seconds / count,
-        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
+        cached_evidence_s=rasterized.cached_seconds / count,
+        cached_evidence_share=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
@@ -628,7 +628,7 @@ def measure_capture(
         view_bytes=_map_bytes(block) / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
-        looked_at=max(count, len(observed.block.cameras)),
+        measured_views=max(count, len(observed.block.cameras)),
     )
 
 

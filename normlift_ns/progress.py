@@ -47,7 +47,7 @@ class StageTimer:
             torch.cuda.synchronize()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def tell(self, stage: str, done: int, total: int) -> None:
+    def report(self, stage: str, done: int, total: int) -> None:
         """Report the progress of a stage that counts its own steps."""
         self._report(stage, done, total)
 

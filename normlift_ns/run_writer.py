@@ -46,9 +46,9 @@ def write_run(
     run_dir: Path,
     *,
     question: Query | None = None,
-    texts: Mapping[str, Tensor] | None = None,
+    text_embeddings: Mapping[str, Tensor] | None = None,
     overwrite: bool = False,
-    exact: bool = True,
+    exact_name: bool = True,
 ) -> Path:
     """Write a lifted run, completely or not at all, and return its directory.
 
@@ -62,16 +62,16 @@ def write_run(
     Args:
         run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
         question: query to render as relevancy_0, relevancy_1, …
-        texts: embeddings provided by the user, by prompt.
+        text_embeddings: embeddings provided by the user, by prompt.
         overwrite: replace an existing directory.
-        exact: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
+        exact_name: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
     Raises:
-        FileExistsError: the directory exists, `exact` is True and `overwrite` is False.
+        FileExistsError: the directory exists, `exact_name` is True and `overwrite` is False.
         ValueError: the field was lifted from other Gaussians.
         OSError: writing failed, for instance because the disk is full; no files are left then.
     """
     complete_interrupted_lifts(run_dir)
-    if exact:
+    if exact_name:
         refuse_existing_run(run_dir, overwrite)
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
         raise InputError(
@@ -83,16 +83,16 @@ def write_run(
             save_splat(folder, source)
             transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
         else:
-            if len(source.added) > 0:
-                write_transforms(folder / EXTRA_IMAGES_FILE, source.added, ())
+            if len(source.extra_frames) > 0:
+                write_transforms(folder / EXTRA_IMAGES_FILE, source.extra_frames, ())
             transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
         write_text_file(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
-        _write_tensors(folder, source, field, question, texts)
-        for path in (run_dir,) if exact else numbered_paths(run_dir):
+        _write_tensors(folder, source, field, question, text_embeddings)
+        for path in (run_dir,) if exact_name else numbered_paths(run_dir):
             is_splat = isinstance(source, SplatScene)
             config = splat_config(source, path) if is_splat else _lifted_config(source, path)
             write_text_file(folder / "config.yml", add_digest_comment(dump_config(config)), overwrite=True)
-            if commit_directory(folder, path, overwrite=overwrite and exact):
+            if commit_directory(folder, path, overwrite=overwrite and exact_name):
                 return path
     refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
     raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
@@ -101,12 +101,12 @@ def write_run(
 def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     config, location = deepcopy(source.config), source.location
     config.method_name = "normlift"
-    config.output_dir = location.portable(run_dir.parents[2])
+    config.output_dir = location.relative_to_root(run_dir.parents[2])
     config.timestamp = run_dir.name
     config.relative_model_dir = Path(CHECKPOINT_DIR)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
     config.pipeline.model = NormLiftModelConfig.upgrade(source.model_config, semantics=Path(FIELD_FOLDER))
-    if location.moved_data or config.output_dir.is_absolute():
+    if location.data_moved or config.output_dir.is_absolute():
         set_dataset(config, location.data)  # a relative path would not be found
     skip_seed_points(config)
     # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA

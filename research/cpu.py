@@ -95,9 +95,9 @@ def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[
     """CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that is kept."""
     job = RasterJob(scene, False, RasterSettings(), torch.float32)
     batch = RasterBatch([camera], [labels], [int(labels.max()) + 1])
-    projected = project(job.world, camera, job.settings, job.antialiased)
+    projected = project(job.prepared, camera, job.settings, job.antialiased)
     tasks: dict[str, Callable[[], Any]] = {
-        "project": lambda: project(job.world, camera, job.settings, job.antialiased),
+        "project": lambda: project(job.prepared, camera, job.settings, job.antialiased),
         "lists": lambda: compiled._tiles(projected, camera, job.settings),
         "view": lambda: compiled.views_evidence(job, batch),
     }
@@ -108,7 +108,7 @@ def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[
             task()
             spent[name].append(1e3 * (time.process_time() - start))
     kept = len(compiled._tiles(projected, camera, job.settings)[2][1])
-    share = kept / len(assign_tiles(projected, camera.width, camera.height, job.settings.tile_size).members)
+    share = kept / len(assign_tiles(projected, camera.width, camera.height, job.settings.tile_size).indices)
     milliseconds = {name: median(values) for name, values in spent.items()}
     milliseconds["sums"] = milliseconds["view"] - milliseconds["project"] - milliseconds["lists"]
     return milliseconds, share

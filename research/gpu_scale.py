@@ -82,7 +82,7 @@ class Clock:
         if self.device == "cuda":
             torch.cuda.synchronize()
         if self.team is not None:
-            self.team.add(torch.zeros(1))
+            self.team.all_reduce(torch.zeros(1))
         return time.perf_counter()
 
     def lap(self, name: str) -> None:
@@ -113,12 +113,12 @@ def core_alone(case: Case, device: str) -> Found:
 def core(team: TorchCommunicator, case: Case, folder: Path, device: str) -> Found:
     """What the Gaussians of this process become, and the seconds of every step."""
     clock = Clock(team, device)
-    portion = Partition.of(team, case.scene.means)
-    chunks = chunk_views(range(len(case.cameras)), team.size)
+    portion = Partition.from_means(team, case.scene.means)
+    chunks = chunk_views(range(len(case.cameras)), team.world_size)
     pieces = dict[int, EvidenceShard]()
-    with team.shares(folder):
-        for number in team.chunks(len(chunks)):
-            pieces[number] = EvidenceShard.of(rasterized(case, chunks[number]), portion)
+    with team.shared_folder(folder):
+        for number in team.claim_chunks(len(chunks)):
+            pieces[number] = EvidenceShard.split(rasterized(case, chunks[number]), portion)
         clock.lap("evidence")
     evidence = redistribute_evidence(pieces, portion, len(chunks))
     pieces.clear()
@@ -130,7 +130,7 @@ def core(team: TorchCommunicator, case: Case, folder: Path, device: str) -> Foun
     copied, _ = vote_distributed(case.scene.means, lifted, own, RefineConfig(), portion, stages)
     clock.lap("vote")
     clock.seconds |= {name: stages.seconds[name] for name in ("neighbors",)}
-    return Found(lifted.scalars.map(portion.join), portion.join(copied), clock.seconds, evidence)
+    return Found(lifted.scalars.map(portion.all_gather), portion.all_gather(copied), clock.seconds, evidence)
 
 
 SMALL_VIEWS: dict[str, Any] = {"scale": 0.1, "dimension": 16}
@@ -153,7 +153,7 @@ def compare_core(
     one, two, wrong, entries = list[dict[str, float]](), list[dict[str, float]](), 0.0, 0
     for turn in range(rounds + 1):
         alone = core_alone(case, device) if team.rank == 0 else None
-        team.add(torch.zeros(1))
+        team.all_reduce(torch.zeros(1))
         together = core(team, case, folder, device)
         entries = together.evidence.nnz
         if alone is not None:
@@ -162,8 +162,8 @@ def compare_core(
                 one.append(alone.seconds)
                 two.append(together.seconds)
         del alone, together
-        team.add(torch.zeros(1))
-    exchanged = int(team.add(torch.tensor([entries])).item())
+        team.all_reduce(torch.zeros(1))
+    exchanged = int(team.all_reduce(torch.tensor([entries])).item())
     if team.rank > 0:
         return
     seconds = statistics.median(map(total, two))
@@ -173,7 +173,7 @@ def compare_core(
     for step in (*STEPS, "neighbors"):
         for count, found in ((1, one), (2, two)):
             report.add(f"core{name}.{step}_s_{count}", statistics.median(x[step] for x in found), "s")
-    moved = exchanged * (team.size - 1) / team.size * ENTRY / 2**30
+    moved = exchanged * (team.world_size - 1) / team.world_size * ENTRY / 2**30
     report.add(f"core{name}.exchanged_gib", moved, "GiB in all")
     spent = statistics.median(x["exchange"] for x in two)
     report.add(f"exchange_gib_s{name}", moved / spent, "GiB/s, sorting what came included")
@@ -186,9 +186,9 @@ def large(team: TorchCommunicator, report: Report, case: Case, folder: Path, dev
     begin = time.perf_counter()
     found = core(team, case, folder, device)
     spent = time.perf_counter() - begin
-    nnz = int(team.add(torch.tensor([found.evidence.nnz])).item())
+    nnz = int(team.all_reduce(torch.tensor([found.evidence.nnz])).item())
     peak = torch.tensor([torch.cuda.max_memory_allocated() / 2**30 if device == "cuda" else 0.0])
-    peak = float(team.join(peak).max())
+    peak = float(team.all_gather(peak).max())
     changed = float((found.copied != torch.arange(len(found.copied), device=found.copied.device)).float().mean())
     if team.rank > 0:
         return
@@ -229,9 +229,9 @@ def front(team: TorchCommunicator, report: Report, folder: Path, device: str, qu
         return clock.seconds["all"]
 
     def see() -> float:
-        clock, chunks = Clock(team, device), chunk_views(range(count), team.size)
-        with team.shares(folder):
-            for number in team.chunks(len(chunks)):
+        clock, chunks = Clock(team, device), chunk_views(range(count), team.world_size)
+        with team.shared_folder(folder):
+            for number in team.claim_chunks(len(chunks)):
                 see_chunk(chunks[number])
             clock.lap("all")
         return clock.seconds["all"]
@@ -239,10 +239,10 @@ def front(team: TorchCommunicator, report: Report, folder: Path, device: str, qu
     for _ in iterate_view_features(source, ((images[v], str(v)) for v in range(2))):  # compiles
         pass
     one = [see_alone()] if team.rank == 0 else []
-    team.add(torch.zeros(1))
+    team.all_reduce(torch.zeros(1))
     two = [see(), see()]
     one += [see_alone()] if team.rank == 0 else []
-    team.add(torch.zeros(1))
+    team.all_reduce(torch.zeros(1))
     if team.rank == 0:
         unit = f"one GPU over two, {count} images"
         report.add("front_end_speedup_2", statistics.mean(one) / statistics.mean(two), unit)

@@ -67,7 +67,7 @@ def true_relevancy(exact_directions: torch.Tensor, question: Query) -> torch.Ten
     """[M, 1] in float64, from directions in float64."""
     positive, negative = (
         exact_directions @ torch.nn.functional.normalize(torch.from_numpy(vectors).to(exact_directions), dim=1).T
-        for vectors in (question.vectors, question.negative_vectors)
+        for vectors in (question.embeddings, question.negative_embeddings)
         if vectors is not None
     )
     return relevancy(positive, negative, rule="lerf")
@@ -124,7 +124,7 @@ def measure(
         cast(Any, model.normlift)._show(History.of(state))
         told(state)
 
-    drawn, state = visible_mask(model.splats()[0]["opacities"]), posed()
+    drawn, state = visible_mask(model.splat_parameters()[0]["opacities"]), posed()
     told(state)
     other = replace(question, threshold=0.55, min_reliability=0.1)
     report.add(

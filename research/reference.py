@@ -125,7 +125,7 @@ def _values(name: str, hint: Any) -> str:
         inner = _values(name, parts[0])
         return {"a text": "texts", "a path": "paths"}.get(inner, f"any of {inner}")
     if hint in (int, float):
-        words = OPTION_RANGES[name].words
+        words = OPTION_RANGES[name].description
         return words if words.startswith("a ") else f"a {'whole ' if hint is int else ''}number, {words}"
     return _KINDS[hint]
 

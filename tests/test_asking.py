@@ -63,7 +63,7 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         text_encoder_for(field, cache=tmp_path / "texts")
     expected = field.manifest["features"].get("encoder", field.manifest["features"].get("texts"))["pretrained"]
-    for part in (str(path), file_digest(path, like=expected), expected, "--text-vectors", "lift again"):
+    for part in (str(path), file_digest(path, compare_to=expected), expected, "--text-vectors", "lift again"):
         assert part in str(caught.value)
     assert "--encoder-pretrained" not in str(caught.value)  # ns-normlift-query has no such flag
     template = with_text_source(field, template="a {}")
@@ -74,7 +74,9 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
         text_encoder_for(field)
     assert "--encoder-pretrained" not in str(missing.value)
     np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))  # the user's choice needs no weights
-    assert isinstance(text_encoder_for(with_text_source(field, vectors=tmp_path / "own.npz")), TextEmbeddingFile)
+    assert isinstance(
+        text_encoder_for(with_text_source(field, text_embeddings=tmp_path / "own.npz")), TextEmbeddingFile
+    )
 
 
 def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +125,7 @@ def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path
     np.savez(path, fox=np.arange(12, dtype=np.float32))
     with pytest.raises(InputError, match=rf"{path} .*--text-vectors"):
         text_encoder_for(field)
-    assert torch.is_tensor(text_encoder_for(with_text_source(field, vectors=path)).text(["fox"]))
+    assert torch.is_tensor(text_encoder_for(with_text_source(field, text_embeddings=path)).text(["fox"]))
     path.unlink()
     with pytest.raises(FileNotFoundError, match=str(path)):
         text_encoder_for(field)

@@ -37,7 +37,7 @@ def test_opacity_grows_with_relevancy() -> None:
     opacity = apply_colormap(torch.linspace(-1, 2, 301), (0.0, 1.0), colormap_rgb("viridis"))[1]
     assert float(opacity.diff().min()) >= 0
     assert (float(opacity[0]), float(opacity[-1])) == pytest.approx((0.35, 0.9))
-    assert float(apply_colormap(torch.zeros(1), (0.0, 1.0), colormap_rgb("viridis"), faint=0.0)[1]) == 0
+    assert float(apply_colormap(torch.zeros(1), (0.0, 1.0), colormap_rgb("viridis"), min_opacity=0.0)[1]) == 0
 
 
 def test_a_prompt_has_the_color_that_it_names_or_some_other() -> None:

@@ -281,7 +281,7 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
     assert run.field.manifest["gsplat_rules"] == again.field.manifest["gsplat_rules"] == "1.6"
     lifts = len(drawn)
     evaluated = EvaluatedRun(run.scene, run.field, run.texts, True)
-    evaluated.composited(run.scene.train.cameras[0], torch.ones(len(run.field), 1))
+    evaluated.composite(run.scene.train.cameras[0], torch.ones(len(run.field), 1))
     run.render(0, run.ask("left"))
     flags = ("--load-config", run.config, "--text", "left", "--render-dir", tmp_path / "pictures")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0

@@ -104,7 +104,7 @@ def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendNa
     block = ViewBatch([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
     found = batch_evidence(
         random_scene(30, dtype=torch.float32), block, folder,
-        RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, done=lambda: done.append(1),
+        RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, on_view=lambda: done.append(1),
     )  # fmt: skip
     assert done == [1]
     return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])

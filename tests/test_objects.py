@@ -44,7 +44,7 @@ def test_only_what_is_selected_connects():
 def test_parts_smaller_than_one_gaussian_are_refused():
     for min_size in (0, 1.5):
         with pytest.raises(InputError, match="min_size"):
-            find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_size=min_size)
+            find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
         with pytest.raises(InputError, match="min_size"):
             find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_size=min_size)
 
@@ -121,7 +121,7 @@ def test_points_lines_and_planes_have_boxes():
 
 def test_boxes_move_with_their_points():
     points, rotation = cuboid(5), turned(5)
-    moved = oriented_box(points).moved(rotation, 3.0, np.array([1.0, 2, 3]))
+    moved = oriented_box(points).transformed(rotation, 3.0, np.array([1.0, 2, 3]))
     again = oriented_box(3 * points @ rotation.T + [1, 2, 3])
     assert box_iou(moved, again) > 0.95
     inside = half_spaces(moved) @ np.append(moved.center, 1)

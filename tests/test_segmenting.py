@@ -22,7 +22,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
     masks = [torch.stack([upper, lower]) ^ (torch.rand(2, 24, 40, generator=g) < 0.1) for _ in cameras]
     masks[1] = torch.stack([~upper, torch.zeros_like(lower)])  # another thing, and nothing
     counted = [None, torch.rand(24, 40, generator=g) < 0.7, None]
-    found = mask_evidence(scene, cameras, masks, counted=counted, backend="torch")
+    found = mask_evidence(scene, cameras, masks, valid_pixels=counted, backend="torch")
     for text in range(2):
         labels = [(~mask[text]).int() for mask in masks]
         labels[1] = labels[1].where(counted[1], -2)
@@ -40,7 +40,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         n_eff = total**2 / (view_weight**2).sum(dim=1)
         answer = found.answer(text)
         close: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-12}
-        assert torch.equal(answer.seen, seen)
+        assert torch.equal(answer.is_visible, seen)
         known = seen & (length > 0)
         assert int(known.sum()) > 20 and bool((answer.relevancy[~known] == 0).all())
         share = e[:, :, 0].sum(dim=1) / e.sum(dim=(1, 2))
@@ -48,7 +48,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         torch.testing.assert_close(answer.scalars.c_inter[known], (vector / length)[known], **close)
         reliability = vector / total * n_eff / (n_eff + 1)
         torch.testing.assert_close(answer.scalars.reliability[known], reliability[known], **close)
-        assert answer.voted.tolist() == there.tolist()
+        assert answer.voting_views.tolist() == there.tolist()
         again = found.answer(text, views=[0, 2])
         torch.testing.assert_close(again.relevancy[known], share[known], **close)
         assert bool((again.scalars.reliability >= answer.scalars.reliability)[known].all())

@@ -43,7 +43,7 @@ class SimilarityTransform:
     shift: Float64[np.ndarray, " 3"]
 
     @classmethod
-    def undoing(cls, transform: Float64[np.ndarray, "3 4"], scale: float) -> SimilarityTransform:
+    def inverse_of(cls, transform: Float64[np.ndarray, "3 4"], scale: float) -> SimilarityTransform:
         """Return the inverse of p -> scale * (transform @ p)."""
         rotation = transform[:, :3].T
         return cls(rotation, 1 / scale, -rotation @ transform[:, 3])
@@ -53,16 +53,16 @@ class SimilarityTransform:
         """Return the identity transform."""
         return cls(np.eye(3), 1.0, np.zeros(3))
 
-    def then(self, other: SimilarityTransform) -> SimilarityTransform:
+    def compose(self, other: SimilarityTransform) -> SimilarityTransform:
         """Return the composition that applies this transform first and `other` second."""
-        shift = other.points(self.shift[None])[0]
+        shift = other.transform_points(self.shift[None])[0]
         return SimilarityTransform(other.rotation @ self.rotation, other.scale * self.scale, shift)
 
-    def times(self, factor: float) -> SimilarityTransform:
+    def scaled(self, factor: float) -> SimilarityTransform:
         """Return this transform followed by scaling with `factor`."""
         return SimilarityTransform(self.rotation, factor * self.scale, factor * self.shift)
 
-    def points(self, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3"]:
+    def transform_points(self, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3"]:
         """Transform points [M, 3]."""
         return self.scale * points @ self.rotation.T + self.shift
 
@@ -104,15 +104,15 @@ class Catalogue:
     """Objects by prompt, and by descending size within each prompt."""
 
     objects: tuple[CatalogueObject, ...]
-    in_smaller_parts: int
+    num_in_small_components: int
     """Number of selected Gaussians in components that are too small to be listed."""
-    metres_per_unit: float | None
+    meters_per_unit: float | None
     """Meters per unit of the capture. If it is given, `capture` positions are in meters, otherwise in capture units."""
 
     @property
     def unit(self) -> str:
         """Unit of the `capture` positions."""
-        return "capture unit" if self.metres_per_unit is None else "metre"
+        return "capture unit" if self.meters_per_unit is None else "metre"
 
 
 def make_catalogue(
@@ -131,7 +131,7 @@ def make_catalogue(
         metres_per_unit: length of a capture unit in meters, > 0; None if unknown.
         device: device that renders the objects, to rank images.
     """
-    to_capture = capture if metres_per_unit is None else capture.times(metres_per_unit)
+    to_capture = capture if metres_per_unit is None else capture.scaled(metres_per_unit)
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
     weight, reliability = (x.double().cpu().numpy() for x in (field.scalars.weight + 1e-12, field.scalars.reliability))
     count, names, cameras = len(instances.classes), scene.train.names, scene.train.cameras
@@ -147,8 +147,8 @@ def make_catalogue(
         whole = shows & (inside >= MIN_WHOLE_FRACTION * inside[shows].max(initial=0))
         order, num_views = np.lexsort((-share, ~whole, ~shows)), int(shows.sum())
         scene_place = _place(means[rows], weight[rows])
-        points = to_capture.points(means[rows])
-        box = scene_place.box.moved(to_capture.rotation, to_capture.scale, to_capture.shift)
+        points = to_capture.transform_points(means[rows])
+        box = scene_place.box.transformed(to_capture.rotation, to_capture.scale, to_capture.shift)
         objects.append(
             CatalogueObject(
                 id=number,
@@ -255,8 +255,8 @@ def catalogue_to_json(catalogue: Catalogue) -> dict[str, Any]:
     """Return a catalogue as plain Python types."""
     return {
         "unit": catalogue.unit,
-        "metres_per_unit": catalogue.metres_per_unit,
-        "in_smaller_parts": catalogue.in_smaller_parts,
+        "metres_per_unit": catalogue.meters_per_unit,
+        "in_smaller_parts": catalogue.num_in_small_components,
         "objects": [
             {
                 "id": item.id,

@@ -56,7 +56,7 @@ class OrientedBox:
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         return self.center + (signs * self.size) @ self.axes
 
-    def moved(
+    def transformed(
         self, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]
     ) -> OrientedBox:
         """Return the box transformed by p -> scale * rotation @ p + shift."""
@@ -145,21 +145,21 @@ def find_objects(
     means: Float[Tensor, "n 3"],
     selected: Bool[Tensor, " n"],
     *,
-    reach: float = OBJECT_MAX_GAP,
-    min_size: int = OBJECT_MIN_GAUSSIANS,
+    max_gap: float = OBJECT_MAX_GAP,
+    min_gaussians: int = OBJECT_MIN_GAUSSIANS,
 ) -> Objects:
     """Divide a selection into objects, its connected components.
 
     Args:
-        reach: as in `connected_components`.
-        min_size: components with fewer Gaussians are counted but not listed.
+        max_gap: as in `connected_components`.
+        min_gaussians: components with fewer Gaussians are counted but not listed.
     Raises:
-        ValueError: `min_size` is less than 1, or as in `connected_components`.
+        ValueError: `min_gaussians` is less than 1, or as in `connected_components`.
     """
-    check_number("min_size", min_size, int)
-    labels = connected_components(means, selected, reach=reach)
+    check_number("min_size", min_gaussians, int)
+    labels = connected_components(means, selected, reach=max_gap)
     sizes = torch.bincount(labels[labels >= 0].long())
-    count = int((sizes >= min_size).sum())  # sizes are in descending order
+    count = int((sizes >= min_gaussians).sum())  # sizes are in descending order
     return Objects(
         gaussians=int(selected.sum()),
         in_smaller_parts=int(selected.sum() - sizes[:count].sum()),

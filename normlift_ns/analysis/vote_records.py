@@ -146,7 +146,7 @@ class RecordedVotes:
             block,
             self.cache / "evidence",
             RasterConfig(
-                rules=str(self.field.manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])),
+                gsplat_version=str(self.field.manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])),
                 backend=self.field.manifest.get("backend", "auto"),
                 dtype=torch.float64 if self._option("precision", str, "standard") == "double" else torch.float32,
                 rasterize_mode=self.scene.rasterize_mode,
@@ -171,7 +171,9 @@ class RecordedVotes:
         rendered = self._option("image_source", str, "photos") == "render"
         settings = RasterSettings.recorded(self.field.manifest) if rendered else None
         divisor = self._option("lift_downscale", int, 1)
-        return observe_views(self.scene, indices, self._source, rendered=settings, divisor=divisor, done=done), images
+        return observe_views(
+            self.scene, indices, self._source, render_settings=settings, downscale=divisor, on_view=done
+        ), images
 
     @cached_property
     def _source(self) -> FeatureSource:

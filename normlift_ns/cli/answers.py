@@ -75,8 +75,8 @@ def print_catalog(catalog: Catalogue) -> None:
     CONSOLE.print(table)
     if len(catalog.objects) > _MAX_ROWS:
         info(f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
-    if catalog.in_smaller_parts > 0:
-        info(f"{catalog.in_smaller_parts:,} selected Gaussians are in groups too small to be listed.")
+    if catalog.num_in_small_components > 0:
+        info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
 
 
 # ns-normlift-query --why: the images that voted for a selection.

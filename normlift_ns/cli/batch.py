@@ -61,11 +61,11 @@ class Capture:
 
     name: str
     """The line itself."""
-    words: tuple[str, ...]
+    arguments: tuple[str, ...]
     """Arguments of ns-normlift, including the name of the new run."""
     key: str
     """Digest of scene and options, 16 hexadecimal digits."""
-    run: Path | None
+    run_dir: Path | None
     """Directory of the lifted run; None if it is not known before the capture is opened."""
 
 
@@ -210,10 +210,10 @@ class Shard:
     """Number of the part, from 0."""
     count: int
 
-    def holds(self, position: int) -> bool:
+    def contains(self, position: int) -> bool:
         """Return whether a position in the list, from 0, belongs to this part; each belongs to exactly one part.
 
-        >>> [position for position in range(7) if Shard(1, 3).holds(position)]
+        >>> [position for position in range(7) if Shard(1, 3).contains(position)]
         [1, 4]
         """
         return position % self.count == self.index
@@ -375,16 +375,16 @@ _TAIL = 2**14
 """Number of bytes at the end of a log file that may contain its last line."""
 
 
-def run_logged(words: Sequence[str], log: Path, beat: Callable[[], bool], every: float) -> int | None:
+def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
     """Run a program with its output in a log file; return its exit code, or minus the signal that killed it.
 
     On Linux, the program ends whenever this process ends; elsewhere, only after Ctrl-C and SIGTERM.
 
     Args:
-        words: Command line of the program.
+        command: Command line of the program.
         log: New file for its output.
-        beat: Callback; if it returns False, the program is terminated and the result is None.
-        every: Seconds between two calls of `beat`.
+        on_tick: Callback; if it returns False, the program is terminated and the result is None.
+        interval: Seconds between two calls of `on_tick`.
     Raises:
         OSError: The program cannot be started, or the log cannot be written.
     """
@@ -393,7 +393,7 @@ def run_logged(words: Sequence[str], log: Path, beat: Callable[[], bool], every:
     with (
         log.open("wb") as output,
         subprocess.Popen(
-            words,
+            command,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -404,9 +404,9 @@ def run_logged(words: Sequence[str], log: Path, beat: Callable[[], bool], every:
         try:
             while True:
                 try:
-                    return process.wait(every)
+                    return process.wait(interval)
                 except subprocess.TimeoutExpired:
-                    if not beat():
+                    if not on_tick():
                         _terminate(process)
                         return None
         except BaseException:  # Ctrl-C or SIGTERM
@@ -446,19 +446,19 @@ _CLAIMS, _LOGS = "claims", "logs"
 def lift_captures(
     captures: Sequence[Capture],
     folder: Path,
-    patience: float,
+    timeout: float,
     *,
-    say: Callable[[str], None] = lambda text: None,
-    program: Sequence[str] = LIFT_COMMAND,
+    on_message: Callable[[str], None] = lambda text: None,
+    command: Sequence[str] = LIFT_COMMAND,
 ) -> dict[str, Outcome]:
     """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
 
     Args:
         captures: The captures of this worker.
         folder: Folder of claims and results, which all workers share; created if missing.
-        patience: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
-        say: Callback for messages about each capture.
-        program: Command of ns-normlift.
+        timeout: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+        on_message: Callback for messages about each capture.
+        command: Command of ns-normlift.
     Raises:
         OSError: The folder cannot be written.
     """
@@ -467,21 +467,21 @@ def lift_captures(
         (folder / name).mkdir(parents=True, exist_ok=True)
     at_start, previous = read_claim_states(folder / _CLAIMS), latest_outcomes(read_jsonl(folder, Outcome))
     missing = {capture.key: capture for capture in captures if not _is_complete(capture, previous)}
-    for claim in iter_claims(folder / _CLAIMS, list(missing), at_start, patience):
+    for claim in iter_claims(folder / _CLAIMS, list(missing), at_start, timeout):
         capture = missing[claim.key]
         try:
-            say(f"{capture.name} …")
-            outcome = _lift_capture(capture, claim, folder, patience, worker, program)
+            on_message(f"{capture.name} …")
+            outcome = _lift_capture(capture, claim, folder, timeout, worker, command)
         except BaseException:
             finish_claim(claim, ABANDONED)
             raise
         if outcome is None:
-            say(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
+            on_message(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
             continue
         append_jsonl(folder / f"{worker}{JSONL_SUFFIX}", outcome)
         finish_claim(claim, outcome.state)
         results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
-        say(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
+        on_message(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
     return latest_outcomes(read_jsonl(folder, Outcome))
 
 
@@ -491,7 +491,7 @@ def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
     if outcome is None or outcome.state == "failed":
         return False
     try:
-        return capture.run is None or is_lifted(capture.run)
+        return capture.run_dir is None or is_lifted(capture.run_dir)
     except InputError:  # reported when the capture is processed
         return False
 
@@ -503,22 +503,22 @@ def _lift_capture(
     start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
 
     def outcome(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
-        run = None if capture.run is None or state == "failed" else str(capture.run)
+        run = None if capture.run_dir is None or state == "failed" else str(capture.run_dir)
         seconds, now = time.monotonic() - start_time, time.time()
         return Outcome(capture.name, capture.key, claim.number, state, seconds, message, code, run, worker, now)
 
     try:
-        if capture.run is not None and is_lifted(capture.run):
+        if capture.run_dir is not None and is_lifted(capture.run_dir):
             return outcome("skipped")
         beats = count(1)
         code = run_logged(
-            [*program, *capture.words], log, lambda: write_pulse(claim, next(beats)), patience / BEATS_PER_TIMEOUT
+            [*program, *capture.arguments], log, lambda: write_pulse(claim, next(beats)), patience / BEATS_PER_TIMEOUT
         )
         if code is None:
             return None
         if code == 0:
             return outcome("done")
-        if capture.run is not None and is_lifted(capture.run):  # by a worker that was considered dead
+        if capture.run_dir is not None and is_lifted(capture.run_dir):  # by a worker that was considered dead
             return outcome("skipped")
     except InputError as error:
         return outcome("failed", str(error), 1)
@@ -560,13 +560,13 @@ class NormLiftBatch:
         check_readable_file(self.captures, "ns-normlift-batch")
         shard = make_shard(self.shard, os.environ)
         all_captures = read_captures(self.captures, self.options)
-        captures = [capture for index, capture in enumerate(all_captures) if shard.holds(index)]
+        captures = [capture for index, capture in enumerate(all_captures) if shard.contains(index)]
         folder = self.results or self.captures.with_name(f"{self.captures.stem}_batch")
         check_writable_folder(folder, "--results")
         count = f"{len(all_captures)} capture{'' if len(all_captures) == 1 else 's'}"
         part = "" if shard.count == 1 else f", {len(captures)} of them in part {shard.index + 1} of {shard.count}"
         info(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
-        outcomes = lift_captures(captures, folder, self.patience, say=info)
+        outcomes = lift_captures(captures, folder, self.patience, on_message=info)
         if len(captures) > 0:
             CONSOLE.print(outcomes_table(captures, outcomes))
             info(count_outcomes(captures, outcomes))

@@ -45,7 +45,7 @@ class NormLiftCheck(NormLift):
         start_time = time.perf_counter()
         if self.json is not None:
             check_writable_file(self.json, "--json")
-            refuse_existing(self.json, overwrite=self.overwrite, instead="--json")
+            refuse_existing(self.json, overwrite=self.overwrite, flags="--json")
         rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:

@@ -306,12 +306,12 @@ def _parse_and_run(command: type[CommandProtocol], words: list[str]) -> None:
     parse_flags(command, words).main()
 
 
-def parse_flags(command: type[_Command], words: Sequence[str], name: str | None = None) -> _Command:
+def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | None = None) -> _Command:
     """Parse the words after the name of a command.
 
     Args:
         command: Dataclass of the command.
-        words: Words of the command line.
+        arguments: Words of the command line.
         name: Name of the command; None: the name that this process was started with.
     Raises:
         InputError: The command does not know the words.
@@ -319,10 +319,10 @@ def parse_flags(command: type[_Command], words: Sequence[str], name: str | None 
     """
     name = name or _module_name()
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
-    words = fill_boolean_values(words, boolean_flags(command))
-    prints_help = {"-h", "--help"} & set(words)
+    arguments = fill_boolean_values(arguments, boolean_flags(command))
+    prints_help = {"-h", "--help"} & set(arguments)
     with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
-        return tyro.cli(flags, prog=name, args=words, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
+        return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
 
 
 def _module_name() -> str | None:

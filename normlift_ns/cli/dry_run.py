@@ -37,7 +37,7 @@ class PlannedCommand(Protocol):
     source: SourceOptions
     lift: LiftOptions
 
-    def trained(self) -> Path | Scene:
+    def open_trained(self) -> Path | Scene:
         """Return the config of the run, or the opened scene."""
         ...
 
@@ -47,7 +47,7 @@ class OpenedCapture(NamedTuple):
 
     scene: Scene
     run_dir: Path
-    seconds: dict[str, float]
+    stage_seconds: dict[str, float]
 
 
 def open_capture(command: PlannedCommand, start_time: float) -> OpenedCapture:
@@ -60,7 +60,7 @@ def open_capture(command: PlannedCommand, start_time: float) -> OpenedCapture:
         FileNotFoundError, ValueError: Same as in `open_scene` and `open_splat`.
     """
     import_time = time.perf_counter()
-    trained = command.trained()
+    trained = command.open_trained()
     scene = (
         open_scene(trained, data=command.data, load_step=command.load_step) if isinstance(trained, Path) else trained
     )
@@ -75,19 +75,21 @@ def compare_cameras(command: PlannedCommand, opened: OpenedCapture, device: str)
         ValueError: Same as in `alignment_warning`.
     """
     scene = opened.scene
-    opened.seconds["kernels"] = time_kernel_loading(scene, command.lift, device=device)
+    opened.stage_seconds["kernels"] = time_kernel_loading(scene, command.lift, device=device)
     start = time.perf_counter()
     match = measure_alignment(
         scene, RasterSettings.of_gsplat(resolve_gsplat_version(scene, command.lift)), device=device
     )
-    opened.seconds["check"] = time.perf_counter() - start
-    return alignment_warning(match, own_cameras=not isinstance(scene, SplatScene))
+    opened.stage_seconds["check"] = time.perf_counter() - start
+    return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
 def plan_lift(command: PlannedCommand, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
     """Return the plan of a command; errors are those of `measure_capture`."""
     cache = cache_folder(opened.run_dir)
-    measurements = measure_capture(opened.scene, source, command.lift, cache, device=device, before=opened.seconds)
+    measurements = measure_capture(
+        opened.scene, source, command.lift, cache, device=device, before=opened.stage_seconds
+    )
     return make_plan(measurements, num_devices=command.num_devices)
 
 

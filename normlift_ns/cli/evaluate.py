@@ -161,7 +161,7 @@ class NormLiftEval:
         check_readable_file(self.masks.names, "--names")
         figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
         figures += pose_output_paths(self._coverage_stem) if "coverage" in self.study else []
-        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
+        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
         for path in (self.output_path, *figures):
             check_writable_file(path, "--output-path")
 

@@ -116,7 +116,7 @@ class NormLiftExport:
             text_template=self.ask.text_template,
         )
         if self.masks_dir is not None:
-            refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
+            refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, flags="--masks-dir")
         job = self._job(run, cloud)
         for kind, path in outputs.items():
             for line in EXPORTERS.load(kind).write(job, path):
@@ -184,7 +184,7 @@ class NormLiftExport:
         target = outputs["ply"]
         suffixes = ("rows.npy", "names.json", "objects.json")
         files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
-        refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
+        refuse_existing(*files, overwrite=self.overwrite, flags="--output-dir or --output-filename")
         for file in files:
             check_writable_file(file, "--output-dir")
         self._check_answer()
@@ -195,7 +195,7 @@ class NormLiftExport:
         if self.arrays_dir is not None:
             check_writable_folder(self.arrays_dir, "--arrays-dir")
             paths = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
-            refuse_existing(*paths, overwrite=self.overwrite, instead="--arrays-dir")
+            refuse_existing(*paths, overwrite=self.overwrite, flags="--arrays-dir")
         if self.transfer is not None:
             check_readable_file(self.transfer, "--transfer")
             path = outputs["cloud"]
@@ -204,9 +204,9 @@ class NormLiftExport:
                     f"{path} would be both the splat and the labeled cloud; give another --output-filename"
                 )
             check_writable_file(path, "--output-dir")
-            refuse_existing(path, overwrite=self.overwrite, instead="--output-dir")
+            refuse_existing(path, overwrite=self.overwrite, flags="--output-dir")
         for kind in self.exporters:
-            refuse_existing(outputs[kind], overwrite=self.overwrite, instead="--output-dir or --output-filename")
+            refuse_existing(outputs[kind], overwrite=self.overwrite, flags="--output-dir or --output-filename")
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""

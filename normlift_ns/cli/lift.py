@@ -71,8 +71,8 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
                 warnings.simplefilter("ignore")
             yield team
     except PeerFailureError as error:
-        if not error.lost.failed:
-            print_error(describe_failure(error.lost))
+        if not error.failure.reported:
+            print_error(describe_failure(error.failure))
         sys.exit(1)
     except (KeyboardInterrupt, TerminatedError):
         if started_by_us:
@@ -171,7 +171,7 @@ class NormLift:
             info_progress(text)
 
         with progress_bars() as report:
-            trained = self.trained()
+            trained = self.open_trained()
             is_config = isinstance(trained, Path)
             request = LiftRequest(
                 open_scene=scene_opener(
@@ -238,7 +238,7 @@ class NormLift:
             if getattr(options, name) != getattr(default, name, None):
                 raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
 
-    def trained(self) -> Path | Scene:
+    def open_trained(self) -> Path | Scene:
         """Return the config of the run; for a splat, or with --add-images, the opened scene."""
         splat = self.load_ply or self.load_gsplat
         if splat is None and self.add_images is None:

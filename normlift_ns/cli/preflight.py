@@ -104,14 +104,14 @@ def check_distinct_paths(**paths: Path | None) -> None:
             names[target] = name.replace("_", "-")
 
 
-def check_run_config(config: Path, data: Path | None, step: int | None = None, *, wrote: str = "ns-train") -> None:
+def check_run_config(config: Path, data: Path | None, step: int | None = None, *, written_by: str = "ns-train") -> None:
     """Check a config.yml, its dataset and its checkpoint.
 
     Args:
         config: Path of the config.
         data: Current path of the dataset, if it was moved.
         step: Training step of the checkpoint; None: any.
-        wrote: Command that wrote the config, for messages.
+        written_by: Command that wrote the config, for messages.
     Raises:
         FileNotFoundError: The config, the dataset or the checkpoint is missing.
         InputError: The file is not a nerfstudio config.
@@ -119,7 +119,7 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
         complete_interrupted_writes(run_dir.parent)  # finish a replacement of the run that was killed
-    check_config_exists(config, wrote)
+    check_config_exists(config, written_by)
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
         raise FileNotFoundError(
@@ -144,7 +144,7 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
 
 def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
     """Check a lifted run, and with `ask` also its text encoder."""
-    check_run_config(config, data, wrote="ns-normlift")
+    check_run_config(config, data, written_by="ns-normlift")
     folder = field_folder(Path(os.path.abspath(config)).parent)
     if ask is None:
         return

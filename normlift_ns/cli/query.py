@@ -114,7 +114,7 @@ class NormLiftQuery:
             _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
         if save_renders is not None:
             save_renders()
-        stored = save_query(run.folder / FIELD_FOLDER, result.question) if self.save else None
+        stored = save_query(run.run_dir / FIELD_FOLDER, result.question) if self.save else None
         folders = (self.render_dir, self.why_dir, self.objects_dir)
         written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
         print_answer(rows, result.question)
@@ -197,15 +197,15 @@ class NormLiftQuery:
         check_distinct_paths(json=self.json, output_path=self.output_path)
         for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
             if path is not None:
-                refuse_existing(path, overwrite=self.overwrite, instead=flag)
+                refuse_existing(path, overwrite=self.overwrite, flags=flag)
                 check_writable_file(path, flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.why_dir, "--why-dir")
         if self.objects_dir is not None:
             check_writable_folder(self.objects_dir, "--objects-dir")
             files = [self.objects_dir / name for name in CATALOG_FILES]
-            refuse_existing(*files, overwrite=self.overwrite, instead="--objects-dir")
-        refuse_existing(*self._existing_renders(), overwrite=self.overwrite, instead="--render-dir")
+            refuse_existing(*files, overwrite=self.overwrite, flags="--objects-dir")
+        refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
         flags = [f"--{name}" for name in ("text", "stdin", "interactive") if getattr(self, name)]

@@ -220,11 +220,11 @@ def sample_gaussians(
 
     def count_entries(entries: SparseRows) -> Int64[Tensor, " columns"]:
         counts = torch.bincount(entries.column, minlength=num_columns)
-        return counts if portion is None else portion.team.add(counts)
+        return counts if portion is None else portion.communicator.all_reduce(counts)
 
     count = count_entries(rows)
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
-    index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.gaussians
+    index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.indices
     number = _hash_to_unit(index)
     while True:
         probability = _largest_share(rows, share)

@@ -48,7 +48,7 @@ def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = N
     """Compute the eigenvectors of the feature table in float64; all processes use those of process 0."""
     exact = features.double()
     vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
-    vectors = vectors if team is None else team.spread(vectors)
+    vectors = vectors if team is None else team.broadcast(vectors)
     power = (exact @ vectors) ** 2
     tail = power.flip(1).cumsum(1).flip(1)  # energy in directions r, r + 1, ...
     return SpectralTable(vectors, torch.cat([tail, tail.new_zeros(len(tail), 1)], dim=1).sqrt())
@@ -80,7 +80,7 @@ def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None =
         rank = (low + high) // 2
         basis = basis_of_rank(lifted, table, rank)
         worst = torch.cat([basis.bound.new_zeros(1), basis.bound]).max()
-        worst = worst if team is None else team.join(worst[None]).max()
+        worst = worst if team is None else team.all_gather(worst[None]).max()
         if float(worst) + half_precision_error(rank) <= tolerance:
             best, high = basis, rank
         else:
@@ -211,7 +211,7 @@ def sizes_and_bounds(
     """
     mask, evidence = lifted.scalars.norm > 0, lifted.evidence
     sizes = torch.stack([mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]])
-    with_evidence, *entries = (sizes if portion is None else portion.team.add(sizes)).tolist()
+    with_evidence, *entries = (sizes if portion is None else portion.communicator.all_reduce(sizes)).tolist()
     n = len(mask) if portion is None else len(portion.order)
     dimension, matrices = lifted.features.shape[1], (evidence.rows, evidence.unlabeled)
     exact = 4 * (lifted.features.numel() + evidence.num_regions)
@@ -223,7 +223,7 @@ def sizes_and_bounds(
     }
     if basis is not None:
         rank = len(basis.rows)
-        bounds = basis.bound[mask] if portion is None else portion.team.join(basis.bound[mask])
+        bounds = basis.bound[mask] if portion is None else portion.communicator.all_gather(basis.bound[mask])
         bounds = bounds.cpu().numpy() if with_evidence > 0 else np.zeros(1)
         quantiles = np.quantile(bounds, _QUANTILES) + half_precision_error(rank)
         forms["low_rank"] = {

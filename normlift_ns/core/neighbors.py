@@ -129,7 +129,9 @@ def _on_gpu_finite(
         if progress is not None and done < rows:
             progress(done, rows)
 
-    result = nearest.find_nearest(points, k, of=queries, done=None if progress is None else report, team=team)
+    result = nearest.find_nearest(
+        points, k, query_indices=queries, progress=None if progress is None else report, communicator=team
+    )
     uncertain = (~result.certain).nonzero().squeeze(1)
     if uncertain.numel() > _MAX_UNCERTAIN:
         return None

@@ -23,35 +23,35 @@ class Communicator(ABC):
 
     rank: int
     """Rank of this process, in 0..size-1."""
-    size: int
+    world_size: int
     """Number of processes."""
 
     @abstractmethod
-    def join(self, rows: Tensor) -> Tensor:
+    def all_gather(self, rows: Tensor) -> Tensor:
         """Return the concatenated rows of all processes, in every process."""
 
     @abstractmethod
-    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+    def gather(self, rows: Tensor) -> list[Tensor] | None:
         """Return the rows of every process in process 0, and None in the others."""
 
     @abstractmethod
-    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+    def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """Send parts[r] to process r, and return the parts that all processes sent to this one."""
 
     @abstractmethod
-    def add(self, values: Tensor) -> Tensor:
+    def all_reduce(self, values: Tensor) -> Tensor:
         """Return the sum over all processes, in every process."""
 
     @abstractmethod
-    def spread(self, values: Tensor) -> Tensor:
+    def broadcast(self, values: Tensor) -> Tensor:
         """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
 
     @abstractmethod
-    def tell(self, value: Any) -> Any:
+    def broadcast_object(self, value: Any) -> Any:
         """Return the JSON-ready object of process 0 in every process."""
 
     @abstractmethod
-    def tell_all(self, value: Any) -> list[Any]:
+    def all_gather_object(self, value: Any) -> list[Any]:
         """Return the JSON-ready objects of all processes in every process."""
 
 
@@ -62,54 +62,54 @@ class Partition:
     Arrays of a portion have one row for each Gaussian of this process, in index order.
     """
 
-    team: Communicator
+    communicator: Communicator
     order: Int64[Tensor, " n"]
     """Indices of all Gaussians in curve order."""
 
     @staticmethod
-    def of(team: Communicator, means: Float[Tensor, "n 3"]) -> Partition:
+    def from_means(team: Communicator, means: Float[Tensor, "n 3"]) -> Partition:
         """Partition the Gaussians with these means."""
         return Partition(team, spatial_order(means))
 
     def __len__(self) -> int:
-        return len(self.gaussians)
+        return len(self.indices)
 
     @cached_property
-    def by_owner(self) -> list[Int64[Tensor, " m"]]:
+    def indices_by_rank(self) -> list[Int64[Tensor, " m"]]:
         """Indices of the Gaussians of every process, ascending; each process has whole blocks of the curve."""
-        n, size = len(self.order), self.team.size
+        n, size = len(self.order), self.communicator.world_size
         blocks = -(-n // PARTITION_BLOCK)
         bounds = [min(n, blocks * rank // size * PARTITION_BLOCK) for rank in range(size + 1)]
         return [self.order[first:last].sort().values for first, last in pairwise(bounds)]
 
     @property
-    def gaussians(self) -> Int64[Tensor, " m"]:
+    def indices(self) -> Int64[Tensor, " m"]:
         """Indices of the Gaussians of this process, ascending."""
-        return self.by_owner[self.team.rank]
+        return self.indices_by_rank[self.communicator.rank]
 
     @cached_property
     def place(self) -> tuple[Int32[Tensor, " n"], Int32[Tensor, " n"]]:
         """Rank that owns each Gaussian, and row of the Gaussian in that process."""
         owner, row = (torch.empty_like(self.order, dtype=torch.int32) for _ in range(2))
-        for rank, gaussians in enumerate(self.by_owner):
+        for rank, gaussians in enumerate(self.indices_by_rank):
             owner[gaussians] = rank
             row[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=self.order.device)
         return owner, row
 
     @cached_property
-    def along(self) -> Int64[Tensor, " m"]:
+    def curve_rows(self) -> Int64[Tensor, " m"]:
         """Rows of the portion in curve order."""
-        first = sum(map(len, self.by_owner[: self.team.rank]))
+        first = sum(map(len, self.indices_by_rank[: self.communicator.rank]))
         return self.place[1][self.order[first : first + len(self)]].long()
 
     def blocks(self) -> Iterator[Int64[Tensor, " b"]]:
         """Yield the rows of the portion in curve order, one block at a time."""
-        return iter(self.along.split(PARTITION_BLOCK))
+        return iter(self.curve_rows.split(PARTITION_BLOCK))
 
-    def join(self, rows: Tensor) -> Tensor:
+    def all_gather(self, rows: Tensor) -> Tensor:
         """Combine the arrays of all portions into one, in index order, in every process."""
-        joined = self.team.join(rows)
-        return torch.empty_like(joined).index_copy_(0, torch.cat(self.by_owner), joined)
+        joined = self.communicator.all_gather(rows)
+        return torch.empty_like(joined).index_copy_(0, torch.cat(self.indices_by_rank), joined)
 
 
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:

@@ -30,13 +30,13 @@ class RuleSettings(NamedTuple):
     """Relevancy from cosines to prompts [..., Q] and to negatives [..., B], and the temperature."""
     threshold: float
     """Relevancy above which a Gaussian is selected."""
-    compares: bool
+    needs_negatives: bool
     """True if the rule needs negative prompts."""
-    least: float
+    no_direction: float
     """Relevancy of a Gaussian without a direction, which no threshold selects."""
-    faintest: float
+    display_min: float
     """Lower end of the color scale: renders do not distinguish smaller relevancies."""
-    present: float | None
+    presence_limit: float | None
     """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
 
 
@@ -59,19 +59,29 @@ def _namespace(array: Any) -> Any:
 
 RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
     # The threshold suits the color encoder, and queries without further information: see `query.question.make_query`.
-    "cosine": RuleSettings(lambda positive, _, __: positive, 0.5, False, least=0.0, faintest=0.0, present=None),
+    "cosine": RuleSettings(
+        lambda positive, _, __: positive, 0.5, False, no_direction=0.0, display_min=0.0, presence_limit=None
+    ),
     # A softmax over two values is a sigmoid of their difference. It falls as the negative rises, so the minimum is at
     # the largest negative. At the threshold, prompt and negative are equally similar.
     "lerf": RuleSettings(
         lambda positive, negative, temperature: _sigmoid(temperature * _margin(positive, negative)),
-        0.5, True, least=0.0, faintest=0.0, present=_PRESENT,
+        0.5,
+        True,
+        no_direction=0.0,
+        display_min=0.0,
+        presence_limit=_PRESENT,
     ),
     # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
     "margin": RuleSettings(
         lambda positive, negative, _: _margin(positive, negative),
-        0.02, True, least=-2.0, faintest=-0.1, present=math.log(_PRESENT / (1 - _PRESENT)) / TEMPERATURE,
+        0.02,
+        True,
+        no_direction=-2.0,
+        display_min=-0.1,
+        presence_limit=math.log(_PRESENT / (1 - _PRESENT)) / TEMPERATURE,
     ),
-}  # fmt: skip
+}
 
 
 def relevancy(
@@ -100,7 +110,7 @@ def relevancy(
     """
     if rule not in RELEVANCY_RULES:
         raise InputError(f"rule must be one of {', '.join(RELEVANCY_RULES)}; got {rule!r}")
-    if RELEVANCY_RULES[rule].compares and (negative is None or negative.shape[-1] == 0):
+    if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(
             f'rule "{rule}" compares with negative prompts; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
@@ -117,4 +127,4 @@ def gaussian_relevancy(
         ValueError: as `relevancy`.
     """
     values = relevancy(positive, negative, rule=rule)
-    return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].least)
+    return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)

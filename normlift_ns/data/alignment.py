@@ -48,9 +48,9 @@ class Alignment(NamedTuple):
     """Mean over the views, in dB."""
     worst: tuple[str, float]
     """Name of the image with the lowest PSNR, and that PSNR in dB."""
-    in_view: float
+    visible_fraction: float
     """Largest fraction of the Gaussians that lies in one view, in 0..1."""
-    grey_psnr: float
+    mean_color_psnr: float
     """PSNR in dB of a constant image in the mean color of each image."""
     focal_factor: float
     """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; otherwise 1."""
@@ -89,12 +89,12 @@ def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
     return [_mean_psnr(render, views, factor) for factor in factors]
 
 
-def alignment_warning(match: Alignment, *, own_cameras: bool) -> str | None:
+def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     """Return a warning in whole sentences, or None if renders and images agree.
 
     Args:
         match: result of `measure_alignment`.
-        own_cameras: whether, as far as the files show, the splat was trained with these cameras.
+        trained_cameras: whether, as far as the files show, the splat was trained with these cameras.
     Raises:
         ValueError: if Gaussians and cameras are unrelated.
     """
@@ -104,20 +104,22 @@ def alignment_warning(match: Alignment, *, own_cameras: bool) -> str | None:
         "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
         "training images; another --rasterize-mode or --background"
     )
-    if own_cameras:
+    if trained_cameras:
         causes = (
             "Likely causes: the images, their exposure or transforms.json have changed since the training, or the "
             "training was stopped early"
         )
-    if match.in_view < _MIN_VISIBLE:
+    if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            f"The cameras do not look at this splat: at most {match.in_view:.2%} of its Gaussians are in any of three "
+            f"The cameras do not look at this splat: at most {match.visible_fraction:.2%} of its Gaussians are in "
+            "any of three "
             f"training views. {causes}. --check False lifts anyway."
         )
-    if match.psnr < match.grey_psnr and not own_cameras:
+    if match.psnr < match.mean_color_psnr and not trained_cameras:
         raise InputError(
             f"The splat does not show what its images show: renders from three of the cameras are further from the "
-            f"images ({match.psnr:.1f} dB) than their mean color is ({match.grey_psnr:.1f} dB). {causes}. --check "
+            f"images ({match.psnr:.1f} dB) than their mean color is ({match.mean_color_psnr:.1f} dB). {causes}. "
+            "--check "
             "False lifts anyway."
         )
     if match.focal_factor != 1.0:

@@ -24,7 +24,7 @@ class CameraFile(NamedTuple):
     """The file, or the folder of the COLMAP reconstruction."""
     folder: Path
     """Folder of the dataset."""
-    base: Path
+    names_root: Path
     """Folder that image names are relative to."""
     to_splat: WorldTransform | None
     """Transform to the splat's world, from --world-transform."""
@@ -76,11 +76,11 @@ def _colmap(options: SplatOptions, folder: Path, advice: str) -> CameraFile:
     if not images_dir.is_dir():
         raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
     names = [image.name for image in registered]
-    files = find_images(names, images_dir, model, advice, copies=True)
+    files = find_images(names, images_dir, model, advice, allow_copies=True)
     masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(names, options.masks)
     base = folder if images_dir.is_relative_to(folder) else images_dir.parent
     frames = [
-        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera], mask)
+        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
         for image, file, mask in zip(registered, files, masks)
     ]
     to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)

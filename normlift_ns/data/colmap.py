@@ -59,7 +59,7 @@ class ColmapCamera(NamedTuple):
     model: str
     width: int
     height: int
-    parameters: tuple[float, ...]
+    params: tuple[float, ...]
 
 
 class ColmapImage(NamedTuple):
@@ -70,7 +70,7 @@ class ColmapImage(NamedTuple):
     rotation: list[float]
     """Quaternion w, x, y, z."""
     translation: list[float]
-    camera: int
+    camera_id: int
 
 
 def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
@@ -101,9 +101,9 @@ def _check_cameras(listed: list[ColmapCamera], model: Path) -> dict[int, ColmapC
                 f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
                 f"twice, or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
             )
-        if not (np.abs(camera.parameters) < _MAX_VALUE).all():
+        if not (np.abs(camera.params) < _MAX_VALUE).all():
             raise InputError(
-                f"{model}: camera {camera.camera_id} has the parameters {camera.parameters}. Expected finite numbers "
+                f"{model}: camera {camera.camera_id} has the parameters {camera.params}. Expected finite numbers "
                 f"below {_MAX_VALUE:g}. {_ADVICE}"
             )
         cameras[camera.camera_id] = camera
@@ -119,9 +119,9 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
                 f"{model}: the pose of {image.name} is not finite, or its quaternion is zero: {image.rotation} "
                 f"{image.translation}. {_ADVICE}"
             )
-    orphans = [image for image in images if image.camera not in cameras]
+    orphans = [image for image in images if image.camera_id not in cameras]
     if orphans or len(images) == 0:
-        problem = f"{orphans[0].name} needs camera {orphans[0].camera}, which is missing" if orphans else "no image"
+        problem = f"{orphans[0].name} needs camera {orphans[0].camera_id}, which is missing" if orphans else "no image"
         raise InputError(
             f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected a camera "
             "for every image; copy the whole reconstruction again."
@@ -142,7 +142,7 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
             f"{', '.join(_INTRINSICS)}. Undistort the images with: colmap image_undistorter, train the scene on those, "
             "and give that folder."
         )
-    fx, fy, cx, cy, distortion = _INTRINSICS[camera.model](*camera.parameters)
+    fx, fy, cx, cy, distortion = _INTRINSICS[camera.model](*camera.params)
     return Intrinsics(fx, fy, cx, cy, camera.width, camera.height, **distortion)
 
 

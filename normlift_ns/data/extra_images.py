@@ -78,7 +78,7 @@ def add_extra_images(scene: _Scene, cameras: Path, images: Path | None = None) -
             "new and old images, or omit --add-images."
         )
     world = _align(extended, known)
-    base = scene.photographs if isinstance(scene, SplatScene) else scene.location.folder
+    base = scene.names_root if isinstance(scene, SplatScene) else scene.location.folder
     placed = [replace(frame, name=relative_name(frame.file, base)) for frame in transform_frames(new, world)]
     placed.sort(key=lambda frame: frame.file)  # the order in which a lifted run reads them
     identity = {**scene.identity, "added_photographs": [frame.name for frame in placed]}
@@ -96,7 +96,7 @@ def _with_frames(scene: _Scene, frames: Sequence[Frame]) -> _Scene:
     if isinstance(scene, SplatScene):
         train = sorted([*scene.train.frames, *frames], key=lambda frame: frame.file)
         return replace(scene, train=ImageViews(train, scene.background), remarks=remarks)
-    return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, added=tuple(frames))
+    return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, extra_frames=tuple(frames))
 
 
 def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:

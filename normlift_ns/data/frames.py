@@ -162,7 +162,7 @@ class WorldTransform(NamedTuple):
     transform: Float[np.ndarray, "3 4"]
     """Rotation and translation."""
     scale: float
-    single: bool = False
+    float32: bool = False
     """Whether to compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its
     training."""
 
@@ -215,7 +215,7 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
         raise InputError(f"{source} lists {duplicates[0]} more than once. Expected every image once.")
 
 
-def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *, copies: bool) -> list[Path]:
+def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *, allow_copies: bool) -> list[Path]:
     """Find images by name in a folder, and return their absolute paths.
 
     Args:
@@ -223,12 +223,12 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
         folder: folder to search.
         source: the camera file, for error messages.
         advice: what to do about missing images, for error messages.
-        copies: whether the folder may hold copies of the images, which need not lie in the same subfolders.
+        allow_copies: whether the folder may hold copies of the images, which need not lie in the same subfolders.
     Raises:
         FileNotFoundError: if images are missing; the message counts them and names the first.
         ValueError: if two names lead to one file.
     """
-    found = [_find_file(folder, name, copies=copies) for name in names]
+    found = [_find_file(folder, name, copies=allow_copies) for name in names]
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
@@ -312,7 +312,7 @@ def rescale_intrinsics(frame: Frame, source: Path) -> Frame:
 
 def transform_frames(frames: Sequence[Frame], world: WorldTransform) -> list[Frame]:
     """Return the frames with poses in another world."""
-    dtype = torch.float32 if world.single else torch.float64
+    dtype = torch.float32 if world.float32 else torch.float64
     poses = torch.from_numpy(np.array([[*frame.pose, [0, 0, 0, 1]] for frame in frames])).to(dtype)
     poses = torch.from_numpy(world.transform).to(dtype) @ poses  # one product, as in nerfstudio, for equal rounding
     poses[:, :, 3] *= world.scale

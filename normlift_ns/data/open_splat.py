@@ -52,7 +52,7 @@ class SplatScene:
     step: int
     """Training step; 0 if unknown."""
     runs_dir: Path
-    photographs: Path
+    names_root: Path
     """Folder that image names are relative to."""
     identity: Mapping[str, Any]
     rasterize_mode: RasterizeMode
@@ -162,7 +162,7 @@ def _scene(
         path,
         file.step,
         Path("outputs").absolute(),
-        cameras.base,
+        cameras.names_root,
         identity,
         options.rasterize_mode or file.rasterize_mode or "classic",
         options.background,
@@ -363,9 +363,7 @@ class _Saved(msgspec.Struct):
 def save_splat(folder: Path, scene: SplatScene) -> None:
     """Write splat.json and the cameras, transforms.json, into the folder of a run."""
     write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
-    saved = _Saved(
-        scene.name, scene.rasterize_mode, scene.background_name, str(scene.photographs), dict(scene.identity)
-    )
+    saved = _Saved(scene.name, scene.rasterize_mode, scene.background_name, str(scene.names_root), dict(scene.identity))
     write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
 
 

@@ -193,7 +193,7 @@ def read_transforms(
     entries = read_transforms_entries(path)
     root = path.parent if base is None else base
     names = [relative_name(Path(frame.file_path), root) for frame in entries.frames]
-    files = find_images(names, images or root, path, advice, copies=images is not None)
+    files = find_images(names, images or root, path, advice, allow_copies=images is not None)
     if base is None:
         names = [relative_name(file, (root if images is None else images.parent).absolute()) for file in files]
     frames = [
@@ -438,7 +438,7 @@ def read_world_transform(
         matrix = matrix @ np.linalg.inv(applied)
     scale = world.scale / applied_scale
     decompose_similarity(matrix * scale + np.diag([0, 0, 0, 1 - scale]), str(path))
-    return WorldTransform(matrix[:3], scale, single=True)
+    return WorldTransform(matrix[:3], scale, float32=True)
 
 
 def _read_values(path: Path) -> Any:

@@ -42,7 +42,7 @@ class TorchCommunicator(Communicator):
     """
 
     rank: int
-    size: int
+    world_size: int
     device: torch.device
     """Device on which arrays are exchanged."""
     store: Any
@@ -52,7 +52,7 @@ class TorchCommunicator(Communicator):
     _num_divisions: int = 0
     """Number of calls of `chunks` so far."""
 
-    def join(self, rows: Tensor) -> Tensor:
+    def all_gather(self, rows: Tensor) -> Tensor:
         """See the base class."""
         counts = self._counts(len(rows))
         data = self._bytes(rows)
@@ -63,7 +63,7 @@ class TorchCommunicator(Communicator):
                 dist.broadcast(part, r)
         return _like(torch.cat(parts), rows)
 
-    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+    def gather(self, rows: Tensor) -> list[Tensor] | None:
         """See the base class."""
         counts, data = self._counts(len(rows)), self._bytes(rows)
         if self.rank > 0:
@@ -71,14 +71,14 @@ class TorchCommunicator(Communicator):
                 dist.send(data, 0)
             return None
         parts = [rows]
-        for r in range(1, self.size):
+        for r in range(1, self.world_size):
             part = data.new_empty(counts[r], *data.shape[1:])
             if part.numel() > 0:
                 dist.recv(part, r)
             parts.append(_like(part, rows))
         return parts
 
-    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+    def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """See the base class."""
         sent_counts = torch.tensor([len(part) for part in parts], device=self.device)
         counts = torch.empty_like(sent_counts)
@@ -88,42 +88,42 @@ class TorchCommunicator(Communicator):
         dist.all_to_all_single(received, sent, counts.tolist(), sent_counts.tolist())
         return list(_like(received, parts[0]).split(counts.tolist()))
 
-    def add(self, values: Tensor) -> Tensor:
+    def all_reduce(self, values: Tensor) -> Tensor:
         """See the base class."""
         total = values.to(self.device, copy=True)
         dist.all_reduce(total)
         return total.to(values.device)
 
-    def spread(self, values: Tensor) -> Tensor:
+    def broadcast(self, values: Tensor) -> Tensor:
         """See the base class."""
         data = self._bytes(values)
         if data.numel() > 0:
             dist.broadcast(data, 0)
         return _like(data, values).reshape(values.shape)
 
-    def tell(self, value: Any) -> Any:
+    def broadcast_object(self, value: Any) -> Any:
         """See the base class."""
-        return self.tell_all(value if self.rank == 0 else None)[0]
+        return self.all_gather_object(value if self.rank == 0 else None)[0]
 
-    def tell_all(self, value: Any) -> list[Any]:
+    def all_gather_object(self, value: Any) -> list[Any]:
         """See the base class."""
         encoded = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
-        text = bytes(self.join(encoded).numpy())
+        text = bytes(self.all_gather(encoded).numpy())
         result = []
         for count in self._counts(len(encoded)):
             result.append(json.loads(text[:count]))
             text = text[count:]
         return result
 
-    def chunks(self, count: int) -> Iterator[int]:
+    def claim_chunks(self, count: int) -> Iterator[int]:
         """Yield the items of this process's part, then those of others that nobody has claimed in the directory."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
-        first = count * self.rank // self.size
+        first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:
             if try_claim(self._folder, f"{key}{index}", after=0) is not None:
                 yield index
 
-    def counted(self, report: ProgressCallback) -> ProgressCallback:
+    def aggregate_progress(self, report: ProgressCallback) -> ProgressCallback:
         """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
         previous: dict[str, int] = {}
 
@@ -137,7 +137,7 @@ class TorchCommunicator(Communicator):
         return report_total
 
     @contextmanager
-    def shares(self, folder: Path) -> Iterator[None]:
+    def shared_folder(self, folder: Path) -> Iterator[None]:
         """Provide a context in which `chunks` can be called.
 
         Args:
@@ -149,11 +149,12 @@ class TorchCommunicator(Communicator):
             for leftover in folder.glob("team-*"):  # from processes that were killed
                 if time.time() - leftover.stat().st_mtime > _STALE_SECONDS:
                     shutil.rmtree(leftover, ignore_errors=True)
-        self._folder = folder / f"team-{self.tell(uuid4().hex)}"
-        creators = sum(self.tell_all(try_claim(self._folder, "start", after=0) is not None))
+        self._folder = folder / f"team-{self.broadcast_object(uuid4().hex)}"
+        creators = sum(self.all_gather_object(try_claim(self._folder, "start", after=0) is not None))
         if creators != 1:
             raise InputError(
-                f"{creators} of {self.size} processes created the same file in {folder}, expected 1. Either they do "
+                f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. Either "
+                "they do "
                 "not share that folder, or its file system does not support exclusive creation. Give all of them the "
                 "same --output-dir, on a disk that they share"
             )
@@ -164,7 +165,7 @@ class TorchCommunicator(Communicator):
                 shutil.rmtree(self._folder, ignore_errors=True)
 
     def _counts(self, count: int) -> list[int]:
-        counts = [torch.zeros(1, dtype=torch.int64, device=self.device) for _ in range(self.size)]
+        counts = [torch.zeros(1, dtype=torch.int64, device=self.device) for _ in range(self.world_size)]
         dist.all_gather(counts, torch.tensor([count], device=self.device))
         return torch.cat(counts).tolist()
 
@@ -175,18 +176,18 @@ class TorchCommunicator(Communicator):
 
 def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
     """Return the concatenated rows of all processes, in every process."""
-    lengths = team.join(rows.offsets.diff())
-    return SparseRows(_offsets(lengths), team.join(rows.column), team.join(rows.weight))
+    lengths = team.all_gather(rows.offsets.diff())
+    return SparseRows(_offsets(lengths), team.all_gather(rows.column), team.all_gather(rows.weight))
 
 
 def gather_sparse(portion: Partition, rows: SparseRows) -> SparseRows | None:
     """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
-    parts = [portion.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
+    parts = [portion.communicator.gather(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
     if any(part is None for part in parts):
         return None
     lengths, column, weight = (torch.cat(part) for part in parts if part is not None)
     count = torch.arange(len(portion.order), device=portion.order.device)
-    row_of = torch.empty_like(portion.order).index_copy_(0, torch.cat(portion.by_owner), count)
+    row_of = torch.empty_like(portion.order).index_copy_(0, torch.cat(portion.indices_by_rank), count)
     return SparseRows(_offsets(lengths), column, weight).select_rows(row_of)
 
 
@@ -224,11 +225,11 @@ class EvidenceShard:
     """Labeled entries for every process."""
     unlabeled: list[CooEntries]
     """Unlabeled entries for every process."""
-    facts: tuple[list[int], int, int, int]
+    metadata: tuple[list[int], int, int, int]
     """Number of regions of every view, `weight_power`, `num_excluded`, and bytes per weight."""
 
     @staticmethod
-    def of(evidence: Evidence, portion: Partition) -> EvidenceShard:
+    def split(evidence: Evidence, portion: Partition) -> EvidenceShard:
         """Split the evidence of all Gaussians by owner."""
         regions = torch.bincount(evidence.region_view, minlength=evidence.num_views).tolist()
         facts = (regions, evidence.weight_power, evidence.num_excluded, evidence.rows.weight.element_size())
@@ -241,7 +242,7 @@ def _split_by_owner(rows: SparseRows, portion: Partition) -> list[CooEntries]:
     owner, row = portion.place
     gaussian = rows.row_index()
     owner_of, row_of, parts = owner[gaussian], row[gaussian], []
-    for rank in range(portion.team.size):
+    for rank in range(portion.communicator.world_size):
         entries = (owner_of == rank).nonzero().squeeze(1)
         parts.append(CooEntries(row_of[entries], rows.column[entries], rows.weight[entries]))
     return parts
@@ -256,8 +257,13 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     """
     local_chunks = sorted(pieces)
     matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
-    counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
-    gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
+    counts = [
+        [[len(parts[rank].row) for parts in matrix] for matrix in matrices]
+        for rank in range(portion.communicator.world_size)
+    ]
+    gathered = portion.communicator.all_gather_object(
+        [local_chunks, [pieces[chunk].metadata for chunk in local_chunks], counts]
+    )
     facts = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
     regions_of = [facts[chunk][0] for chunk in range(chunks)]
     widths = [(sum(counts), len(counts)) for counts in regions_of]  # columns of both matrices
@@ -266,7 +272,7 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     result = []
     for i, matrix in enumerate(matrices):
         first_column = [0, *accumulate(width[i] for width in widths)]
-        received = [counts[portion.team.rank][i] for _, _, counts in gathered]
+        received = [counts[portion.communicator.rank][i] for _, _, counts in gathered]
         result.append(
             _exchange_rows(matrix, chunks_by_rank, received, first_column, portion, _WEIGHT_DTYPES[weight_bytes])
         )
@@ -293,12 +299,15 @@ def _exchange_rows(
         first_column: first column of every chunk in the whole matrix.
         dtype: type of the weights.
     """
-    team, device = portion.team, portion.order.device
+    team, device = portion.communicator, portion.order.device
     empty = CooEntries(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, dtype)))
     arrays = []
     for name in CooEntries._fields:
-        sent = [[getattr(empty, name), *(getattr(chunk[rank], name) for chunk in entries)] for rank in range(team.size)]
-        arrays.append(team.exchange([torch.cat(parts) for parts in sent]))
+        sent = [
+            [getattr(empty, name), *(getattr(chunk[rank], name) for chunk in entries)]
+            for rank in range(team.world_size)
+        ]
+        arrays.append(team.all_to_all([torch.cat(parts) for parts in sent]))
     received: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
     for rank, chunks in enumerate(chunks_by_rank):
         parts = [array[rank].split(list(counts[rank])) for array in arrays]
@@ -325,18 +334,18 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
         lifted: lift of the portion.
         neighbors: neighbors of the portion's Gaussians, as indices in the scene.
     """
-    team, local, device = portion.team, portion.gaussians, portion.order.device
+    team, local, device = portion.communicator, portion.indices, portion.order.device
     _, row = portion.place
     wanted = torch.zeros(len(portion.order) + 1, dtype=torch.bool, device=device)  # the last element is for -1
     for index in neighbors.index.split(_RENUMBER_BLOCK):
         wanted[index.long()] = True
     wanted[local] = False
-    halo = [gaussians[wanted[gaussians]] for gaussians in portion.by_owner]
-    requested = team.exchange([row[gaussians] for gaussians in halo])
+    halo = [gaussians[wanted[gaussians]] for gaussians in portion.indices_by_rank]
+    requested = team.all_to_all([row[gaussians] for gaussians in halo])
     evidence, norm = lifted.evidence, lifted.scalars.norm
     sent = [evidence.rows.select_rows(rows.long()) for rows in requested]
     lengths, column, weight, halo_norm = (
-        torch.cat(team.exchange(parts))
+        torch.cat(team.all_to_all(parts))
         for parts in (
             [x.offsets.diff() for x in sent],
             [x.column for x in sent],

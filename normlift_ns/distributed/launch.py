@@ -40,9 +40,9 @@ class PeerFailure(NamedTuple):
 
     rank: int
     """Rank of the lost or failed process."""
-    failed: bool
+    reported: bool
     """True if the process failed and reported the error itself; False if its heartbeat stopped."""
-    place: str
+    host: str
     """Host name and process id."""
 
 
@@ -54,9 +54,9 @@ class Heartbeat:
     """Client of the shared store, for this object only."""
     rank: int
     size: int
-    last_words: Callable[[PeerFailure], None]
+    on_failure: Callable[[PeerFailure], None]
     """Callback invoked before a forced exit; it must return quickly."""
-    lost: PeerFailure | None = None
+    failure: PeerFailure | None = None
     _waiting: bool = False
     _stop: Event = field(default_factory=Event)
     _loss_detected: Event = field(default_factory=Event)
@@ -84,19 +84,19 @@ class Heartbeat:
             if well and self.rank == 0:  # the store may live in this process
                 self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
             return first
-        return self.rank == 0 or self.lost is not None
+        return self.rank == 0 or self.failure is not None
 
-    def wait_for_a_loss(self) -> PeerFailure | None:
+    def wait_for_failure(self) -> PeerFailure | None:
         """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
         self._waiting = True
         self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
-        return self.lost
+        return self.failure
 
     def _run(self) -> None:
         beats: dict[int, tuple[bytes, float]] = {}
         places = {r: "host unknown" for r in range(self.size)}
         count = 0
-        while self.lost is None and not self._stop.wait(HEARTBEAT_INTERVAL):
+        while self.failure is None and not self._stop.wait(HEARTBEAT_INTERVAL):
             count += 1
             try:
                 self.store.set(f"beat/{self.rank}", str(count))
@@ -104,8 +104,8 @@ class Heartbeat:
                     if r != self.rank:
                         self._check(r, beats, places)
             except Exception:  # a store whose process is lost raises various errors
-                self.lost = self.lost or PeerFailure(0, False, places[0])
-        if self.lost is not None and not self._stop.is_set():
+                self.failure = self.failure or PeerFailure(0, False, places[0])
+        if self.failure is not None and not self._stop.is_set():
             self._exit()
 
     def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
@@ -113,14 +113,14 @@ class Heartbeat:
             places[r] = self.store.get(f"place/{r}").decode()
         if self.store.check([f"end/{r}"]):
             if self.store.get(f"end/{r}") == b"failed":
-                self.lost = PeerFailure(r, True, places[r])
+                self.failure = PeerFailure(r, True, places[r])
             return
         beat = self.store.get(f"beat/{r}") if self.store.check([f"beat/{r}"]) else b""
         now = time.monotonic()
         if r not in beats or beats[r][0] != beat:
             beats[r] = beat, now
         elif now - beats[r][1] > HEARTBEAT_TIMEOUT:
-            self.lost = PeerFailure(r, False, places[r])
+            self.failure = PeerFailure(r, False, places[r])
 
     def _exit(self) -> None:
         self._loss_detected.set()
@@ -128,8 +128,8 @@ class Heartbeat:
             return
         os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
         if not self._stop.wait(_GRACE):
-            assert self.lost is not None
-            self.last_words(self.lost)
+            assert self.failure is not None
+            self.on_failure(self.failure)
             os._exit(1)
 
 
@@ -156,8 +156,8 @@ class PeerFailureError(RuntimeError):
     """Loss or failure of another process."""
 
     def __init__(self, lost: PeerFailure) -> None:
-        super().__init__(f"process {lost.rank} ({lost.place}) {'failed' if lost.failed else 'was lost'}")
-        self.lost = lost
+        super().__init__(f"process {lost.rank} ({lost.host}) {'failed' if lost.reported else 'was lost'}")
+        self.failure = lost
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
@@ -327,16 +327,16 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
 
     on_gpu = device != "cpu" and torch.cuda.is_available()
     store, heart = _connect(rank, size, "nccl" if on_gpu else "gloo", log)
-    team = TorchCommunicator(rank=rank, size=size, device=torch.device("cuda" if on_gpu else "cpu"), store=store)
+    team = TorchCommunicator(rank=rank, world_size=size, device=torch.device("cuda" if on_gpu else "cpu"), store=store)
     try:
         yield team
-        team.add(torch.zeros(1))  # wait until process 0 has written its files
+        team.all_reduce(torch.zeros(1))  # wait until process 0 has written its files
     except BaseException as error:
-        lost = heart.lost
+        lost = heart.failure
         if lost is None and isinstance(error, RuntimeError) and _is_network_error(error):
-            lost = heart.wait_for_a_loss()
+            lost = heart.wait_for_failure()
         if not heart.stop(well=False):  # another process has reported its error
-            lost = PeerFailure(rank, True, "this one") if lost is None else lost._replace(failed=True)
+            lost = PeerFailure(rank, True, "this one") if lost is None else lost._replace(reported=True)
         if lost is None:
             raise
         raise PeerFailureError(lost) from error
@@ -346,7 +346,7 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
 
 def describe_failure(lost: PeerFailure) -> str:
     """Return a message for the user about a lost process."""
-    return f"Process {lost.rank} ({lost.place}) was lost, so the others exit. {_RESUME_HINT}"
+    return f"Process {lost.rank} ({lost.host}) was lost, so the others exit. {_RESUME_HINT}"
 
 
 def _is_network_error(error: Exception) -> bool:

@@ -74,7 +74,7 @@ from normlift_ns.progress import ProgressCallback, StageTimer
 def run_lift_distributed(team: TorchCommunicator, request: LiftRequest) -> LiftedRun | None:
     """Run `run_lift` in several processes, all with the same request. Only rank 0 writes and returns the run."""
     prepared, stages = prepare_lift(request), StageTimer(request.report)
-    run_dir = prepared.run_dir.with_name(team.tell(prepared.run_dir.name))  # clocks differ
+    run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
     prepared = replace(prepared, run_dir=run_dir)
     if team.rank == 0:
         check_target(prepared)
@@ -85,7 +85,7 @@ def run_lift_distributed(team: TorchCommunicator, request: LiftRequest) -> Lifte
     collection = plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
     )
-    with team.shares(cache):
+    with team.shared_folder(cache):
         result = lift_scene_distributed(team, collection, device, prepared.encoder, request.report)
     return None if result is None else write_lifted_run(prepared, result, stages)
 
@@ -102,10 +102,10 @@ def lift_scene_distributed(
     Args:
         device, encoder, report: as in `lift_scene`.
     """
-    stages, facts = StageTimer(team.counted(report)), {}
+    stages, facts = StageTimer(team.aggregate_progress(report)), {}
     options, means = collection.options, collection.gaussians.means
     wait_for_kernels = start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
-    portion = Partition.of(team, means)
+    portion = Partition.from_means(team, means)
     views = _collect(team, collection, portion, stages, wait_for_kernels)
     table = views.features
     if options.consensus:
@@ -117,14 +117,14 @@ def lift_scene_distributed(
         table, facts = agreed.features, consensus_facts(options, agreed)
     with stages("lift") as step:
         lifted, own = lift_features(views, table, options)
-        check_directions(team.add(count_directions(lifted)), len(means), collection.source)
+        check_directions(team.all_reduce(count_directions(lifted)), len(means), collection.source)
         step()
     copied = None
     if options.refine:
         copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
         facts |= vote_facts
     with stages("store") as step:
-        statistics = lift_statistics(collection, views, portion.join(lifted.scalars.reliability), facts)
+        statistics = lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
         provenance = lift_provenance(collection, encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
@@ -142,14 +142,14 @@ def _collect(
     wait_for_kernels: Callable[[], None],
 ) -> ViewObservations:
     """Collect chunks of views that no other process has claimed; return all views, for this process's Gaussians."""
-    chunks = chunk_views(collection.views, team.size)
+    chunks = chunk_views(collection.views, team.world_size)
     tables: dict[int, tuple[Tensor, Tensor]] = {}
     pieces: dict[int, EvidenceShard] = {}
-    for index in team.chunks(len(chunks)):
+    for index in team.claim_chunks(len(chunks)):
         evidence, features, level = collection.collect_chunk(chunks[index], stages, wait_for_kernels)
         tables[index] = features, level
         with stages("evidence", len(collection.views)):
-            pieces[index] = EvidenceShard.of(evidence, portion)
+            pieces[index] = EvidenceShard.split(evidence, portion)
     with stages("exchange"):
         evidence = redistribute_evidence(pieces, portion, len(chunks))
         features, level = _gather_tables(tables, team)
@@ -159,12 +159,12 @@ def _collect(
 def _gather_tables(tables: Mapping[int, tuple[Tensor, Tensor]], team: Communicator) -> tuple[Tensor, Tensor]:
     """Return features and levels of the regions of all chunks, in order."""
     local_chunks = sorted(tables)
-    gathered = team.tell_all([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
+    gathered = team.all_gather_object([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
     widths = {width for (shapes,) in gathered for _, _, width in shapes}
     counts = [(chunk, count) for (shapes,) in gathered for chunk, count, _ in shapes]
     empty = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
     parts = (torch.cat([empty[i], *(tables[chunk][i] for chunk in local_chunks)]) for i in range(2))
-    features, levels = (team.join(part).split([count for _, count in counts]) for part in parts)
+    features, levels = (team.all_gather(part).split([count for _, count in counts]) for part in parts)
     order = sorted(range(len(counts)), key=lambda i: counts[i][0])
     return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])
 
@@ -178,19 +178,19 @@ def consensus_distributed(
     least: float = CHANCE_AGREEMENT,
 ) -> Consensus:
     """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes."""
-    team, (evidence, features, level) = portion.team, views
+    team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
     sampled = evidence.select_gaussians(chosen)
-    order = team.join(portion.gaussians[chosen]).argsort()
+    order = team.all_gather(portion.indices[chosen]).argsort()
     rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
-    probability = team.join(probability)[order]
+    probability = team.all_gather(probability)[order]
     if team.rank > 0:
         out = features.to(evidence.rows.weight.device, copy=True)
-        return Consensus(team.spread(out), team.tell(None), len(order))
+        return Consensus(team.broadcast(out), team.broadcast_object(None), len(order))
     sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
     result = sampled_consensus(sampled, probability, features, level=level, power=power, least=least)
-    return result._replace(features=team.spread(result.features), agreement=team.tell(result.agreement))
+    return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
 
 
 def vote_distributed(
@@ -207,22 +207,22 @@ def vote_distributed(
         For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians
         that change their direction and that have no support.
     """
-    team, gaussians = portion.team, portion.gaussians
+    team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):
-        progress = partial(stages.tell, "neighbors")
+        progress = partial(stages.report, "neighbors")
         neighbors = nearest_neighbors(means, config.k, of=gaussians, progress=progress, team=team)
     with stages("vote", len(gaussians)):
         halo = gather_halo(lifted, neighbors, portion)
-        neighbors, reliability = halo.neighbors, portion.join(lifted.scalars.reliability)[halo.gaussians]
+        neighbors, reliability = halo.neighbors, portion.all_gather(lifted.scalars.reliability)[halo.gaussians]
         own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
         rows = refine_subset(
-            portion.along, neighbors, halo.lifted.directions, reliability, config,
+            portion.curve_rows, neighbors, halo.lifted.directions, reliability, config,
             own=None if config.vote == "paper" else own,
-            width=decay_width(team.join(neighbors.spacing), config),
-            progress=partial(stages.tell, "vote"),
+            width=decay_width(team.all_gather(neighbors.spacing), config),
+            progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        counts = team.add(count_votes(copied, gaussians, neighbors, reliability))
+        counts = team.all_reduce(count_votes(copied, gaussians, neighbors, reliability))
     return copied, vote_shares(counts, len(means))
 
 
@@ -247,15 +247,15 @@ def build_field_distributed(
         provenance: as in `SemanticField.build`; only that of process 0 is used.
     """
     check_storage(storage, tolerance)
-    basis = smallest_basis(lifted, tolerance, portion.team)
+    basis = smallest_basis(lifted, tolerance, portion.communicator)
     forms = sizes_and_bounds(lifted, basis, portion)
     form = choose_form(forms, storage, tolerance)
     if form == "evidence":
         store = _gather_evidence(lifted, portion)
     else:
         store = _gather_directions(lifted, basis.rows if form == "low_rank" and basis is not None else None, portion)
-    scalars = lifted.scalars.map(portion.join)
-    sources = portion.join(portion.gaussians.int() if source is None else source.int())
+    scalars = lifted.scalars.map(portion.all_gather)
+    sources = portion.all_gather(portion.indices.int() if source is None else source.int())
     if store is None:
         return None
     facts = {"form": form, "tolerance": tolerance, "forms": forms}
@@ -273,7 +273,7 @@ def _gather_evidence(lifted: Lifted, portion: Partition) -> StoredEvidence | Non
 def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> StoredDirections | None:
     """Return the directions of all Gaussians with evidence in process 0, and None in the others."""
     coordinates, rows = encode_directions(lifted, basis, portion.blocks())
-    parts, gaussians = portion.team.deliver(coordinates), portion.team.deliver(portion.gaussians[rows])
+    parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:
         return None
     return arrange_directions(parts, gaussians, basis, len(portion.order))

@@ -258,13 +258,13 @@ def check_image(image: Tensor, name: str) -> None:
         )
 
 
-def check_files_distinct(files: Iterable[tuple[str, Path]], what: str, how: str) -> None:
+def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, remedy: str) -> None:
     """Check that no two images use the same file, with symbolic links resolved.
 
     Args:
         files: Pairs of an image name and one of its files.
-        what: Kind of file, for the message.
-        how: How to give each image its own file, for the message.
+        description: Kind of file, for the message.
+        remedy: How to give each image its own file, for the message.
     Raises:
         ValueError: If two images share a file.
     """
@@ -272,7 +272,9 @@ def check_files_distinct(files: Iterable[tuple[str, Path]], what: str, how: str)
     for name, file in files:
         other = owner.setdefault(os.path.realpath(file), name)
         if other != name:
-            raise InputError(f"images {other} and {name} would share the {what} {file}; give each its own, {how}")
+            raise InputError(
+                f"images {other} and {name} would share the {description} {file}; give each its own, {remedy}"
+            )
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:

@@ -62,7 +62,7 @@ _ADVICE = (
 class AdaptiveBatches:
     """Splits work into batches. If GPU memory cannot hold a batch, it is split, and all later batches are smaller."""
 
-    size: int
+    batch_size: int
     """Items per batch."""
 
     def __call__(self, function: Callable[[Items], _Result], items: Items) -> Iterator[_Result]:
@@ -73,14 +73,14 @@ class AdaptiveBatches:
         """
         start = 0
         while start < len(items):
-            batch = items[start : start + self.size]
+            batch = items[start : start + self.batch_size]
             results = retry_in_halves(function, batch, _ADVICE)
             if len(results) > 1:
-                self.size = -(-len(batch) // len(results))
+                self.batch_size = -(-len(batch) // len(results))
             start += len(batch)
             yield from results
 
-    def across(
+    def map_across(
         self, function: Callable[[Sequence[_Item]], Tensor], parts: Iterable[Sequence[_Item]]
     ) -> Iterator[list[Tensor]]:
         """Yield the rows of each part, one per item; one batch may hold items of several parts.
@@ -98,13 +98,13 @@ class AdaptiveBatches:
         for part in parts:
             counts.append(len(part))
             queue.extend(part)
-            while len(queue) >= self.size:
-                batch, queue = queue[: self.size], queue[self.size :]
+            while len(queue) >= self.batch_size:
+                batch, queue = queue[: self.batch_size], queue[self.batch_size :]
                 rows.extend(row for result in self(function, batch) for row in result)
             while len(counts) > 0 and counts[0] <= len(rows):
                 yield [rows.popleft() for _ in range(counts.popleft())]
         if len(queue) > 0:
-            padded = [*queue, *[queue[-1]] * (self.size - len(queue))]
+            padded = [*queue, *[queue[-1]] * (self.batch_size - len(queue))]
             rows.extend([row for result in self(function, padded) for row in result][: len(queue)])
         for count in counts:
             yield [rows.popleft() for _ in range(count)]

@@ -72,7 +72,7 @@ def _check_unchanged(pretrained: str, expected: object) -> None:
 
     path, identity = Path(pretrained), pretrained
     if path.is_file():
-        identity = file_digest(path, like=expected)
+        identity = file_digest(path, compare_to=expected)
     elif expected.startswith(_DIGEST_PREFIXES) and os.path.lexists(path):
         raise InputError(f"weight file {path}, which the run was lifted with, is not a file anymore; {remedy}")
     elif expected.startswith(_DIGEST_PREFIXES):

@@ -226,12 +226,12 @@ class CachedTextMasks:
     to, nothing is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
-        """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.find`."""
+        """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.segment`."""
         size = (image.shape[0], image.shape[1])
         paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
         packed = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
         new = [text for text, bits in packed.items() if bits is None]
-        for text, masks in zip(new, self._network.find(image, new) if len(new) > 0 else []):
+        for text, masks in zip(new, self._network.segment(image, new) if len(new) > 0 else []):
             packed[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
             with suppress(OSError):
                 _write(paths[text], "bits", bits)

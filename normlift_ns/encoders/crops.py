@@ -133,7 +133,7 @@ class NetworkEncoder(ABC):
                 crops.append(masked_crops(image, labels, regions, boxes[regions], self.network.size, self.fill))
             return self._image_rows(torch.cat(crops))
 
-        for number, rows in enumerate(self._crops.across(encode, crop_ids())):
+        for number, rows in enumerate(self._crops.map_across(encode, crop_ids())):
             del pending[number]
             yield torch.stack(rows) if len(rows) > 0 else torch.empty(0, self._width())
 

@@ -51,13 +51,13 @@ class ModelFamily:
     model_types: tuple[str, ...]
     """Values of "model_type" in config.json. Fixed-resolution SigLIP 2 models have the architecture of SigLIP and use
     its name."""
-    default: str
+    default_model: str
     """Hub name of the default model."""
-    read: Callable[[str], str]
+    preprocess_text: Callable[[str], str]
     """Prepares a text for the tokenizer."""
-    pad: str
+    pad_token: str
     """Token that pads texts to full length, if the tokenizer's configuration names none."""
-    tokenizers: tuple[str, ...]
+    tokenizer_names: tuple[str, ...]
     """Substrings of the class names of its tokenizers."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
     """Mean of pixels in 0..1, if the configuration names none."""
@@ -103,7 +103,7 @@ def family_of_tokenizer(name: str) -> ModelFamily | None:
     ('SigLIP 2', 'SigLIP')
     """
     for family in (MODEL_FAMILIES["siglip2"], MODEL_FAMILIES["siglip"], MODEL_FAMILIES["metaclip2"]):
-        if any(part in name for part in family.tokenizers):
+        if any(part in name for part in family.tokenizer_names):
             return family
     return None
 
@@ -145,12 +145,12 @@ _ACTIVATIONS = ("gelu", "gelu_fast", "gelu_new", "gelu_pytorch_tanh", "quick_gel
 class PixelNormalization:
     """Normalization of pixels, 0..255, for the network: (factor x - mean) / std."""
 
-    factor: float
+    rescale_factor: float
     mean: tuple[float, ...]
     std: tuple[float, ...]
-    side: int | None
+    image_size: int | None
     """Height and width of input images; None: unknown, or not equal."""
-    patches: int | None
+    max_patches: int | None
     """Largest number of patches of an image, if images keep their aspect ratio; else None."""
 
 
@@ -158,11 +158,11 @@ class PixelNormalization:
 class TokenPadding:
     """Padding of tokenized texts."""
 
-    pad: str
+    pad_token: str
     """Padding token."""
-    side: str
+    padding_side: str
     """left or right."""
-    masked: bool
+    attention_mask: bool
     """True if an attention mask hides padding from the network; SigLIP was trained without one."""
 
 
@@ -174,7 +174,7 @@ class ModelFolder:
     model_type: str
     text: dict[str, Any]
     vision: dict[str, Any]
-    whole: dict[str, Any]
+    sizes: dict[str, Any]
     """Network sizes, by their names in the configurations of transformers: of the text part, the vision part, and the
     whole network."""
     pixels: PixelNormalization
@@ -195,7 +195,7 @@ def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
     Raises:
         InputError: If the folder is of another architecture, incomplete or damaged.
     """
-    remedy = f"give --encoder-model the folder of a {family.title} network, or a name such as {family.default}"
+    remedy = f"give --encoder-model the folder of a {family.title} network, or a name such as {family.default_model}"
     try:
         return _read(path, family)
     except InputError as error:
@@ -327,7 +327,7 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
             f"its tokenizer {truncate_text(str(name))} belongs to {owner.title}, not {family.title}: use "
             f"--encoder {owner.name}"
         )
-    pad = settings.get("pad_token") or family.pad
+    pad = settings.get("pad_token") or family.pad_token
     pad = pad.get("content") if isinstance(pad, Mapping) else pad
     side = settings.get("padding_side", "right")
     if not isinstance(pad, str) or side not in ("left", "right"):
@@ -378,7 +378,7 @@ _MIN_VERSIONS = {"torch": (2, 6), "transformers": (4, 56)}
 def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
     """Return the hub name or folder that the options select. The default of `--encoder-model` is an OpenCLIP model and
     stands for the family's own default."""
-    return family.default if options.encoder_model == DEFAULT_MODEL else options.encoder_model
+    return family.default_model if options.encoder_model == DEFAULT_MODEL else options.encoder_model
 
 
 def check_transformers_version(family: ModelFamily) -> None:
@@ -429,7 +429,9 @@ def check_model_name(model: str, family: ModelFamily) -> None:
     Raises:
         InputError, FileNotFoundError: If it cannot.
     """
-    example = f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default}"
+    example = (
+        f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default_model}"
+    )
     if os.path.isdir(model):
         return
     if os.path.lexists(model):
@@ -476,7 +478,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
     if kind not in family.model_types:
         raise InputError(
             f"{model} has the architecture {kind!r:.60}, expected that of {family.title}, "
-            f"{' or '.join(map(repr, family.model_types))}; give --encoder-model a name such as {family.default}"
+            f"{' or '.join(map(repr, family.model_types))}; give --encoder-model a name such as {family.default_model}"
         )
     try:
         return Path(hub.snapshot_download(model, allow_patterns=[*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]))

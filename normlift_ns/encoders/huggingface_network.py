@@ -58,7 +58,7 @@ class HuggingFaceNetwork:
     @property
     def size(self) -> tuple[int, int]:
         """Height and width of the training images."""
-        count = self.folder.pixels.patches
+        count = self.folder.pixels.max_patches
         side = self.model.config.vision_config.image_size if count is None else patches_per_side(count) * self.patch
         return side, side
 
@@ -84,7 +84,7 @@ class HuggingFaceNetwork:
 
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Return pixels, 0..255, on the device, normalized for the model."""
-        normalized = (pixels.to(self.mean.dtype) * self.folder.pixels.factor - self.mean) / self.std
+        normalized = (pixels.to(self.mean.dtype) * self.folder.pixels.rescale_factor - self.mean) / self.std
         return normalized.to(self.model.logit_scale.dtype)
 
     def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
@@ -109,7 +109,7 @@ class HuggingFaceNetwork:
                 f"{vocab_size} tokens"
             )
         inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
-        if self.folder.tokens.masked:
+        if self.folder.tokens.attention_mask:
             inputs["attention_mask"] = torch.tensor([x.attention_mask for x in encoded], device=self.mean.device)
         return self._finite(lambda: _pooled_output(self.model.get_text_features(**inputs)))
 
@@ -187,7 +187,10 @@ def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: s
         InputError: If the folder is damaged or does not match its configuration, or transformers does not know the
             network.
     """
-    remedy = f"give another folder with --encoder-model, or a name such as {family.default}; or use --encoder open_clip"
+    remedy = (
+        f"give another folder with --encoder-model, or a name such as {family.default_model}; or use "
+        "--encoder open_clip"
+    )
     try:
         model = _build_model(folder)
         tokenizer = _load_tokenizer(folder, model.config.text_config)
@@ -208,12 +211,12 @@ def _build_model(folder: ModelFolder) -> Any:
     transformers = importlib.import_module("transformers")
     name = _CLASSES[folder.model_type]
     config = getattr(transformers, f"{name}Config")(
-        text_config=folder.text, vision_config=folder.vision, **folder.whole
+        text_config=folder.text, vision_config=folder.vision, **folder.sizes
     )
     vision, pixels = config.vision_config, folder.pixels
-    if pixels.side is not None and pixels.side != vision.image_size:
+    if pixels.image_size is not None and pixels.image_size != vision.image_size:
         raise InputError(
-            f"images are preprocessed to {pixels.side} pixels, but the network expects {vision.image_size}"
+            f"images are preprocessed to {pixels.image_size} pixels, but the network expects {vision.image_size}"
         )
     with torch.device("meta"):
         model = getattr(transformers, f"{name}Model")(config)
@@ -233,11 +236,11 @@ def _load_tokenizer(folder: ModelFolder, config: Any) -> Any:
     """Load the tokenizer; it pads texts to the length used in training, and truncates longer ones."""
     tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / TOKENIZER_FILE))
     length, tokens = cast(int, config.max_position_embeddings), folder.tokens
-    pad_id = tokenizer.token_to_id(tokens.pad)
+    pad_id = tokenizer.token_to_id(tokens.pad_token)
     if pad_id is None:
-        raise InputError(f"{TOKENIZER_FILE} does not contain the padding token {tokens.pad!r:.40}")
+        raise InputError(f"{TOKENIZER_FILE} does not contain the padding token {tokens.pad_token!r:.40}")
     tokenizer.enable_truncation(length)
-    tokenizer.enable_padding(direction=tokens.side, pad_id=pad_id, pad_token=tokens.pad, length=length)
+    tokenizer.enable_padding(direction=tokens.padding_side, pad_id=pad_id, pad_token=tokens.pad_token, length=length)
     return tokenizer
 
 
@@ -285,7 +288,7 @@ class HuggingFaceEncoder(NetworkEncoder):
         return self.network.width
 
     def _prepare(self, prompt: str, text: str) -> str:
-        text = self.family.read(text)
+        text = self.family.preprocess_text(text)
         if not text.strip():
             raise InputError(
                 f"text {prompt!r} has no letters or digits, and {self.family.title} ignores everything else; use words"

@@ -133,7 +133,7 @@ class TextEmbeddingFile:
         return {"kind": "text_vectors", "content": blake2b(self.file.read_bytes(), digest_size=16).hexdigest()}
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def texts(self) -> tuple[str, ...]:
         """The texts that have an embedding.
 
         Raises:
@@ -212,12 +212,12 @@ def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
             raise InputError(f"the entry {name!r} is not a valid vector: {error}") from None
 
 
-def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], where: str) -> Float32[np.ndarray, "q d"]:
+def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origin: str) -> Float32[np.ndarray, "q d"]:
     """Return one unit row per prompt.
 
     Args:
         vectors: Arrays, or tensors on the CPU.
-        where: Origin of the vectors, for the message.
+        origin: Origin of the vectors, for the message.
     Raises:
         ValueError: If a prompt has no vector.
     """
@@ -225,7 +225,7 @@ def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], where
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
             hint = f"which holds {len(vectors)}; closest: {', '.join(near)}" if len(vectors) > 0 else "which is empty"
-            raise InputError(f"text {truncate_text(prompt)!r} has no vector in {where}, {hint}")
+            raise InputError(f"text {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
@@ -267,10 +267,10 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 class CachedTextEncoder:
     """A text encoder that caches its embeddings. The key: the text, and the settings that change its vector."""
 
-    settings: Callable[[], dict[str, Any]]
+    make_identity: Callable[[], dict[str, Any]]
     """Returns every setting that changes `text`, as JSON-serializable values; weight files are identified by their
     content."""
-    network: Callable[[], TextEncoder]
+    make_encoder: Callable[[], TextEncoder]
     """Makes the encoder; called only for texts that are not cached."""
     folder: Path | None
     """Contains one safetensors file per text; created if it does not exist. If the folder is None or cannot be written
@@ -299,7 +299,7 @@ class CachedTextEncoder:
 
     @cached_property
     def _encoder(self) -> TextEncoder:
-        return self.network()
+        return self.make_encoder()
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -308,7 +308,7 @@ class CachedTextEncoder:
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
-        return self.settings()
+        return self.make_identity()
 
     def _path(self, prompt: str) -> Path | None:
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())

@@ -86,7 +86,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     return SemanticField(scalars, own, StoredDirections(rows[valid], None), manifest)
 
 
-def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
+def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> EvaluatedRun:
     """Return the run with or without consensus, unrefined.
 
     If it was lifted otherwise, it is lifted again from its regions and features.
@@ -96,7 +96,7 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
     """
     manifest, defaults = lifted.field.manifest, LiftOptions()
     options = manifest.get("options", {})
-    if options.get("consensus", False) == on:
+    if options.get("consensus", False) == enabled:
         return lifted
     power = options.get("weight_power", 1)
     gaussians = lifted.scene.gaussians.to(device)
@@ -111,7 +111,7 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
     evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
     lift_kwargs = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
     result = lift(evidence, features, **lift_kwargs)
-    if on:
+    if enabled:
         kwargs = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
         kwargs = {key: value for key, value in kwargs.items() if value is not None}
         table = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
@@ -119,16 +119,16 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
         result = replace(after, scalars=with_original_reliability(after.scalars, result.scalars))
     own = torch.arange(len(gaussians), dtype=torch.int32)
     store = StoredEvidence(evidence.to("cpu"), result.features.cpu())
-    manifest = {**manifest, "options": {**options, "consensus": on}}
+    manifest = {**manifest, "options": {**options, "consensus": enabled}}
     return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
 
 
-def lifted_batches(lifted: EvaluatedRun, device: str, *, most: int | None = None) -> Iterator[ViewBatch]:
+def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None = None) -> Iterator[ViewBatch]:
     """Yield cameras, labels and features of the views of the lift, a few views at a time.
 
     Args:
         device: device of the networks.
-        most: maximum number of views, evenly spaced. If None, use all views of the lift.
+        max_views: maximum number of views, evenly spaced. If None, use all views of the lift.
     Raises:
         ValueError: the run does not record its features, they were the user's own, or they have changed.
         FileNotFoundError: files of the features are missing.
@@ -140,9 +140,9 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, most: int | None = None
     names = set(source.available(scene.train.names))
     usable = [index for index, name in enumerate(scene.train.names) if name in names]
     used = [usable[i] for i in sample_evenly(len(usable), options.get("max_views"))]
-    used = [used[i] for i in sample_evenly(len(used), most)]
+    used = [used[i] for i in sample_evenly(len(used), max_views)]
     rendered = lifted.settings if options.get("image_source") == "render" else None
-    kwargs = {"rendered": rendered, "divisor": options.get("lift_downscale", 1), "done": lambda view: None}
+    kwargs = {"render_settings": rendered, "downscale": options.get("lift_downscale", 1), "on_view": lambda view: None}
     for chunk in chunk_views(used):
         yield observe_views(scene, chunk, source, **kwargs)
 
@@ -343,7 +343,7 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     Raises:
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
-    blocks = list(lifted_batches(lifted, device, most=_TIMED_VIEWS))
+    blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)
     timed = {"dense": lambda: _dense(job, blocks), "ours": lambda: _sparse(lifted, job, blocks)}
     seconds = {name: _median_seconds(run) for name, run in timed.items()}

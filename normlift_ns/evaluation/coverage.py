@@ -66,7 +66,7 @@ class StudyImages(NamedTuple):
     lifted: int
     names: list[str]
     cameras: list[Camera]
-    why: list[LeftOutReason]
+    reasons: list[LeftOutReason]
     """Reasons for the images that were not lifted."""
     left_out: dict[LeftOutReason, int]
 
@@ -284,14 +284,14 @@ class ReliabilityModel:
     """s_j"""
     beta: float
 
-    def expected(
+    def reliability(
         self, weight: Float64[Tensor, " m"], squared: Float64[Tensor, " m"], rows: Tensor | slice = slice(None)
     ) -> Float64[Tensor, " m"]:
         """Return R_j of some Gaussians with these sums of weights."""
         n_eff = _ratio(weight**2, squared + (FAINT * self.surface[rows]) ** 2)
         return self.norm[rows] * reliability(1.0, n_eff, self.beta)
 
-    def seen_by(self, views: SparseRows, view: int) -> ReliabilityModel:
+    def with_view(self, views: SparseRows, view: int) -> ReliabilityModel:
         """Return the evidence after lifting one of the views, too."""
         entries = views.column == view
         rows, weight = views.row_index()[entries], views.weight[entries].double()
@@ -368,17 +368,17 @@ def model_of_lift(
 
 def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
     """Return gain(v) of every view, in addition to the lifted ones."""
-    before = model.expected(model.weight, model.squared)
+    before = model.reliability(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
     for row, column, weight in zip(*parts):
         added = weight.double()
-        after = model.expected(model.weight[row] + added, model.squared[row] + added**2, row)
+        after = model.reliability(model.weight[row] + added, model.squared[row] + added**2, row)
         rise.index_add_(0, column.long(), model.surface[row] * (after - before[row]).clamp(min=0))
     return _ratio(rise, model.surface.sum())
 
 
-def choose_views(model: ReliabilityModel, views: SparseRows, count: int, most: int) -> list[tuple[int, float]]:
+def choose_views(model: ReliabilityModel, views: SparseRows, count: int, max_views: int) -> list[tuple[int, float]]:
     """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
 
     Views without any gain are not returned.
@@ -387,14 +387,14 @@ def choose_views(model: ReliabilityModel, views: SparseRows, count: int, most: i
         views: W_jv of the candidates, [N, count].
     """
     chosen: list[tuple[int, float]] = []
-    for _ in range(min(most, count)):
+    for _ in range(min(max_views, count)):
         gain = gains(model, views, count)
         gain[[view for view, _ in chosen]] = 0.0
         best = int(gain.argmax())
         if not float(gain[best]) > 0:
             break
         chosen.append((best, float(gain[best])))
-        model = model.seen_by(views, best)
+        model = model.with_view(views, best)
     return chosen
 
 
@@ -477,7 +477,7 @@ class Pose:
 class FreeSpace:
     """Free space according to the images."""
 
-    eyes: Float64[Tensor, "v 3"]
+    camera_positions: Float64[Tensor, "v 3"]
     up: Float64[Tensor, " 3"]
     cameras: Sequence[Camera]
     depths: Sequence[Float64[Tensor, "h w"]]
@@ -492,14 +492,14 @@ class FreeSpace:
     @property
     def spacing(self) -> float:
         """Median distance between a camera and its nearest neighbor; 0 for a single camera."""
-        if len(self.eyes) < 2:
+        if len(self.camera_positions) < 2:
             return 0.0
-        distance = torch.cdist(self.eyes, self.eyes).fill_diagonal_(torch.inf)
+        distance = torch.cdist(self.camera_positions, self.camera_positions).fill_diagonal_(torch.inf)
         return float(distance.amin(1).median())
 
-    def free(self, positions: Float64[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+    def is_free(self, positions: Float64[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
         """Return whether a camera could be at each position."""
-        free = (torch.cdist(positions, self.eyes) <= self.spacing + 1e-9).any(1)
+        free = (torch.cdist(positions, self.camera_positions) <= self.spacing + 1e-9).any(1)
         for camera, depth in zip(self.cameras, self.depths):
             pose, K = camera.world_to_camera.double().cpu(), camera.K.double().cpu()
             points = positions @ pose[:3, :3].T + pose[:3, 3]
@@ -533,7 +533,7 @@ def mean_depth(drawn: RasterInputs, camera: Camera) -> Float64[Tensor, "h w"]:
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
     """Return free positions that face a target: those of images, and two rings around it at the height of the
     cameras."""
-    away = space.eyes - target
+    away = space.camera_positions - target
     height = away @ space.up
     radius = (away - height[:, None] * space.up).norm(dim=1).median()
     axis = torch.eye(3, dtype=torch.float64)[space.up.abs().argmin()]
@@ -542,9 +542,11 @@ def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64
     angle = torch.arange(_RING_POSITIONS, dtype=torch.float64) * (2 * math.pi / _RING_POSITIONS)
     circle = angle.cos()[:, None] * first + angle.sin()[:, None] * second
     rings = [target + height.median() * space.up + factor * radius * circle for factor in (1.0, 0.5)]
-    positions = torch.cat([space.eyes[sample_evenly(len(space.eyes), _CAMERA_POSITIONS)], *rings])
+    positions = torch.cat(
+        [space.camera_positions[sample_evenly(len(space.camera_positions), _CAMERA_POSITIONS)], *rings]
+    )
     far = (positions - target).norm(dim=1) > _MIN_DEPTH * space.depth
-    return positions[space.free(positions) & far]
+    return positions[space.is_free(positions) & far]
 
 
 def look_at(
@@ -610,7 +612,7 @@ def suggest_poses(
             continue
         numbers = [i for i, x in enumerate(shown[:, best].tolist(), 1) if x >= MIN_SHOWN_SHARE]
         poses.append(Pose(candidates[best], share * float(gain[best]), numbers, float(shown[:, best].max())))
-        lacking = lacking.seen_by(weights, best)
+        lacking = lacking.with_view(weights, best)
     return poses
 
 
@@ -688,7 +690,7 @@ def write_poses(
     if len(written) == 0:
         return []
     old = [file for file in (path, *images) if overwrite and file not in written]
-    with atomic_files(*written, overwrite=overwrite, remove=old) as drafts:
+    with atomic_files(*written, overwrite=overwrite, delete=old) as drafts:
         for draft, content in zip(drafts, json_files.values()):
             draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf8")
         for i, (draft, pose, picture) in enumerate(zip(drafts[len(json_files) :], poses, pictures), 1):
@@ -838,7 +840,7 @@ def coverage_of(
     split = images.lifted
     lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
     model = model_of_lift(scalars, lifted, surface, beta=vote.beta)
-    reliability = model.expected(model.weight, model.squared)
+    reliability = model.reliability(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
     evidenced = GaussianEvidence(gaussians.means, scalars, surface, reliability, count_views(lifted, surface), lost)
     regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=OBJECT_MAX_GAP)
@@ -858,12 +860,12 @@ def coverage_of(
 def _suggest_images(
     images: StudyImages, model: ReliabilityModel, unused: SparseRows, parts: Sequence[Tensor]
 ) -> list[SuggestedImage]:
-    names, count = images.names[images.lifted :], len(images.why)
+    names, count = images.names[images.lifted :], len(images.reasons)
     shown = visible_shares(unused, count, model.surface, parts)
     return [
         SuggestedImage(
             names[view],
-            images.why[view],
+            images.reasons[view],
             gain,
             [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE],
         )
@@ -888,11 +890,11 @@ def _remarks(
         remarks.append(
             "No new pose shows a region better than the images do; it may be hidden from all possible positions."
         )
-    if len(images.why) == 0:
+    if len(images.reasons) == 0:
         remarks.append("No image was left out of the lift, so none can be suggested.")
     total = sum(images.left_out.values())
-    if len(images.why) < total:
-        remarks.append(f"Of {total:,} images left out, only {len(images.why)}, evenly spaced, were examined.")
+    if len(images.reasons) < total:
+        remarks.append(f"Of {total:,} images left out, only {len(images.reasons)}, evenly spaced, were examined.")
     if len(images.cameras) == 1:
         remarks.append("The scene has a single camera; the study cannot judge what this camera does not show.")
     return remarks

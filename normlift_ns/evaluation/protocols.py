@@ -214,7 +214,7 @@ class EvaluatedRun:
         """Rasterizer settings of the lift."""
         return RasterSettings.recorded(self.field.manifest)
 
-    def composited(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
+    def composite(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
         """Render values [H, W, Q] and alpha [H, W] with the settings of the lift."""
         mode = self.scene.rasterize_mode
         return render(self.scene.gaussians, camera, values, rasterize_mode=mode, settings=self.settings)
@@ -231,7 +231,7 @@ class EvaluatedRun:
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
             values = factor * self.field.query(axes, refined=self.refined).float()
             for i, camera in enumerate(cameras):
-                squares[i] += self.composited(camera, values)[0].double().square().sum(dim=2)
+                squares[i] += self.composite(camera, values)[0].double().square().sum(dim=2)
         return [square.sqrt() for square in squares]
 
     def cameras(self) -> dict[str, Camera]:
@@ -325,7 +325,7 @@ def _frame_scores(
     """Return composited scores, divided by the length of each pixel's feature if given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
     negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
-    values, _ = lifted.composited(camera, factor * lifted.cosine((*prompts, *negatives)))
+    values, _ = lifted.composite(camera, factor * lifted.cosine((*prompts, *negatives)))
     if length is not None:
         values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
     values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
@@ -354,10 +354,10 @@ def mask_truth(
     Raises:
         FileNotFoundError, ValueError: masks or names are missing or damaged; the message names the file.
     """
-    masks = LabelFiles(folder, what="instance mask", flag="--labels")
+    masks = LabelFiles(folder, description="instance mask", flag="--labels")
     images = [*scene.train.names, *scene.held_out.names]
     check_files_distinct(
-        ((name, masks.path(name)) for name in images), masks.what, "in folders named like those of the images"
+        ((name, masks.path(name)) for name in images), masks.description, "in folders named like those of the images"
     )
     names = read_names(options.names or folder.parent / "labels.json")
 
@@ -388,7 +388,7 @@ def run_masks(lifted: EvaluatedRun, truth: MaskTruth) -> Evaluation:
     """Run protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
     cosine, pixels = lifted.cosine(truth.classes), []
     for camera, exact in zip(lifted.scene.held_out.cameras, truth.held_out):
-        values, alpha = lifted.composited(camera, cosine)
+        values, alpha = lifted.composite(camera, cosine)
         pixels.append((exact, classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
     prediction, reliability = classify(cosine, lifted.valid), lifted.field.scalars.reliability
     return evaluate_masks(truth.classes, truth.gaussians, prediction, pixels, reliability, truth.settings)

@@ -292,7 +292,7 @@ class SceneSignals:
     truth: Int[Tensor, " n"] | None = None
     """Class of every Gaussian, `NO_CLASS` if it does not count. None means that it is unknown; there are no accuracies
     then."""
-    answers: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
+    predictions: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
     """Predicted class of each direction: "unrefined", and "refined" after a vote."""
 
 
@@ -345,9 +345,9 @@ def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, "
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
     right = {
-        kind: torch.cat([scene.answers[kind] == truth for scene, truth in zip(scenes, truths)])
-        for kind in scenes[0].answers
-        if all(kind in scene.answers for scene in scenes)
+        kind: torch.cat([scene.predictions[kind] == truth for scene, truth in zip(scenes, truths)])
+        for kind in scenes[0].predictions
+        if all(kind in scene.predictions for scene in scenes)
     }
     return torch.cat([truth != NO_CLASS for truth in truths]), right
 
@@ -503,19 +503,19 @@ def study_votes(
 
 
 def study_ablation(
-    runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, tell: Callable[[str], None] = lambda text: None
+    runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, warn: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
     """Evaluate the protocol with every variant, with and without consensus, no matter how the runs were lifted.
 
     Args:
-        tell: called with the reason if variants are left out, because the features of a run cannot be computed again.
+        warn: called with the reason if variants are left out, because the features of a run cannot be computed again.
     """
     rows: list[Row] = []
     for on, votes in ((False, ablation), (True, consensus_ablation)):
         try:
             variants = [with_consensus(lifted, on, device) for lifted in runs]
         except (ValueError, FileNotFoundError) as error:
-            tell(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
+            warn(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
             continue
         rows += study_votes(variants, evaluate, votes, device)
     return rows

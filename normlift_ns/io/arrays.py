@@ -39,21 +39,21 @@ class ArrayFile(NamedTuple):
     """Content of a file."""
 
     arrays: dict[str, np.ndarray]
-    facts: dict[str, str]
+    metadata: dict[str, str]
     """Metadata, without the digest."""
     digest: str | None
     """None for files of version 0.1."""
 
 
-def content_digest(parts: ArrayParts, facts: Mapping[str, str], key: str) -> str:
+def content_digest(parts: ArrayParts, metadata: Mapping[str, str], key: str) -> str:
     """Return the digest of a key, metadata, and the names, types, shapes and values of arrays.
 
     Args:
         parts: the arrays, sorted by name.
-        facts: metadata.
+        metadata: metadata.
         key: cache key, or an empty string.
     """
-    state = xxh3_128(json.dumps([key, sorted(facts.items())]).encode())
+    state = xxh3_128(json.dumps([key, sorted(metadata.items())]).encode())
     for name, dtype, shape, content in parts:
         state.update(json.dumps([name, dtype, list(shape)]).encode())
         state.update(content)
@@ -107,10 +107,10 @@ def sort_metadata(path: Path) -> None:
 
 
 def load_arrays(
-    path: Path, *, key: str = "", undigested: Collection[str] | None = None, remedy: str = "write it again"
+    path: Path, *, key: str = "", legacy_keys: Collection[str] | None = None, remedy: str = "write it again"
 ) -> ArrayFile:
     """Read a file and check its digest; see `tensors.load_tensors`."""
-    return ArrayFile(*read_safetensors(path, "np", array_digest, key, undigested, remedy))
+    return ArrayFile(*read_safetensors(path, "np", array_digest, key, legacy_keys, remedy))
 
 
 def read_metadata(path: Path) -> dict[str, str]:
@@ -193,11 +193,11 @@ _MAX_NUMBERS = 2**60
 """Largest product of the side lengths of an array, in which lengths of 0 count as 1."""
 
 
-def read_npy(path: Path, what: str) -> np.ndarray:
+def read_npy(path: Path, description: str) -> np.ndarray:
     """Return the numeric array in an NPY file, memory-mapped and read-only.
 
     Args:
-        what: Kind of file, for messages.
+        description: Kind of file, for messages.
     Raises:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is not an NPY file, holds anything but numbers, or is shorter or longer than its header
@@ -205,15 +205,15 @@ def read_npy(path: Path, what: str) -> np.ndarray:
     """
     if not os.path.isfile(path):
         if os.path.lexists(path):
-            raise InputError(f"{what} {path} is not a file; expected an NPY file as written by numpy.save")
-        raise FileNotFoundError(f"{what} {path} does not exist; check the folder")
+            raise InputError(f"{description} {path} is not a file; expected an NPY file as written by numpy.save")
+        raise FileNotFoundError(f"{description} {path} does not exist; check the folder")
     try:
         with path.open("rb") as file:
             _check_npy(file)
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{what} {path} is damaged or not an NPY file ({error}); write it again with numpy.save"
+            f"{description} {path} is damaged or not an NPY file ({error}); write it again with numpy.save"
         ) from None
 
 

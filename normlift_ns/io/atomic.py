@@ -40,24 +40,24 @@ def text_digest(text: str) -> str:
     return f"xxh3_128:{xxh3_128(text.encode()).hexdigest()}"
 
 
-def file_digest(*files: Path, like: str = "") -> str:
+def file_digest(*files: Path, compare_to: str = "") -> str:
     """Return the digest of the concatenated content of files, regardless of their paths.
 
     One core reads about 10 GB/s.
 
     Args:
-        like: digest to compare the result with. For one of version 0.1, the result uses the hash of that version, at a
-            tenth of the speed.
+        compare_to: digest to compare the result with. For one of version 0.1, the result uses the hash of that version,
+            at a tenth of the speed.
     Raises:
         OSError: a file cannot be read.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.txt"
     >>> _ = path.write_text("fox")
-    >>> file_digest(path) == text_digest("fox"), file_digest(path, like="blake2b:0")
+    >>> file_digest(path) == text_digest("fox"), file_digest(path, compare_to="blake2b:0")
     (True, 'blake2b:af951fc8e5abe85ac01baf525102361b')
     """
-    legacy = like.startswith(_LEGACY_PREFIX)
+    legacy = compare_to.startswith(_LEGACY_PREFIX)
     new_hash: Callable[[], Any] = partial(blake2b, digest_size=16) if legacy else xxh3_128
     state, block = new_hash(), bytearray(_BLOCK_SIZE)
     for file in files:
@@ -291,7 +291,7 @@ class NotWrittenError(OSError):
 
 
 @contextmanager
-def atomic_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
+def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
     """Yield a temporary path for each path; when the block ends, rename all of them to their final paths together.
 
     If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
@@ -300,7 +300,7 @@ def atomic_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] =
     Args:
         paths: the final paths, all in one folder.
         overwrite: replace existing files.
-        remove: existing files to delete in the same step.
+        delete: existing files to delete in the same step.
     Raises:
         FileExistsError: a path exists, and `overwrite` is False.
         NotWrittenError: writing failed, for instance because the disk is full; nothing has changed then.
@@ -321,7 +321,7 @@ def atomic_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] =
             if not overwrite:
                 existing = next((path for path in paths if os.path.lexists(path)), None)
             if existing is None:
-                existing = _rename_drafts(temporary, drafts, overwrite, remove)
+                existing = _rename_drafts(temporary, drafts, overwrite, delete)
         _flush_names(folder)
     if existing is not None:
         raise FileExistsError(f"{existing} exists; give another name, or allow overwriting it")
@@ -491,21 +491,21 @@ def _flush_names(folder: Path) -> None:
             os.close(descriptor)
 
 
-def refuse_existing(*paths: Path, overwrite: bool, instead: str) -> None:
+def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
     """Raise, before anything is computed, if a command would overwrite an existing file without being asked to.
 
     Args:
-        instead: flags with which the user can choose another path, for the error message.
+        flags: flags with which the user can choose another path, for the error message.
     Raises:
         FileExistsError: one of the paths exists and `overwrite` is False.
         ValueError: as in `refuse_run_files`.
     """
-    refuse_run_files(*paths, instead=instead)
+    refuse_run_files(*paths, instead=flags)
     for folder in {path.parent for path in paths}:
         complete_interrupted_writes(folder)
     for path in paths:
         if not overwrite and os.path.lexists(path):
-            raise FileExistsError(f"{path} exists; give another {instead}, or --overwrite True.")
+            raise FileExistsError(f"{path} exists; give another {flags}, or --overwrite True.")
 
 
 def safe_file_name(text: str) -> str:

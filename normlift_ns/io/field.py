@@ -81,7 +81,7 @@ class FieldArrays(NamedTuple):
     `basis`.
     """
     evidence: EvidenceArrays | None
-    digested: frozenset[str]
+    digested_files: frozenset[str]
     """Files that have a digest in the manifest, as paths relative to its folder."""
 
 
@@ -96,7 +96,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         ValueError: the file is damaged or not an evidence file.
     """
     undigested = None if key else ("format", *EVIDENCE_COUNTS)
-    arrays, metadata, digest = load_arrays(path, key=key, undigested=undigested, remedy=remedy)
+    arrays, metadata, digest = load_arrays(path, key=key, legacy_keys=undigested, remedy=remedy)
     if metadata.get("format") != EVIDENCE_FORMAT:
         raise InputError(
             f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
@@ -140,7 +140,7 @@ def read_field(folder: Path) -> FieldArrays:
     """
     manifest, digests = read_manifest(folder)
     try:
-        arrays, _, digest = load_arrays(folder / FIELD_FILE, undigested=(), remedy=LIFT_AGAIN)
+        arrays, _, digest = load_arrays(folder / FIELD_FILE, legacy_keys=(), remedy=LIFT_AGAIN)
         actual, evidence = {FIELD_FILE: digest}, None
         if manifest["form"] == "evidence":
             evidence = read_evidence(folder / EVIDENCE_FILE, remedy=LIFT_AGAIN)

@@ -60,7 +60,7 @@ class Claim:
 class ObservedPulse(NamedTuple):
     """Latest known heartbeat of a claim."""
 
-    pulse: bytes
+    heartbeat: bytes
     since: float
     """Time at which this process first read this pulse, in seconds of its own clock."""
 
@@ -104,7 +104,7 @@ def observe_pulse(before: ObservedPulse | None, pulse: bytes, now: float) -> Obs
     >>> observe_pulse(before, b"7", now=15.0).since, observe_pulse(before, b"8", now=15.0).since
     (10.0, 15.0)
     """
-    return before if before is not None and before.pulse == pulse else ObservedPulse(pulse, now)
+    return before if before is not None and before.heartbeat == pulse else ObservedPulse(pulse, now)
 
 
 def is_dead(seen: ObservedPulse, now: float, patience: float) -> bool:
@@ -186,8 +186,8 @@ def finish_claim(claim: Claim, outcome: str) -> None:
 def iter_claims(
     folder: Path,
     keys: Sequence[str],
-    at_start: Mapping[str, ClaimState],
-    patience: float,
+    initial_states: Mapping[str, ClaimState],
+    timeout: float,
     *,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
@@ -195,23 +195,23 @@ def iter_claims(
     """Yield claims of this process until every task has ended, in this process or another.
 
     The generator waits for tasks of other processes, and claims them if their heartbeat stops. The caller must work on
-    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `patience`), and call `finish_claim` before it takes
+    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `timeout`), and call `finish_claim` before it takes
     the next claim.
 
     Args:
         keys: names of the tasks.
-        at_start: result of `read_claim_states` before the caller listed its tasks. Attempts that had ended by then are
-            repeated; attempts that end later are not.
-        patience: seconds without a heartbeat after which an owner counts as dead.
+        initial_states: result of `read_claim_states` before the caller listed its tasks. Attempts that had ended by
+            then are repeated; attempts that end later are not.
+        timeout: seconds without a heartbeat after which an owner counts as dead.
         clock, sleep: replacements for tests.
     Raises:
         OSError: the folder cannot be written.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
-    >>> for mine in iter_claims(folder, ["a", "b"], {}, patience=60.0):
+    >>> for mine in iter_claims(folder, ["a", "b"], {}, timeout=60.0):
     ...     finish_claim(mine, "done")
-    >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, patience=60.0))
+    >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, timeout=60.0))
     (ClaimState(number=1, outcome='done'), [])
     """
     heartbeats: dict[Claim, ObservedPulse] = {}
@@ -219,11 +219,11 @@ def iter_claims(
         now, current, waiting, mine = clock(), read_claim_states(folder), False, None
         for key in keys:
             state = current.get(key, UNCLAIMED)
-            available = is_claimable(state, at_start.get(key, UNCLAIMED))
+            available = is_claimable(state, initial_states.get(key, UNCLAIMED))
             if not available and state.outcome is None:
                 other = Claim(folder, key, state.number)
                 heartbeats[other] = observe_pulse(heartbeats.get(other), read_pulse(other), now)
-                available, waiting = is_dead(heartbeats[other], now, patience), True
+                available, waiting = is_dead(heartbeats[other], now, timeout), True
             if available and (mine := try_claim(folder, key, state.number)) is not None:
                 break
             waiting |= available  # another process claimed it first, and may die
@@ -232,7 +232,7 @@ def iter_claims(
         elif not waiting:
             return
         else:
-            sleep(min(patience / BEATS_PER_TIMEOUT, _MAX_POLL_INTERVAL))
+            sleep(min(timeout / BEATS_PER_TIMEOUT, _MAX_POLL_INTERVAL))
 
 
 # JSON Lines files: each process appends to a file of its own, and readers read all files of a folder.

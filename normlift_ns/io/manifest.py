@@ -100,22 +100,22 @@ def _read_text(path: Path) -> str:
     return path.read_bytes().decode("utf8").replace("\r\n", "\n")  # copying via Windows may change line endings
 
 
-def check_digests(folder: Path, found: Mapping[str, str | None], expected: Mapping[str, str] | None) -> None:
+def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapping[str, str] | None) -> None:
     """Raise if the files next to a manifest were not written together with it.
 
     Args:
-        found: actual digests of the files by name; None for files without a digest.
+        actual: actual digests of the files by name; None for files without a digest.
         expected: digests in the manifest. None for a manifest of version 0.1; the files must then have none either.
     Raises:
         ValueError: a file is from a different lift.
     """
-    if expected is None and set(found.values()) == {None}:
+    if expected is None and set(actual.values()) == {None}:
         warnings.warn(
             f"{folder} was written by version 0.1, without digests, so damage cannot be detected; {LIFT_AGAIN}",
             stacklevel=2,
         )
         return
-    for name, digest in found.items():
+    for name, digest in actual.items():
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
             raise InputError(

@@ -146,7 +146,7 @@ def complete_interrupted_lifts(run_dir: Path) -> None:
 
 def refuse_existing_run(run_dir: Path, overwrite: bool) -> None:
     """Raise FileExistsError if the directory exists and `overwrite` is False, or if it is not a run."""
-    refuse_existing(run_dir, overwrite=overwrite, instead="--timestamp or --output-dir")
+    refuse_existing(run_dir, overwrite=overwrite, flags="--timestamp or --output-dir")
     if os.path.lexists(run_dir) and not (run_dir / "config.yml").is_file():
         raise FileExistsError(
             f"{run_dir} is not a run (it has no config.yml), so --overwrite does not replace it; give another "

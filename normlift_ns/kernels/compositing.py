@@ -166,7 +166,7 @@ def build_cell_lists(
     unused = count
     if entries > 0:
         _pairs[launch](
-            projected.splats, order, projected.seen, unused, unused, count, unused, unused, *sizes,
+            projected.splats, order, projected.keys, unused, unused, count, unused, unused, *sizes,
             WRITE=False, **options,
         )  # fmt: skip
     ends = count.cumsum(0)
@@ -179,7 +179,7 @@ def build_cell_lists(
     if pairs > 0:
         starts = ends - count
         _pairs[launch](
-            projected.splats, order, projected.seen, starts, ends, count, cell, member, *sizes, WRITE=True, **options
+            projected.splats, order, projected.keys, starts, ends, count, cell, member, *sizes, WRITE=True, **options
         )  # fmt: skip
     cell, by_cell = cell.sort(stable=True)
     bounds = torch.arange(end + 1, dtype=dtype, device=device)

@@ -39,11 +39,11 @@ class GatheringProcesses(Protocol):
         ...
 
     @property
-    def size(self) -> int:
+    def world_size(self) -> int:
         """Number of processes."""
         ...
 
-    def join(self, rows: Tensor, /) -> Tensor:
+    def all_gather(self, rows: Tensor, /) -> Tensor:
         """Return the concatenated rows of all processes, in every process."""
         ...
 
@@ -72,14 +72,14 @@ class NearestNeighbors(NamedTuple):
     """False if the result may be wrong."""
 
 
-def build_kd_tree(points: Float32[Tensor, "n 3"], team: GatheringProcesses | None = None) -> KdTree:
+def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcesses | None = None) -> KdTree:
     """Build a tree level by level by splitting nodes at the median along their longest side.
 
     Each level needs one sort, and small nodes are sorted independently.
 
     Args:
         points: Points of the tree.
-        team: Processes with the same points. Each splits a part of the nodes, and all return the same tree.
+        communicator: Processes with the same points. Each splits a part of the nodes, and all return the same tree.
     """
     n, device = len(points), points.device
     depth = max(0, (-(-n // LEAF) - 1).bit_length())
@@ -88,18 +88,24 @@ def build_kd_tree(points: Float32[Tensor, "n 3"], team: GatheringProcesses | Non
     index[:n] = torch.arange(n, device=device)
     padded = torch.full((size, 3), torch.inf, device=device)
     padded[:n] = points
-    shared = 0 if team is None or team.size == 1 else min(depth, (team.size - 1).bit_length())
+    shared = (
+        0
+        if communicator is None or communicator.world_size == 1
+        else min(depth, (communicator.world_size - 1).bit_length())
+    )
     for level in range(shared):
         index, padded = _split(index, padded, 1 << level)
-    if team is not None and shared > 0:
-        first, last = (rank * (1 << shared) // team.size for rank in (team.rank, team.rank + 1))
+    if communicator is not None and shared > 0:
+        first, last = (
+            rank * (1 << shared) // communicator.world_size for rank in (communicator.rank, communicator.rank + 1)
+        )
         width = size >> shared
         own = slice(first * width, last * width)
         index, padded = index[own], padded[own]
         for level in range(shared, depth):
             if last > first:
                 index, padded = _split(index, padded, (last - first) << (level - shared))
-        index, padded = team.join(index), team.join(padded)
+        index, padded = communicator.all_gather(index), communicator.all_gather(padded)
     else:
         for level in range(shared, depth):
             index, padded = _split(index, padded, 1 << level)
@@ -247,25 +253,25 @@ def find_nearest(
     points: Float32[Tensor, "n 3"],
     k: int,
     *,
-    of: Int64[Tensor, " m"] | None = None,
-    done: Callable[[int], None] | None = None,
-    team: GatheringProcesses | None = None,
+    query_indices: Int64[Tensor, " m"] | None = None,
+    progress: Callable[[int], None] | None = None,
+    communicator: GatheringProcesses | None = None,
 ) -> NearestNeighbors:
     """Return the K nearest other points of all or some points.
 
     Args:
         points: Finite points.
         k: Number of neighbors in 1..MOST_NEIGHBORS.
-        of: Distinct indices of the query points, one per row of the result; None: all points.
-        done: Function called with the number of rows whose search has been launched.
-        team: Processes that call this function together with the same points, each for its own query points.
+        query_indices: Distinct indices of the query points, one per row of the result; None: all points.
+        progress: Function called with the number of rows whose search has been launched.
+        communicator: Processes that call this function together with the same points, each for its own query points.
     """
-    tree, device, wanted = build_kd_tree(points, team), points.device, k + SPARE
-    n, leaves = len(points) if of is None else len(of), len(tree.index) // LEAF
+    tree, device, wanted = build_kd_tree(points, communicator), points.device, k + SPARE
+    n, leaves = len(points) if query_indices is None else len(query_indices), len(tree.index) // LEAF
     row_of = torch.arange(len(points), dtype=torch.int32, device=device)
     query_leaves = torch.arange(-(-len(points) // LEAF), dtype=torch.int32, device=device)  # others are empty
-    if of is not None:
-        row_of = torch.full_like(row_of, -1).index_copy_(0, of, row_of[:n])
+    if query_indices is not None:
+        row_of = torch.full_like(row_of, -1).index_copy_(0, query_indices, row_of[:n])
         rows = torch.where(tree.index < 0, -1, row_of[tree.index.clamp(min=0)])
         query_leaves = (rows.view(leaves, LEAF) >= 0).any(dim=1).nonzero().squeeze(1).int()
     result = NearestNeighbors(
@@ -287,8 +293,8 @@ def find_nearest(
             LEAF=LEAF, SLOTS=SLOTS, num_warps=1,
         )  # fmt: skip
         first += len(chunk)
-        if done is not None:
-            done(first * n // len(query_leaves))
+        if progress is not None:
+            progress(first * n // len(query_leaves))
     return result._replace(certain=result.certain.bool())
 
 

@@ -46,7 +46,7 @@ class ProjectionSettings(NamedTuple):
 class ProjectedSplats(NamedTuple):
     """Visible Gaussians of some cameras."""
 
-    seen: Int64[Tensor, " m"]
+    keys: Int64[Tensor, " m"]
     """Keys gaussian * views + view, ascending."""
     splats: Float32[Tensor, "m 8"]
     """Values described at `SPLAT`."""

@@ -109,7 +109,7 @@ class NormLiftModel(SplatfactoModel):
         self.normlift = SearchPanel(self)
 
     @property
-    def on_cpu(self) -> bool:
+    def renders_on_cpu(self) -> bool:
         """True if normlift_ns renders; stock splatfacto needs CUDA."""
         return self.device.type == "cpu"
 
@@ -129,7 +129,7 @@ class NormLiftModel(SplatfactoModel):
             folder = self.config.semantics = find_field_folder(self.config.semantics)
             check_run(folder.parent)
             self.attach(resolve_field_paths(SemanticField.load(folder, self.means), folder), load_query(folder))
-        if self.on_cpu:
+        if self.renders_on_cpu:
             compile_renderer()
 
     def attach(self, semantic_field: SemanticField, question: Query | None = None) -> None:
@@ -155,9 +155,9 @@ class NormLiftModel(SplatfactoModel):
             obb_box: crop box; Gaussians outside are not drawn.
         """
         display, (camera, view) = self._display, _valid_camera(camera.to(self.device))
-        rows = self.rows_in(obb_box, display)
+        rows = self.drawn_mask(obb_box, display)
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
-        if self.on_cpu:
+        if self.renders_on_cpu:
             with without_tracer():
                 outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
@@ -171,9 +171,12 @@ class NormLiftModel(SplatfactoModel):
             return outputs
         alpha = outputs["accumulation"][:, :, 0]
         with without_tracer():
-            return {**outputs, **render_outputs(display, outputs["rgb"], scalars, alpha, by_text=self.normlift.viewed)}
+            return {
+                **outputs,
+                **render_outputs(display, outputs["rgb"], scalars, alpha, named_by_text=self.normlift.has_viewer),
+            }
 
-    def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
+    def drawn_mask(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
         """Return the mask of the Gaussians that are drawn: in the box and not hidden. None: all."""
         drawn = None if display is None else display.drawn
         if obb_box is None:
@@ -181,9 +184,9 @@ class NormLiftModel(SplatfactoModel):
         inside = obb_box.within(self.means.detach()).reshape(-1)
         return inside if drawn is None else inside & drawn
 
-    def in_sight(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
+    def ray_weights(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
         """Return the `ray_weights` of the Gaussians drawn in the last render, and 0 for all others."""
-        rows = self.rows_in(self.crop_box, self._display)
+        rows = self.drawn_mask(self.crop_box, self._display)
         weights = ray_weights(self._scene(rows), origin, direction)
         return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
 
@@ -191,7 +194,7 @@ class NormLiftModel(SplatfactoModel):
         """Return all Gaussians."""
         return self._scene(None)
 
-    def splats(self) -> TrainedSplat:
+    def splat_parameters(self) -> TrainedSplat:
         """Return the trained Gaussians, for `write_splat_ply`."""
         return TrainedSplat(dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode)
 

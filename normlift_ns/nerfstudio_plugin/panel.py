@@ -54,7 +54,7 @@ class PromptEncoder:
         """The text encoder as the only item once it is loaded; empty before."""
         self._lock = Lock()
 
-    def pose(
+    def encode_query(
         self,
         field: SemanticField,
         folder: Path | None,
@@ -153,11 +153,11 @@ class SearchPanel(PanelView):
                 state = actions.ask(state, prompts_of_query(question), question)
                 self._negatives = join_prompts(question.negatives)
                 self._set_prompts(join_prompts(question.texts))
-            self._clicks.known, self._message = {}, ""
+            self._clicks.directions, self._message = {}, ""
             self._reasons = explanation_of_run(folder, field)
             if self._widgets is not None:
                 self._widgets.negatives.value = self._negatives
-            self._show(History.of(state, lean=State.lean))
+            self._show(History.of(state, lean=State.without_caches))
 
     def close(self) -> None:
         """Drop the field, because the Gaussians are about to change."""
@@ -167,7 +167,7 @@ class SearchPanel(PanelView):
             self._history = self._reasons = None
             self._update_widgets()
 
-    def act(self, name: str, value: Any = None, client: Any = None) -> None:
+    def on_action(self, name: str, value: Any = None, client: Any = None) -> None:
         """Carry out the action of a widget; the panel shows any error.
 
         Args:
@@ -187,7 +187,7 @@ class SearchPanel(PanelView):
                 with self._lock:
                     self._act_quickly(name, value, client)
         except Exception as error:  # no error may stop the viewer
-            self.tell(describe_error(error)[0])
+            self.show_message(describe_error(error)[0])
 
     def _act_quickly(self, name: str, value: Any, client: Any) -> None:
         """Carry out an action that takes no noticeable time."""
@@ -207,19 +207,19 @@ class SearchPanel(PanelView):
             with suppress(ValueError, OSError):  # as in `open`
                 self._negatives = join_prompts(default_rule(state.space.field).negatives)
             if self._widgets is not None:
-                self._widgets.forget(self._negatives)
-            self._show(history.do(replace(actions.show_all(actions.clear(state)), did="Clear")))
+                self._widgets.reset_query_settings(self._negatives)
+            self._show(history.do(replace(actions.show_all(actions.clear(state)), action="Clear")))
         elif name == "shown" and self._widgets is not None:
-            self._show(history.do(actions.show_prompt(state, self._widgets.place(value))))
-        elif name == "refined" and state.question is not None:
-            question = replace(state.question, refined=value)
+            self._show(history.do(actions.show_prompt(state, self._widgets.prompt_index(value))))
+        elif name == "refined" and state.query is not None:
+            question = replace(state.query, refined=value)
             self._show(history.do(actions.update_query(state, question, "Refined features")))
         elif name == "colormap":
             self._colormap = value
             self._show(history)
         elif name in CLICK_MODES:
             self._clicks.arm(name, client)
-            self.tell("Click on the scene, or press Cancel or Escape to stop.")
+            self.show_message("Click on the scene, or press Cancel or Escape to stop.")
         elif name == "Cancel":
             self._cancel()
             self._update_widgets()
@@ -235,7 +235,7 @@ class SearchPanel(PanelView):
         self._turns.cancel()
         self._clicks.disarm()
         if self._reasons is not None:
-            self._reasons.forget()
+            self._reasons.clear()
 
     def _act_on_object(self, action: str, row: ObjectRow, client: Any) -> None:
         if action == "go to":
@@ -249,7 +249,7 @@ class SearchPanel(PanelView):
     def _download(self, mask: Tensor, name: str, client: Any) -> None:
         file, content, count = export_selection(self._host[0], cast(State, self.state), mask, name)
         client.send_file_download(file, content)
-        self.tell(f"Sent {file} with {count:,} Gaussians to the browser's downloads.")
+        self.show_message(f"Sent {file} with {count:,} Gaussians to the browser's downloads.")
 
     def _ask(self) -> None:
         """Ask the prompts in the text boxes."""
@@ -261,19 +261,19 @@ class SearchPanel(PanelView):
         """Run a slow task without holding a lock; the panel shows its description until it ends."""
         token = self._turns.start(description)
         self._clicks.disarm()
-        self.tell("")
+        self.show_message("")
         message = ""
         try:
             task(token)
         except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
             message = describe_error(error)[0]
         if self._turns.finish(token):
-            self.tell(message)
+            self.show_message(message)
 
     def _answer(self, token: RequestToken) -> None:
-        inputs = (self._folder, self._line, self._negatives, dict(self._clicks.known), self._widgets)
+        inputs = (self._folder, self._line, self._negatives, dict(self._clicks.directions), self._widgets)
         field = cast(State, self.state).space.field
-        result = self._asker.pose(field, *inputs, lambda: self._turns.busy != "")
+        result = self._asker.encode_query(field, *inputs, lambda: self._turns.busy != "")
         with self._lock:
             if result is not None and self._turns.finish(token) and self._history is not None:
                 state, (prompts, question) = self._history.now, result
@@ -285,7 +285,7 @@ class SearchPanel(PanelView):
     def _select_floaters(self, token: RequestToken) -> None:
         floaters = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
         with self._lock:
-            if self._history is not None and self._turns.wanted(token):
+            if self._history is not None and self._turns.is_current(token):
                 state = actions.select_floaters(self._history.now, floaters)
                 self._turns.finish(token)
                 self._message = actions.FLOATERS_HINT
@@ -295,24 +295,24 @@ class SearchPanel(PanelView):
         """Show the training images behind the selection; the search for them holds no lock."""
         state, reasons = cast(State, self.state), cast(Explanation, self._reasons)
         token = reasons.start(state)
-        self.tell("")
+        self.show_message("")
         try:
-            reasons.find(token, state)
+            reasons.compute(token, state)
         finally:
             with self._lock:
                 self._update_widgets()
 
-    def forget(self, client: Any) -> None:
+    def on_disconnect(self, client: Any) -> None:
         """Handle a disconnected browser, and stop waiting for its click."""
-        if self._clicks.forget(client):
-            self.tell("")
+        if self._clicks.on_disconnect(client):
+            self.show_message("")
 
     def _on_click(self, mode: str, origin: Tensor, direction: Tensor) -> None:
         """Handle a click: ask for everything similar, or select, add or remove the object under it."""
         try:
             device = cast(State, self.state).space.means.device
             with self._viewer.train_lock:  # a render in another thread may change which Gaussians are drawn
-                weights = self._host[0].in_sight(origin.to(device), direction.to(device))
+                weights = self._host[0].ray_weights(origin.to(device), direction.to(device))
             with self._lock:
                 history = cast("History[State]", self._history)
                 if mode != "like":
@@ -321,20 +321,20 @@ class SearchPanel(PanelView):
                     return
                 saved = load_stored_query(self._folder)
                 vector = actions.picked_direction(history.now, weights)
-                self._set_prompts(self._clicks.keep(vector, () if saved is None else saved.texts))
+                self._set_prompts(self._clicks.add_direction(vector, () if saved is None else saved.texts))
             self._ask()
         except Exception as error:  # as in `act`
-            self.tell(describe_error(error)[0])
+            self.show_message(describe_error(error)[0])
 
     def _save(self, state: State, *, replaces: bool) -> None:
         try:
-            count = store_prompts(self._folder, state, replaces=replaces)
+            count = store_prompts(self._folder, state, replace=replaces)
         except InputError:
-            self._offer_to_replace(state.question is not None)
+            self._offer_to_replace(state.query is not None)
             raise
         self._offer_to_replace(False)
         prompts = "one prompt" if count == 1 else f"{count} prompts"
-        self.tell(f"Saved. The run now stores {prompts} for ns-render to draw.")
+        self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
     def _offer_to_replace(self, visible: bool) -> None:
         if self._widgets is not None:

@@ -62,7 +62,7 @@ class ClickListener:
     def __init__(self, hit: Callable[[str, Tensor, Tensor], None]) -> None:
         self._hit = hit
         self._armed: tuple[str, Any] | None = None
-        self.known: dict[str, np.ndarray] = {}
+        self.directions: dict[str, np.ndarray] = {}
         """Directions of the clicked Gaussians, by the names of their prompts."""
 
     @property
@@ -87,14 +87,14 @@ class ClickListener:
             with suppress(Exception):  # raised by viser if the browser has just disconnected
                 armed[1].scene.remove_pointer_callback()
 
-    def forget(self, client: Any) -> bool:
+    def on_disconnect(self, client: Any) -> bool:
         """Handle a disconnected browser; return whether it waited for a click."""
         waited = self._armed is not None and self._armed[1].client_id == client.client_id
         if waited:
             self._armed = None
         return waited
 
-    def keep(self, vector: np.ndarray, taken: Iterable[str]) -> str:
+    def add_direction(self, vector: np.ndarray, taken: Iterable[str]) -> str:
         """Keep the direction of a clicked Gaussian.
 
         Args:
@@ -102,9 +102,9 @@ class ClickListener:
         Returns:
             Name of the new prompt.
         """
-        names = {*self.known, *taken}
+        names = {*self.directions, *taken}
         name = next(name for n in range(1, len(names) + 2) if (name := click_name(n)) not in names)
-        self.known[name] = vector
+        self.directions[name] = vector
         return name
 
     def _clicked(self, event: Any) -> None:
@@ -140,21 +140,21 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     lines = [escape_mdx(text) for text in (busy, clip_text(message, 400)) if text]
     selection = state.selection
     count, hidden = int(selection.sum()), 0 if state.hidden is None else int(state.hidden.sum())
-    if state.question is None and count == 0:
+    if state.query is None and count == 0:
         lines.append("No query yet.")
     else:
-        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}")
+        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}")
     faint = int((selection & ~drawn.to(selection.device)).sum())
     if faint > 0:
         lines.append(f"{faint:,} of them are never drawn or exported (opacity below 1/255).")
-    if state.answer is not None and state.from_answer and state.shown is None:
+    if state.answer is not None and state.prompts_select and state.shown is None:
         several = int((state.answer.selected.sum(dim=1) > 1).sum())
         if several > 0:
             lines.append(f"{several:,} of them are selected by several prompts.")
     if hidden > 0:
         lines.append(f"{hidden:,} Gaussians are hidden.")
-    if state.remark:
-        lines.append(escape_mdx(state.remark))
+    if state.warning:
+        lines.append(escape_mdx(state.warning))
     return "\n\n".join(lines)
 
 
@@ -173,12 +173,12 @@ def prompt_table(state: State) -> str:
         "| | prompt | selected | peak |",
         "|---|---|---|---|",
     ]
-    failed = [prompt for prompt in state.prompts if prompt.problem]  # listed first, to be noticed
-    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.problem)][:_MAX_TABLE_ROWS]
+    failed = [prompt for prompt in state.prompts if prompt.error]  # listed first, to be noticed
+    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.error)][:_MAX_TABLE_ROWS]
     for prompt in listed:
         name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.problem or prompt.text not in rows:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.problem, 120))} | |")
+        if prompt.error or prompt.text not in rows:
+            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} | |")
             continue
         count, peak, color = rows[prompt.text]
         lines.append(f"| {color_swatch(color)} | {name} | {count:,} | {peak:.2f} |")
@@ -197,7 +197,7 @@ class PanelHost(Protocol):
         """Replace what is rendered in addition to the colors."""
         ...
 
-    def in_sight(self, origin: Tensor, direction: Tensor) -> Tensor:
+    def ray_weights(self, origin: Tensor, direction: Tensor) -> Tensor:
         """Return the weights of the Gaussians on a ray."""
         ...
 
@@ -205,7 +205,7 @@ class PanelHost(Protocol):
         """Return all Gaussians."""
         ...
 
-    def splats(self) -> TrainedSplat:
+    def splat_parameters(self) -> TrainedSplat:
         """Return the trained Gaussians, for `write_splat_ply`."""
         ...
 
@@ -223,7 +223,7 @@ def export_selection(host: PanelHost, state: State, mask: Bool[Tensor, " n"], st
     """
     if not bool(mask.any()):
         raise InputError("Nothing is selected; there is nothing to download.")
-    splat = host.splats()
+    splat = host.splat_parameters()
     if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
         raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
     name = f"{safe_file_name(stem)}.ply"
@@ -233,20 +233,20 @@ def export_selection(host: PanelHost, state: State, mask: Bool[Tensor, " n"], st
         return name, path.read_bytes(), len(rows)
 
 
-def store_prompts(folder: Path | None, state: State, *, replaces: bool) -> int:
+def store_prompts(folder: Path | None, state: State, *, replace: bool) -> int:
     """Store the prompts of a state in a run, in addition to the prompts stored there.
 
     Args:
         folder: folder of the semantic field; None: the run is not stored yet.
-        replaces: replace the stored prompts.
+        replace: replace the stored prompts.
     Returns:
         Number of prompts that the run stores now.
     Raises:
         ValueError: there are no prompts to store, or the stored prompts use another rule.
     """
-    if state.question is None or folder is None:
+    if state.query is None or folder is None:
         raise InputError("No query yet; there is nothing to save.")
-    question = merge_queries(None if replaces else load_query(folder), state.question)
+    question = merge_queries(None if replace else load_query(folder), state.query)
     save_query(folder, question)
     return len(question.texts)
 
@@ -302,8 +302,8 @@ class PanelWidgets:
             self.cancel = self._button("Cancel", hint="Or press Escape. Stops a query or a pending click.")
             self.cancel.visible = False
             self.status = self._gui.add_markdown("")
-            self.poor = self._button("Leave out what is poorly evidenced")
-            self.poor.visible = False
+            self.remove_weak = self._button("Leave out what is poorly evidenced")
+            self.remove_weak.visible = False
             self._group("History", ("Undo", "Redo", "Clear"))
             self.threshold = self._slider(
                 "Threshold", MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5, "Relevancy above which Gaussians are selected."
@@ -314,11 +314,13 @@ class PanelWidgets:
             self._button("Suggested", hint="Use the threshold that the histogram suggests, its dashed line.")
             self._group("Selection", ("Hide", "Only", "All"))
             self._button("Select likely floaters", hint="Gaussians of no surface. Check them, then hide them.")
-            self.found = self._gui.add_markdown("")
+            self.prompt_table = self._gui.add_markdown("")
             self.histograms = self._gui.add_markdown("")
             self.rows = ObjectRows(self._gui, lambda action, row, event: act(action, row, event.client))
             with self._gui.add_folder("Why"):
-                self.why = self._button("Why?", hint="Show the training images that voted for the selection.")
+                self.explain_button = self._button(
+                    "Why?", hint="Show the training images that voted for the selection."
+                )
                 self.reasons = self._gui.add_markdown("")
             with self._gui.add_folder("Click in the scene"):
                 self._button("More like this", hint="Ask for everything similar to the Gaussian you click.")
@@ -348,7 +350,7 @@ class PanelWidgets:
                 )
         self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
 
-    def forget(self, negatives: str) -> None:
+    def reset_query_settings(self, negatives: str) -> None:
         """Reset the settings that apply to the next query.
 
         Args:
@@ -358,7 +360,7 @@ class PanelWidgets:
         self._reset("refined", self.refined, True)
         self.rule.value, self.negatives.value = "auto", negatives
 
-    def follow(self, state: State) -> None:
+    def show_state(self, state: State) -> None:
         """Show a state in every widget except the text boxes."""
         texts = () if state.answer is None else state.answer.texts
         options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
@@ -367,13 +369,13 @@ class PanelWidgets:
             self.shown.options = options
             self._values["shown"] = self.shown.value  # viser keeps the choice if it is a new option
         self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
-        if state.question is not None:
-            threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.question.threshold))
+        if state.query is not None:
+            threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold))
             self._set("Threshold", self.threshold, threshold)
-            self._set("Minimum reliability", self.reliability, state.question.min_reliability)
-            self._set("refined", self.refined, state.question.refined)
-        self._set("Grow", self.steps, state.steps)
-        self.poor.visible = state.remark != ""
+            self._set("Minimum reliability", self.reliability, state.query.min_reliability)
+            self._set("refined", self.refined, state.query.refined)
+        self._set("Grow", self.steps, state.grow_steps)
+        self.remove_weak.visible = state.warning != ""
 
     def explain(self, reasons: str, *, busy: bool) -> None:
         """Show the explanation of a selection.
@@ -382,11 +384,11 @@ class PanelWidgets:
             reasons: MDX, as `viewer.widgets.Explanation.content`.
             busy: whether the explanation is being computed.
         """
-        self.why.disabled = busy
+        self.explain_button.disabled = busy
         if self.reasons.content != reasons:
             self.reasons.content = reasons
 
-    def place(self, value: str) -> int | None:
+    def prompt_index(self, value: str) -> int | None:
         """Return the index of the prompt that an option of the dropdown names; None: all prompts."""
         return None if value == ALL_PROMPTS else int(value.split(":", maxsplit=1)[0]) - 1
 
@@ -476,7 +478,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField) -> Explanation
         scene = (
             open_saved_splat(run)
             if is_saved_splat(run)
-            else load_nerfstudio_scene(run / "config.yml", by_nerfstudio=_no_aria)
+            else load_nerfstudio_scene(run / "config.yml", make_nerfstudio_views=_no_aria)
         )
         return RecordedVotes(scene, field.to("cpu"), cache_folder(run))
 
@@ -503,7 +505,7 @@ class BackgroundDetails:
     ):
         self._show, self._failed, self._turns = show, failed, RequestTokens()
 
-    def follow(self, state: State) -> None:
+    def update(self, state: State) -> None:
         """Compute the details of the state that is shown now."""
         token = self._turns.start("Looking for objects.")
         Thread(target=self._compute, args=(token, state), daemon=True).start()
@@ -514,10 +516,10 @@ class BackgroundDetails:
 
     def _compute(self, token: RequestToken, state: State) -> None:
         time.sleep(_DELAY)
-        if not self._turns.wanted(token):
+        if not self._turns.is_current(token):
             return
         try:
-            objects, histograms = list_objects(state, most=MAX_OBJECT_ROWS), diagnostics_mdx(state)
+            objects, histograms = list_objects(state, max_objects=MAX_OBJECT_ROWS), diagnostics_mdx(state)
             self._show(lambda: self._turns.finish(token), objects, histograms)
         except Exception as error:  # no error may stop the viewer
             if self._turns.finish(token):
@@ -531,7 +533,7 @@ def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Boo
     position = unoccluded_viewpoint(target, scene, drawn, *view)
     with client.atomic():
         camera.position = np.array(position) * VISER_SCALE
-        camera.look_at = np.array(target.centre) * VISER_SCALE
+        camera.look_at = np.array(target.center) * VISER_SCALE
 
 
 # View of the panel: shows a state in the widgets and in the image of nerfstudio's viewer.
@@ -582,7 +584,7 @@ class PanelView(torch.nn.Module):
         self._colormap: Colormap = COLORMAPS[0]
         self._turns, self._lock = RequestTokens(), RLock()
         self._reasons: Explanation | None = None
-        self._details = BackgroundDetails(self._show_details, lambda error: self.tell(describe_error(error)[0]))
+        self._details = BackgroundDetails(self._show_details, lambda error: self.show_message(describe_error(error)[0]))
         self.control = _Control(self)
 
     @property
@@ -596,11 +598,11 @@ class PanelView(torch.nn.Module):
         return None if self.state is None else self.state.answer
 
     @property
-    def viewed(self) -> bool:
+    def has_viewer(self) -> bool:
         """True if a viewer shows the panel."""
         return self._widgets is not None
 
-    def act(self, name: str, value: Any = None, client: Any = None) -> None:
+    def on_action(self, name: str, value: Any = None, client: Any = None) -> None:
         """Carry out the action of a widget.
 
         Args:
@@ -609,19 +611,19 @@ class PanelView(torch.nn.Module):
         """
         raise NotImplementedError
 
-    def forget(self, client: Any) -> None:
+    def on_disconnect(self, client: Any) -> None:
         """Handle a disconnected browser."""
         raise NotImplementedError
 
     def install(self, viewer: Any) -> None:
         """Add the tab to a viewer."""
         self._viewer = viewer
-        self._widgets = PanelWidgets(viewer.viser_server, self.act, self._lock)
+        self._widgets = PanelWidgets(viewer.viser_server, self.on_action, self._lock)
         viewer.viser_server.on_client_disconnect(self._on_disconnect)
         ignore_closed_clients(viewer.viser_server)
         self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
         if self.state is not None:
-            self._details.follow(self.state)
+            self._details.update(self.state)
         self._update_widgets()
 
     def _on_disconnect(self, client: Any) -> None:
@@ -629,9 +631,9 @@ class PanelView(torch.nn.Module):
 
         viser calls this under its own lock, for which a thread that holds the panel's lock may be waiting.
         """
-        Thread(target=self.forget, args=(client,), daemon=True).start()
+        Thread(target=self.on_disconnect, args=(client,), daemon=True).start()
 
-    def tell(self, message: str) -> None:
+    def show_message(self, message: str) -> None:
         """Show a message above the size of the selection."""
         with self._lock:
             self._message = message
@@ -650,16 +652,16 @@ class PanelView(torch.nn.Module):
             state.answer,
             shown=state.shown,
             colormap=self._colormap,
-            chosen=state.selection,
+            selection=state.selection,
             drawn=drawn,
-            by_hand=not state.from_answer,
+            by_hand=not state.prompts_select,
         )
         self._history = history
         if self._reasons is not None:
-            self._reasons.follow(state)
+            self._reasons.update(state)
         if self._viewer is not None:
             self._select_output(display, answered=answered)
-            self._details.follow(state)
+            self._details.update(state)
         self._host[0].show(display)
         self._update_widgets()
         if self._viewer is not None:
@@ -689,12 +691,12 @@ class PanelView(torch.nn.Module):
         widgets.cancel.visible = busy != "" or self._armed()
         widgets.explain("" if self._reasons is None else self._reasons.content, busy=explaining != "")
         if state is None:
-            widgets.status.content, widgets.found.content, widgets.histograms.content = NO_FIELD_MESSAGE, "", ""
+            widgets.status.content, widgets.prompt_table.content, widgets.histograms.content = NO_FIELD_MESSAGE, "", ""
             return
-        widgets.follow(state)
-        visible = visible_mask(self._host[0].splats().parameters["opacities"])
+        widgets.show_state(state)
+        visible = visible_mask(self._host[0].splat_parameters().parameters["opacities"])
         widgets.status.content = status_mdx(state, self._message, busy, visible)
-        widgets.found.content = prompt_table(state)
+        widgets.prompt_table.content = prompt_table(state)
 
     def _show_details(self, is_current: Callable[[], bool], objects: ObjectList, histograms: str) -> None:
         with self._lock:

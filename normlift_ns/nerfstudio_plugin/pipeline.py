@@ -170,7 +170,7 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     pipeline: Any = trainer.pipeline
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
-    scene = load_nerfstudio_scene(path, by_nerfstudio=nerfstudio_views)
+    scene = load_nerfstudio_scene(path, make_nerfstudio_views=nerfstudio_views)
     source = feature_source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"

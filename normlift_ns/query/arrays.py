@@ -78,7 +78,7 @@ class ArrayField(FieldArrays):
 class QuickRun:
     """The semantic field of a run as NumPy arrays, and its text encoder."""
 
-    folder: Path
+    run_dir: Path
     """The run directory."""
     field: ArrayField
     """The field; its arrays include `means`, the centers of the Gaussians."""
@@ -88,9 +88,9 @@ class QuickRun:
     """Device of the text encoder's network, if it needs one."""
 
     @cached_property
-    def texts(self) -> LazyTextEncoder:
+    def text_encoder(self) -> LazyTextEncoder:
         """The text encoder; raises the errors of `text_encoder_for`."""
-        return text_encoder_for(self, self.device, text_cache_folder(self.folder))
+        return text_encoder_for(self, self.device, text_cache_folder(self.run_dir))
 
     def ask(self, texts: Sequence[str], **rules: Any) -> Answer:
         """Run a query for some prompts. The arrays of the answer are NumPy arrays.
@@ -99,7 +99,7 @@ class QuickRun:
             texts: the prompts.
             rules: keyword arguments of `make_query`, which also raises the errors.
         """
-        question = make_query(self, self.texts.rows, texts, **rules)
+        question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)
 
 
@@ -133,7 +133,7 @@ def open_quick(
     }
     if means is not None:
         field = field._replace(arrays={**field.arrays, "means": means})
-    elif "means" not in field.arrays or not checkpoints <= field.digested:
+    elif "means" not in field.arrays or not checkpoints <= field.digested_files:
         return None
     run = QuickRun(run_dir, field, resolve_manifest_paths(field.manifest, folder), device)
-    return with_text_source(run, vectors=text_vectors, template=text_template)
+    return with_text_source(run, text_embeddings=text_vectors, template=text_template)

@@ -307,9 +307,9 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
         ValueError: the embeddings have a different dimension than the field, or the rule needs negatives and there are
             none.
     """
-    vectors, count = question.vectors, len(question.vectors)
-    if RELEVANCY_RULES[question.rule].compares and question.negative_vectors is not None:
-        vectors = np.concatenate([vectors, question.negative_vectors])
+    vectors, count = question.embeddings, len(question.embeddings)
+    if RELEVANCY_RULES[question.rule].needs_negatives and question.negative_embeddings is not None:
+        vectors = np.concatenate([vectors, question.negative_embeddings])
     valid, cosine = field.valid(refined=question.refined), field.query(vectors, refined=question.refined)
     relevancy = gaussian_relevancy(cosine[:, :count], cosine[:, count:], valid, question.rule)
     means = means if isinstance(means, np.ndarray) else means.detach()
@@ -322,8 +322,10 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 
     If the query asks for a suggested threshold, the query in the result has that threshold.
     """
-    if question.suggest:
+    if question.suggest_threshold:
         suggested = answer.suggested_threshold
-        question = replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
+        question = replace(
+            question, threshold=question.threshold if suggested is None else suggested, suggest_threshold=False
+        )
     reliable = answer.valid & (answer.field.scalars.reliability >= question.min_reliability)
     return replace(answer, question=question, selected=(answer.relevancy > question.threshold) & reliable[:, None])

@@ -142,7 +142,7 @@ def presence_limit(rule: RelevancyRule, encoder: str | None) -> float | None:
     >>> presence_limit("lerf", "open_clip"), presence_limit("cosine", "colour"), presence_limit("cosine", "open_clip")
     (0.62, 0.9, None)
     """
-    return _COLOR_LIMIT if rule == "cosine" and encoder == "colour" else RELEVANCY_RULES[rule].present
+    return _COLOR_LIMIT if rule == "cosine" and encoder == "colour" else RELEVANCY_RULES[rule].presence_limit
 
 
 def _suggest(median: float, top: float) -> float:

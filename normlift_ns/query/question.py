@@ -34,11 +34,11 @@ class Query:
     """A query: Q prompts, their embeddings, and how they select Gaussians. Embeddings may be passed as tensors."""
 
     texts: tuple[str, ...]
-    vectors: Float[np.ndarray, "q d"]
+    embeddings: Float[np.ndarray, "q d"]
     """One embedding per prompt, of any norm > 0."""
     negatives: tuple[str, ...] = ()
     """Negative prompts, for rules that compare with them."""
-    negative_vectors: Float[np.ndarray, "b d"] | None = None
+    negative_embeddings: Float[np.ndarray, "b d"] | None = None
     rule: RelevancyRule = "cosine"
     threshold: float = 0.5
     """Relevancy above which a Gaussian is selected."""
@@ -48,13 +48,13 @@ class Query:
     """Use refined features."""
     encoder: str | None = None
     """Digest of the encoder of the embeddings, see `encoder_digest`; None if unknown."""
-    suggest: bool = False
+    suggest_threshold: bool = False
     """Replace the threshold with the one that the histogram of all relevancies suggests, when the query runs. The query
     stored in the result has that threshold.
     """
 
     def __post_init__(self) -> None:
-        for name in ("vectors", "negative_vectors"):
+        for name in ("embeddings", "negative_embeddings"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, as_numpy(value))
@@ -62,7 +62,7 @@ class Query:
 
 def make_query(
     field: HasManifest,
-    read: Callable[[Sequence[str]], Any],
+    encode: Callable[[Sequence[str]], Any],
     texts: Sequence[str],
     *,
     negatives: Sequence[str] | None = None,
@@ -74,7 +74,7 @@ def make_query(
     """Encode prompts as a query for a field.
 
     Args:
-        read: encodes prompts as one embedding each, with an encoder that fits the field.
+        encode: encodes prompts as one embedding each, with an encoder that fits the field.
         texts: the prompts.
         negatives: negative prompts (default: those of the encoder, see `default_rule`).
         rule: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
@@ -100,17 +100,17 @@ def make_query(
     if rule == "auto":
         rule = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
     if threshold is None:
-        general = RELEVANCY_RULES[rule].threshold if RELEVANCY_RULES[rule].compares else "auto"
+        general = RELEVANCY_RULES[rule].threshold if RELEVANCY_RULES[rule].needs_negatives else "auto"
         threshold = default.threshold if rule == default.rule else general
     negatives = tuple(default.negatives if negatives is None else negatives)
     return Query(
         texts=tuple(texts),
-        vectors=read(texts),
+        embeddings=encode(texts),
         negatives=negatives,
-        negative_vectors=read(negatives) if len(negatives) > 0 else None,
+        negative_embeddings=encode(negatives) if len(negatives) > 0 else None,
         rule=rule,
         threshold=RELEVANCY_RULES[rule].threshold if threshold == "auto" else threshold,
-        suggest=threshold == "auto",
+        suggest_threshold=threshold == "auto",
         min_reliability=min_reliability,
         refined=refined,
         encoder=encoder_digest(field.manifest),
@@ -164,7 +164,7 @@ def save_query(folder: Path, question: Query) -> Path:
             f"{folder} does not exist any more, so nothing was stored: the run was moved or deleted while it was open. "
             "Open it again at its new path"
         )
-    if question.suggest:
+    if question.suggest_threshold:
         raise InputError(
             'the query cannot be stored: its threshold is "auto"; run the query, and store that of its answer'
         )
@@ -172,7 +172,8 @@ def save_query(folder: Path, question: Query) -> Path:
         question.texts, question.negatives, question.refined, question.rule, question.threshold,
         question.min_reliability, question.encoder,
     )  # fmt: skip
-    vectors = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
+    rows = zip(_VECTORS, (question.embeddings, question.negative_embeddings))
+    vectors = {name: value for name, value in rows if value is not None}
     arrays = {name: value.astype(np.float32) for name, value in vectors.items()}
     try:
         encoded = msgspec.json.encode(metadata).decode()
@@ -197,7 +198,7 @@ def load_query(folder: Path) -> Query | None:
     try:
         if not os.path.isfile(path):
             raise InputError("it is not a regular file")
-        arrays, metadata, _ = load_arrays(path, undigested=(_METADATA_KEY,), remedy=_REMEDY)
+        arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
         if set(metadata) != {_METADATA_KEY}:
             raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
         question = _decode(metadata[_METADATA_KEY], arrays)
@@ -224,7 +225,7 @@ def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Query:
         raise InputError(
             f"it has {len(metadata.negatives)} negatives, but {'no' if negative is None else 'also'} negative_vectors"
         )
-    if RELEVANCY_RULES[metadata.form].compares and negative is None:
+    if RELEVANCY_RULES[metadata.form].needs_negatives and negative is None:
         raise InputError(f"rule {metadata.form!r} needs negatives, but it has none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
     _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
@@ -238,7 +239,7 @@ def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Query:
 
 def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:
     """Raise ValueError if the embeddings are from a different encoder than the field."""
-    size, field_encoder = question.vectors.shape[1], encoder_digest(manifest)
+    size, field_encoder = question.embeddings.shape[1], encoder_digest(manifest)
     if size != manifest["dimension"]:
         raise InputError(
             f"its vectors have {size} dimensions, but the features of the run have {manifest['dimension']}"

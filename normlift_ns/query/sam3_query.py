@@ -47,11 +47,11 @@ class MaskResult:
     """Fraction of each Gaussian's weight inside the masks, in 0..1; 0 for Gaussians that no voting view sees."""
     scalars: Scalars
     """Numbers of the lift with two regions per view: c_inter is the agreement of the voting views, reliability is R."""
-    voted: Bool[Tensor, " v"]
+    voting_views: Bool[Tensor, " v"]
     """Views in which the prompt was found and that vote."""
 
     @property
-    def seen(self) -> Bool[Tensor, " n"]:
+    def is_visible(self) -> Bool[Tensor, " n"]:
         """Gaussians that have weight in at least one view."""
         return self.scalars.weight > 0
 
@@ -126,20 +126,20 @@ def mask_evidence(
     cameras: Sequence[Camera],
     masks: Sequence[Bool[Tensor, "q h w"]],
     *,
-    counted: Sequence[Bool[Tensor, "h w"] | None] | None = None,
+    valid_pixels: Sequence[Bool[Tensor, "h w"] | None] | None = None,
     rasterize_mode: RasterizeMode = "classic",
     settings: RasterSettings | None = None,
     backend: BackendName = "auto",
-    done: Callable[[], None] = lambda: None,
+    on_view_done: Callable[[], None] = lambda: None,
 ) -> MaskEvidence:
     """Rasterize the evidence of the masks of Q prompts, once for all prompts.
 
     Args:
         cameras: one per view.
         masks: for each view, one mask per prompt; empty if the prompt was not found.
-        counted: for each view, the pixels to use; None for all.
+        valid_pixels: for each view, the pixels to use; None for all.
         rasterize_mode, settings, backend: as in `rasterize_evidence`.
-        done: called after each view.
+        on_view_done: called after each view.
     Raises:
         ValueError: there are no views, or the masks do not match the number or size of the cameras.
     """
@@ -157,7 +157,7 @@ def mask_evidence(
                 f"{camera.height}, {camera.width}]: one per prompt, of the size of the camera"
             )
         cells, cell_values = joint_partition(view_masks.int())
-        pixels = None if counted is None else counted[index]
+        pixels = None if valid_pixels is None else valid_pixels[index]
         labels.append(cells if pixels is None else cells.where(pixels.to(cells.device), MASKED))
         inside.append(cell_values == 1)
     evidence = rasterize_evidence(
@@ -168,7 +168,7 @@ def mask_evidence(
         rasterize_mode=rasterize_mode,
         settings=settings,
         backend=backend,
-        progress=lambda *_: done(),
+        progress=lambda *_: on_view_done(),
     )
     return MaskEvidence(evidence, torch.cat(inside, dim=1).to(scene.means.device))
 
@@ -210,12 +210,12 @@ class SegmentationResult(NamedTuple):
             "fraction": selection.fraction,
             "centroid": selection.centroid,
             "extent": selection.extent,
-            "peak": float(answer.relevancy.max()) if bool(answer.seen.any()) else None,
+            "peak": float(answer.relevancy.max()) if bool(answer.is_visible.any()) else None,
             "agreement": agreement,
             "mean_reliability": selection.mean_reliability,
             "min_reliability": self.min_reliability,
             "views": self.views,
-            "agree": [name for name, voted in zip(self.views, answer.voted.tolist()) if voted],
+            "agree": [name for name, voted in zip(self.views, answer.voting_views.tolist()) if voted],
             "found_in": [name for name, found in zip(self.views, self.found[text].tolist()) if found],
             "iou": int((mask & other).sum()) / union if union > 0 else None,
         }
@@ -223,7 +223,7 @@ class SegmentationResult(NamedTuple):
 
 def query_sam3(
     scene: Scene,
-    find: Callable[[UInt8[Tensor, "h w 3"], Sequence[str]], Bool[Tensor, "q h w"]],
+    find_masks: Callable[[UInt8[Tensor, "h w 3"], Sequence[str]], Bool[Tensor, "q h w"]],
     texts: Sequence[str],
     *,
     views: int,
@@ -235,7 +235,7 @@ def query_sam3(
     """Segment evenly spaced training views with SAM 3, and lift the masks.
 
     Args:
-        find: returns SAM 3's mask of each prompt in an image.
+        find_masks: returns SAM 3's mask of each prompt in an image.
         texts: the prompts.
         views: maximum number of views.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
@@ -249,13 +249,13 @@ def query_sam3(
     indices, masks, cameras, counted = sample_evenly(len(scene.train), views), [], [], []
     for index in indices:
         view = scene.train[index]
-        masks.append(find(view.image, texts).cpu())
+        masks.append(find_masks(view.image, texts).cpu())
         cameras.append(view.camera)
         counted.append(view.mask)
         done()
     gaussians = scene.gaussians.to(device)
     evidence = mask_evidence(
-        gaussians, cameras, masks, counted=counted, rasterize_mode=scene.rasterize_mode, settings=settings
+        gaussians, cameras, masks, valid_pixels=counted, rasterize_mode=scene.rasterize_mode, settings=settings
     )
     answers = [evidence.answer(text) for text in range(len(texts))]
     found = torch.stack([view_masks.flatten(1).any(dim=1) for view_masks in masks], dim=1)

@@ -65,20 +65,20 @@ def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
     return {**encoder_settings(SourceOptions()), "encoder": PRECOMPUTED, "text_vectors": text_vectors}
 
 
-def with_text_source(field: FieldT, *, vectors: Path | None = None, template: str | None = None) -> FieldT:
+def with_text_source(field: FieldT, *, text_embeddings: Path | None = None, template: str | None = None) -> FieldT:
     """Return the field with a different source of text embeddings.
 
     Args:
-        vectors: file of text embeddings (default: that of the lift).
+        text_embeddings: file of text embeddings (default: that of the lift).
         template: prompt template (default: that of the lift).
     """
     changes = {
-        "text_vectors": None if vectors is None else os.path.abspath(vectors),
+        "text_vectors": None if text_embeddings is None else os.path.abspath(text_embeddings),
         "text_template": template,
     }
     changes = {key: value for key, value in changes.items() if value is not None}
     encoder = {**(field.manifest.get("encoder") or {}), **changes}
-    chosen = {} if vectors is None else {_CHOSEN: True}
+    chosen = {} if text_embeddings is None else {_CHOSEN: True}
     return replace(field, manifest={**field.manifest, "encoder": encoder, **chosen})
 
 
@@ -213,7 +213,7 @@ def default_rule(field: HasManifest) -> DefaultRule:
     if kind is None:
         return _PLAIN_COSINE
     if vectors is not None:  # the file may not exist yet, if it is written together with the run
-        names = TextEmbeddingFile(Path(vectors)).names if Path(vectors).is_file() else ()
+        names = TextEmbeddingFile(Path(vectors)).texts if Path(vectors).is_file() else ()
         if not set(kind.negatives) <= set(names):
             return _PLAIN_COSINE
     return DefaultRule(kind.rule, kind.negatives, kind.threshold)

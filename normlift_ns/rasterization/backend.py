@@ -38,13 +38,13 @@ class RasterJob:
     """Exponent p of the evidence, the sums of A_ij ** p."""
 
     @cached_property
-    def world(self) -> PreparedGaussians:
+    def prepared(self) -> PreparedGaussians:
         """The drawable Gaussians, prepared for any camera."""
         return prepare_gaussians(self.scene, self.dtype)
 
-    def seen_by(self, camera: Camera) -> tuple[ProjectedGaussians, TileLists]:
+    def project(self, camera: Camera) -> tuple[ProjectedGaussians, TileLists]:
         """Project the Gaussians into a camera and list them by tile."""
-        projected = project(self.world, camera, self.settings, self.antialiased)
+        projected = project(self.prepared, camera, self.settings, self.antialiased)
         return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
 
 
@@ -110,11 +110,11 @@ class TileBackend:
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)
         (camera,), (labels,), (count,) = batch
-        return self.kernels.view_evidence(*job.seen_by(camera), labels, count, job.weight_power, job.settings)
+        return self.kernels.view_evidence(*job.project(camera), labels, count, job.weight_power, job.settings)
 
     def composite(  # noqa: D102 (as in the protocol)
         self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-        projected, tiles = job.seen_by(camera)
+        projected, tiles = job.project(camera)
         visible_values = values[projected.gaussian].to(projected.opacities.dtype)
         return self.kernels.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)

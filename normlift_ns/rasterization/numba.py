@@ -38,7 +38,7 @@ def in_flight(job: RasterJob, camera: Camera) -> int:
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
     """Return the entries of one view, bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
-    projected = project(job.world, camera, job.settings, job.antialiased)
+    projected = project(job.prepared, camera, job.settings, job.antialiased)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     size, label_map = job.settings.tile_size, labels.int().numpy()
     capacity = np.diff(offsets) * kernels.count_labels(label_map, size)
@@ -59,7 +59,7 @@ def composite(
     job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
-    projected = project(job.world, camera, job.settings, job.antialiased)
+    projected = project(job.prepared, camera, job.settings, job.antialiased)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     visible_values = values[projected.gaussian].to(job.dtype).contiguous().numpy()
     image = np.zeros((camera.height, camera.width, values.shape[1]), visible_values.dtype)

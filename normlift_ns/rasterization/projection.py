@@ -53,7 +53,7 @@ class TileLists(NamedTuple):
     """
 
     offsets: Int64[Tensor, " tiles_plus_1"]
-    members: Int32[Tensor, " intersections"]
+    indices: Int32[Tensor, " intersections"]
 
 
 def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGaussians:
@@ -240,7 +240,7 @@ def _tiles(
     for tile, (start, stop) in enumerate(pairwise(bounds)):
         if start == stop:
             continue
-        member = tiles.members[start:stop].long()
+        member = tiles.indices[start:stop].long()
         top, left = tile // across * size, tile % across * size
         rows, columns = slice(top, min(top + size, height)), slice(left, min(left + size, width))
         dx = (

@@ -98,7 +98,7 @@ def views_evidence(job: RasterJob, batch: RasterBatch, *, cull: bool = True) -> 
     key, weight = sum_equal_keys(*sums)
     # Splats are sorted by Gaussian and then by view, so ascending keys have the order of entries.
     first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0).int().to(key.device)
-    return Entries(*decode_keys(key, projected.seen, first, columns), weight, tuple(batch.num_regions))
+    return Entries(*decode_keys(key, projected.keys, first, columns), weight, tuple(batch.num_regions))
 
 
 def composite(
@@ -107,7 +107,7 @@ def composite(
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
     grid, projected, lists = project_and_bin(job, [camera])
     return kernel.composite(
-        projected.splats, lists, projected.seen, values.to(job.scene.means), grid, _limits(job.settings)
+        projected.splats, lists, projected.keys, values.to(job.scene.means), grid, _limits(job.settings)
     )
 
 

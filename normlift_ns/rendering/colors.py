@@ -54,20 +54,20 @@ def apply_colormap(
     scale: tuple[float, float],
     colors: Float[Tensor, "256 3"],
     *,
-    faint: float = MIN_OVERLAY_OPACITY,
+    min_opacity: float = MIN_OVERLAY_OPACITY,
 ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n"]]:
     """Map relevancy to a color and an opacity over the scene.
 
     Args:
         scale: relevancies of the first and the last color; relevancies outside this range are clamped.
         colors: RGB values of a colormap, in 0..1.
-        faint: opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
+        min_opacity: opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
 
     >>> apply_colormap(torch.tensor([0.0, 0.5, 1.0]), (0.0, 1.0), colormap_rgb("viridis"))[1]
     tensor([0.3500, 0.6250, 0.9000])
     """
     step = ((relevancy - scale[0]) / (scale[1] - scale[0])).clamp(0, 1)
-    return colors[(step * 255).round().long()], faint + (MAX_OVERLAY_OPACITY - faint) * step
+    return colors[(step * 255).round().long()], min_opacity + (MAX_OVERLAY_OPACITY - min_opacity) * step
 
 
 def named_color(text: str) -> tuple[float, float, float] | None:

@@ -61,7 +61,7 @@ class Display:
     (0 or 1), R, N_eff."""
     scale: tuple[float, float]
     """Relevancies at the two ends of the overlay's colors."""
-    whole: tuple[float, float]
+    map_scale: tuple[float, float]
     """Relevancies at the two ends of the colors in maps of the whole scene."""
     colormap: Colormap
     """Colormap of the overlay."""
@@ -94,7 +94,7 @@ def make_display(
     *,
     shown: int | None = None,
     colormap: Colormap = COLORMAPS[0],
-    chosen: Bool[Tensor, " n"] | None = None,
+    selection: Bool[Tensor, " n"] | None = None,
     drawn: Bool[Tensor, " n"] | None = None,
     by_hand: bool = False,
 ) -> Display:
@@ -102,14 +102,14 @@ def make_display(
 
     Args:
         shown: index of the prompt whose relevancy is in the overlay and whose selection counts; None: all prompts.
-        chosen: mask of the selection; None: the selection of the answer.
+        selection: mask of the selection; None: the selection of the answer.
         drawn: mask of the Gaussians that are drawn at all; None: all.
-        by_hand: whether `chosen` is independent of the answer.
+        by_hand: whether `selection` is independent of the answer.
     """
     scalars = field.scalars
     zeros = torch.zeros_like(scalars.reliability)
     relevancy = zeros[:, None][:, :0] if answer is None else answer.relevancy
-    explicit, selected = chosen is not None, selection_mask(answer, shown) if chosen is None else chosen
+    explicit, selected = selection is not None, selection_mask(answer, shown) if selection is None else selection
     selected = zeros.bool() if selected is None else selected
     count, shown_relevancy, selected_by_any = relevancy.shape[1], zeros, zeros
     scale = whole = (0.0, 1.0)
@@ -144,7 +144,7 @@ def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"])
 def map_scale(answer: Answer) -> tuple[float, float]:
     """Return the scale of all maps: from the rule's faintest colored relevancy to the largest of any prompt."""
     peak = color_scale(answer.relevancy[answer.valid].flatten(), answer.question.threshold)[1]
-    low = RELEVANCY_RULES[answer.question.rule].faintest
+    low = RELEVANCY_RULES[answer.question.rule].display_min
     return low, max(peak, low + _MIN_SPAN)
 
 
@@ -167,7 +167,7 @@ def render_outputs(
     image: Float[Tensor, "h w c"],
     alpha: Float[Tensor, "h w"],
     *,
-    by_text: bool = False,
+    named_by_text: bool = False,
 ) -> dict[str, Tensor]:
     """Return the semantic outputs of one image, each [H, W, 1] or [H, W, 3], the overlay last.
 
@@ -178,8 +178,8 @@ def render_outputs(
         rgb: rendered scene, 0..1.
         image: composited `display.values`.
         alpha: opacity of every pixel.
-        by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise they
-            are scalars named relevancy_0, relevancy_1, …
+        named_by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise
+            they are scalars named relevancy_0, relevancy_1, …
     """
     count, colors = display.num_prompts, colormap_rgb(display.colormap).to(rgb)
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
@@ -193,10 +193,10 @@ def render_outputs(
     if count > 0 and not display.by_hand:
         overlaid = overlay(rgb, pixel[:, :, count], selected, colors, display.scale)
         overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
-    if by_text:
+    if named_by_text:
         outputs = {
             name: add_color_bar(
-                relevancy_map(display, rgb, pixel[:, :, i], alpha), display.colormap, display.whole, text
+                relevancy_map(display, rgb, pixel[:, :, i], alpha), display.colormap, display.map_scale, text
             )
             for i, (name, text) in enumerate(zip(output_names(display.texts), display.texts))
         }
@@ -232,7 +232,9 @@ def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
-    color, opacity = apply_colormap(relevancy, display.whole, colormap_rgb(display.colormap).to(rgb), faint=0.0)
+    color, opacity = apply_colormap(
+        relevancy, display.map_scale, colormap_rgb(display.colormap).to(rgb), min_opacity=0.0
+    )
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
 
 
@@ -480,7 +482,7 @@ def save_overlays(
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
     headers = [FigureHeader.of(finding) for finding in answer]
-    sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).whole, answer.question.threshold)
+    sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
     for view, camera in cameras.items():
         image = _training_image(scene, view)
@@ -553,7 +555,7 @@ def write_masks(
     selected: Bool[Tensor, " n"],
     folder: Path,
     *,
-    rest: bool = False,
+    invert: bool = False,
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
@@ -563,7 +565,7 @@ def write_masks(
     lens distortion, on which the scene was trained.
 
     Args:
-        rest: invert the masks: 255 for pixels that show anything else, or nothing.
+        invert: invert the masks: 255 for pixels that show anything else, or nothing.
         settings: rasterizer settings; None: those of gsplat 1.4.
         overwrite: replace existing files.
     Returns:
@@ -575,7 +577,7 @@ def write_masks(
     files = mask_files(scene, folder)
     with atomic_files(*files, overwrite=overwrite) as drafts:
         for camera, draft in zip(scene.train.cameras, drafts):
-            mask = view_mask(scene, camera, selected, settings=settings) != rest
+            mask = view_mask(scene, camera, selected, settings=settings) != invert
             Image.fromarray((mask.to(torch.uint8) * 255).cpu().numpy()).save(draft, "PNG")
     return files
 

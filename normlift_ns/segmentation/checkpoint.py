@@ -44,13 +44,13 @@ class SamFamily:
     """Name of its model class in transformers."""
     config: str
     """Name of its config class in transformers."""
-    parts: tuple[str, ...]
+    config_parts: tuple[str, ...]
     """Names of the configs in its config."""
-    nested: tuple[tuple[str, str], ...] = ()
+    nested_types: tuple[tuple[str, str], ...] = ()
     """Dotted paths of more deeply nested configs, with the model type that each must have."""
-    within: str | None = None
+    config_key: str | None = None
     """Entry of config.json that holds its config; None: the whole file."""
-    since: str = "4.50"
+    min_transformers: str = "4.50"
     """First version of transformers that has it."""
 
 
@@ -59,18 +59,18 @@ _SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "det
                  "detr_decoder_config", "mask_decoder_config")  # fmt: skip
 _SAM3_NESTED = (("vision_config.backbone_config", "sam3_vit_model"), ("text_config", "clip_text_model"))
 SAM = SamFamily("SAM", "SamModel", "SamConfig", _SAM_CONFIGS)
-_SAM2 = SamFamily("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, since="4.56")
+_SAM2 = SamFamily("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, min_transformers="4.56")
 POINT_PROMPT_FAMILIES: dict[str, SamFamily] = {
     "sam": SAM,
     "sam2": _SAM2,
     "sam2_video": _SAM2,  # in the checkpoints of SAM 2 and 2.1, which contain the image model
-    "sam_hq": SamFamily("HQ-SAM", "SamHQModel", "SamHQConfig", _SAM_CONFIGS, since="4.52"),
+    "sam_hq": SamFamily("HQ-SAM", "SamHQModel", "SamHQConfig", _SAM_CONFIGS, min_transformers="4.52"),
 }
 """Networks that turn points into masks, by the model type of config.json."""
 TEXT_PROMPT_FAMILIES: dict[str, SamFamily] = {
-    "sam3": SamFamily("SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, since="5.0"),
+    "sam3": SamFamily("SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0"),
     "sam3_video": SamFamily(
-        "SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, "detector_config", since="5.0"
+        "SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, "detector_config", min_transformers="5.0"
     ),
 }
 """Networks that turn text prompts into masks, by the model type of config.json."""
@@ -123,7 +123,8 @@ def _check_supported(kind: SamFamily) -> None:
     transformers = import_transformers()
     if not hasattr(transformers, kind.model):
         raise InputError(
-            f"{kind.name} needs transformers {kind.since} or newer, found {transformers.__version__}; {_ALTERNATIVE}"
+            f"{kind.name} needs transformers {kind.min_transformers} or newer, found {transformers.__version__}; "
+            f"{_ALTERNATIVE}"
         )
 
 
@@ -177,14 +178,14 @@ def _config(folder: Path) -> dict[str, Any]:
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     """Return the parts of a config without the entries that are not sizes."""
-    own = config if kind.within is None else config.get(kind.within)
-    parts = {name: own.get(name) for name in kind.parts} if isinstance(own, Mapping) else {}
+    own = config if kind.config_key is None else config.get(kind.config_key)
+    parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
         if not isinstance(part, Mapping):
             raise InputError(f"{name} of config.json is {type(part).__name__}, expected an object")
     check_config_sizes(parts)
     sizes = _drop_other_entries(parts)
-    for path, expected in kind.nested:
+    for path, expected in kind.nested_types:
         part: Any = sizes
         for name in path.split("."):
             part = part.get(name) if isinstance(part, Mapping) else None

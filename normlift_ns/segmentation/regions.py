@@ -38,22 +38,22 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
 
 
 def read_pixels(
-    path: Path, mode: str | None = None, *, what: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS
+    path: Path, mode: str | None = None, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS
 ) -> np.ndarray:
     """Read the pixels of an image file, [H, W] or [H, W, channels], in a Pillow mode or as stored; raises as
     `read_image`.
 
     Args:
-        what: Kind of file, for messages.
+        description: Kind of file, for messages.
         formats: Accepted formats, by their Pillow names.
     """
-    with _open_image(path, what, formats) as image:
+    with _open_image(path, description, formats) as image:
         return np.array(image if mode is None else image.convert(mode))
 
 
-def read_size(path: Path, *, what: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS) -> tuple[int, int]:
+def read_size(path: Path, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS) -> tuple[int, int]:
     """Read width and height of an image file without decoding it; arguments and errors as in `read_pixels`."""
-    with _open_image(path, what, formats) as image:
+    with _open_image(path, description, formats) as image:
         return image.size
 
 
@@ -193,7 +193,7 @@ class LabelFiles:
     """Index of the map that counts in an NPY file [levels, H, W]; None for files [H, W]."""
     resample: bool = False
     """Resize maps of another size to the image's by nearest neighbor, instead of raising an error."""
-    what: str = "label map"
+    description: str = "label map"
     """Name of a file in messages."""
     flag: str = "--regions-dir"
     """Name, in messages, of the option that sets the folder."""
@@ -201,7 +201,8 @@ class LabelFiles:
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of {self.what}s {self.folder} does not exist ({self.flag}); give a folder with one PNG or NPY "
+                f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
+                "PNG or NPY "
                 "file per image"
             )
 
@@ -220,10 +221,12 @@ class LabelFiles:
     def files(self, name: str) -> tuple[Path, ...]:
         path = self.path(name)
         if not path.is_file():
-            raise InputError(f"{self.what} {path} is not a file; expected a PNG or NPY file with one value per pixel")
+            raise InputError(
+                f"{self.description} {path} is not a file; expected a PNG or NPY file with one value per pixel"
+            )
         if path.stat().st_size > _MAX_MAP_BYTES:
             raise InputError(
-                f"{self.what} {path} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}"
+                f"{self.description} {path} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}"
             )
         return (path,)
 
@@ -240,11 +243,14 @@ class LabelFiles:
             base = self.folder.joinpath(*parts[first:])
             paths = [path for suffix in _MAP_SUFFIXES if os.path.lexists(path := base.with_suffix(suffix))]
             if len(paths) > 1:
-                raise InputError(f"image {name} has two {self.what}s, {paths[0]} and {paths[1]}; keep one of them")
+                raise InputError(
+                    f"image {name} has two {self.description}s, {paths[0]} and {paths[1]}; keep one of them"
+                )
             if len(paths) == 1:
                 return paths[0]
         raise FileNotFoundError(
-            f"image {name} has no {self.what} in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
+            f"image {name} has no {self.description} in {self.folder}; expected {relative.stem}.png or "
+            f"{relative.stem}.npy"
         )
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
@@ -260,8 +266,10 @@ class LabelFiles:
         if maps.shape[1:] != (height, width):
             if not self.resample:
                 raise InputError(
-                    f"{self.what} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image {name} is "
-                    f"{width}x{height}; make {self.what}s of the size of the image (undistortion crops images), or "
+                    f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
+                    f"{name} is "
+                    f"{width}x{height}; make {self.description}s of the size of the image (undistortion crops "
+                    "images), or "
                     "resample them by nearest neighbor: --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
@@ -271,7 +279,7 @@ class LabelFiles:
         """Return the path, width and height of the label map of an image; raises as `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
-            return path, *read_size(path, what=self.what, formats=_MAP_FORMATS)
+            return path, *read_size(path, description=self.description, formats=_MAP_FORMATS)
         _, height, width = self.values(name).shape
         return path, width, height
 
@@ -284,26 +292,28 @@ class LabelFiles:
         """
         path = self.path(name)
         if path.suffix == ".npy":
-            maps = read_npy(path, self.what)
+            maps = read_npy(path, self.description)
         else:
-            maps = read_pixels(path, what=self.what, formats=_MAP_FORMATS)
+            maps = read_pixels(path, description=self.description, formats=_MAP_FORMATS)
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{self.what} {path} is a grayscale PNG with {bits} bits, whose values readers multiply by "
+                    f"{self.description} {path} is a grayscale PNG with {bits} bits, whose values readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{self.what} {path} has {maps.shape[2]} color channels; expected one value per pixel: save it as an "
+                f"{self.description} {path} has {maps.shape[2]} color channels; expected one value per pixel: save "
+                "it as an "
                 "8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
             raise InputError(
-                f"{self.what} {path} holds {maps.dtype}; expected an integer type: save it with .astype(numpy.int32)"
+                f"{self.description} {path} holds {maps.dtype}; expected an integer type: save it with "
+                ".astype(numpy.int32)"
             )
         if maps.ndim not in (2, 3) or maps.size == 0:
-            raise InputError(f"{self.what} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"{self.description} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         return maps.reshape(-1, *maps.shape[-2:])
 

@@ -90,7 +90,7 @@ class Sam3Network:
         return cls(model, tokenizer, device, precision)
 
     @torch.no_grad()
-    def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> list[TextMasks]:
+    def segment(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> list[TextMasks]:
         """Return the instances of every text prompt, on the device.
 
         Raises:
@@ -190,8 +190,8 @@ class Sam3Masks:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
-        """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.find`."""
-        masks, scores = (torch.cat(parts) for parts in zip(*self.network.find(image, self.texts)))
+        """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.segment`."""
+        masks, scores = (torch.cat(parts) for parts in zip(*self.network.segment(image, self.texts)))
         rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
         ascending = rows[torch.sort(scores[rows], stable=True).indices]
         return stack_masks(masks[ascending])[None]

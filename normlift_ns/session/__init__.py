@@ -4,7 +4,7 @@ Everything that is shown is an immutable `State`. Each action returns a new stat
 A viewer keeps one `Space` per run, and one `History` per user::
 
     space = Space(field, means)                          # shared by all users; caches answers and the neighbor graph
-    history = History.of(State(space), lean=State.lean)
+    history = History.of(State(space), lean=State.without_caches)
     prompts = read_prompts("red, round mug; sky blue", encoder.rows)      # slow: without holding a lock
     prompts, question = pose(field, prompts, encoder.rows)                # rows that cannot be encoded keep their error
     history = history.do(actions.ask(history.now, prompts, question))

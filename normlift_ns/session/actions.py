@@ -28,26 +28,26 @@ class PromptDiagnostics:
 
     text: str
     """The prompt."""
-    colour: RGB
+    color: RGB
     """Color of the prompt."""
     histogram: Histogram
     """Histogram of its relevancies."""
-    words: str
+    warning: str
     """Warning that the prompt is probably not in the scene, or that nothing reaches the threshold, with the nearest
     match; empty if a selected match stands out, or if presence cannot be judged."""
-    nearest: tuple[float, float, float] | None = None
+    nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
 
-def diagnose_prompts(state: State, *, most: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return the diagnostics of the first `most` prompts that select; none if the selection was made by hand."""
+def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
+    """Return the diagnostics of the first `max_prompts` prompts that select; none if the selection was made by hand."""
     answer = state.answer
-    if answer is None or not state.from_answer:
+    if answer is None or not state.prompts_select:
         return ()
     colors = prompt_rgb_tuples(answer.texts)
     prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
     results = []
-    for index in prompts[:most]:
+    for index in prompts[:max_prompts]:
         finding = Finding(answer, index)
         if finding.histogram is not None:
             warning = _warning(finding, finding.histogram)
@@ -87,15 +87,15 @@ def carry_threshold(state: State, question: Query) -> Query:
 
     A query that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
     """
-    previous = state.question
+    previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
         return question
-    if question.suggest and previous.threshold in (
+    if question.suggest_threshold and previous.threshold in (
         threshold_suggestion(state),
         threshold_suggestion(replace(state, shown=None)),
     ):
         return question
-    return replace(question, threshold=previous.threshold, suggest=False)
+    return replace(question, threshold=previous.threshold, suggest_threshold=False)
 
 
 def _only_clicks(question: Query) -> bool:
@@ -127,34 +127,34 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
         ValueError: the vectors differ in length from the field's.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
-    state = State(state.space, tuple(prompts), question, hidden=state.hidden, look=state.look, did=did)
+    state = State(state.space, tuple(prompts), question, hidden=state.hidden, color_mode=state.color_mode, action=did)
     return _with_suggested_threshold(state)
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
     """Answer the same prompts with another rule or other features. Selections by click and cuts are kept."""
-    return state if question is None else _with_suggested_threshold(replace(state, question=question, did=did))
+    return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
 def _with_suggested_threshold(state: State) -> State:
     """Apply the suggested threshold if the query asks for it. Invalid queries raise here."""
-    if state.answer is None or state.question is None or not state.question.suggest:
+    if state.answer is None or state.query is None or not state.query.suggest_threshold:
         return state
-    return replace(state, question=state.answer.question)
+    return replace(state, query=state.answer.question)
 
 
 def clear(state: State) -> State:
     """Remove the query and the selection. Hidden Gaussians stay hidden."""
-    return State(state.space, hidden=state.hidden, look=state.look, did="Clear")
+    return State(state.space, hidden=state.hidden, color_mode=state.color_mode, action="Clear")
 
 
 def set_threshold(state: State, value: float) -> State:
     """Set the relevancy above which Gaussians are selected, clamped to the range of the slider."""
     value = min(MAX_THRESHOLD, max(MIN_THRESHOLD, value))
-    if state.question is None or value == state.question.threshold:
+    if state.query is None or value == state.query.threshold:
         return state
-    question = replace(state.question, threshold=value, suggest=False)
-    return replace(state, question=question, did=f"Threshold {value:.3g}")
+    question = replace(state.query, threshold=value, suggest_threshold=False)
+    return replace(state, query=question, action=f"Threshold {value:.3g}")
 
 
 def use_suggested_threshold(state: State) -> State:
@@ -172,9 +172,9 @@ def use_suggested_threshold(state: State) -> State:
 def set_min_reliability(state: State, value: float) -> State:
     """Set the reliability R, clamped to 0..1, that Gaussians selected by prompts must have."""
     value = min(1.0, max(0.0, value))
-    if state.question is None or value == state.question.min_reliability:
+    if state.query is None or value == state.query.min_reliability:
         return state
-    return replace(state, question=replace(state.question, min_reliability=value), did=f"Reliability {value:.2g}")
+    return replace(state, query=replace(state.query, min_reliability=value), action=f"Reliability {value:.2g}")
 
 
 def remove_weak(state: State) -> State:
@@ -185,16 +185,16 @@ def remove_weak(state: State) -> State:
 
 def show_prompt(state: State, shown: int | None) -> State:
     """Let only one prompt of the query select; None: all of them."""
-    count = 0 if state.question is None else len(state.question.texts)
+    count = 0 if state.query is None else len(state.query.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
         return state
-    text = "all prompts" if shown is None or state.question is None else state.question.texts[shown]
-    return replace(state, shown=shown, did=f"Show {text}")
+    text = "all prompts" if shown is None or state.query is None else state.query.texts[shown]
+    return replace(state, shown=shown, action=f"Show {text}")
 
 
 def set_color_mode(state: State, name: str) -> State:
     """Set the color mode in which the viewer draws the state."""
-    return state if name == state.look else replace(state, look=name, did=f"Draw {name}")
+    return state if name == state.color_mode else replace(state, color_mode=name, action=f"Draw {name}")
 
 
 def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
@@ -235,22 +235,22 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
 
 def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> State:
     """Select these Gaussians and no others."""
-    return replace(state, from_answer=False, added=chosen, removed=None, steps=0, box=None, did=did)
+    return replace(state, prompts_select=False, added=chosen, removed=None, grow_steps=0, box=None, action=did)
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
     """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown, shrunk or cut."""
-    if state.steps != 0 or state.box is not None:
+    if state.grow_steps != 0 or state.box is not None:
         return select(state, state.selection | chosen, did)
     removed = None if state.removed is None else state.removed & ~chosen
-    return replace(state, added=chosen if state.added is None else state.added | chosen, removed=removed, did=did)
+    return replace(state, added=chosen if state.added is None else state.added | chosen, removed=removed, action=did)
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") -> State:
     """Remove Gaussians from the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
-    if state.steps != 0:
+    if state.grow_steps != 0:
         return select(state, state.selection & ~chosen, did)
-    return replace(state, removed=chosen if state.removed is None else state.removed | chosen, did=did)
+    return replace(state, removed=chosen if state.removed is None else state.removed | chosen, action=did)
 
 
 def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
@@ -269,14 +269,14 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
 def resize(state: State, steps: int) -> State:
     """Set how far the selection is grown (steps > 0) or shrunk (steps < 0), from part to whole, clamped to -10..10."""
     steps = max(-MAX_GROW_STEPS, min(MAX_GROW_STEPS, int(steps)))
-    return state if steps == state.steps else replace(state, steps=steps, did=f"Grow {steps:+d}")
+    return state if steps == state.grow_steps else replace(state, grow_steps=steps, action=f"Grow {steps:+d}")
 
 
 def set_box(state: State, box: SelectionBox | None) -> State:
     """Cut the selection with a box; None: remove the box."""
     if box == state.box:
         return state
-    return replace(state, box=box, did="Remove the box" if box is None else "Cut with the box")
+    return replace(state, box=box, action="Remove the box" if box is None else "Cut with the box")
 
 
 def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
@@ -291,7 +291,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     if not bool(chosen.any()):
         raise InputError("Nothing is selected. There is nothing to hide.")
     hidden = chosen if state.hidden is None else state.hidden | chosen
-    return replace(state, hidden=hidden, did=f"Hide {int(chosen.sum()):,}")
+    return replace(state, hidden=hidden, action=f"Hide {int(chosen.sum()):,}")
 
 
 def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
@@ -305,9 +305,9 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
         raise InputError("Nothing is selected. The screen would be blank.")
-    return replace(state, hidden=~chosen, did=f"Only {int(chosen.sum()):,}")
+    return replace(state, hidden=~chosen, action=f"Only {int(chosen.sum()):,}")
 
 
 def show_all(state: State) -> State:
     """Show all hidden Gaussians again."""
-    return state if state.hidden is None else replace(state, hidden=None, did="Show everything")
+    return state if state.hidden is None else replace(state, hidden=None, action="Show everything")

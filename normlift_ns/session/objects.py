@@ -31,7 +31,7 @@ class ObjectRow:
     """The prompt."""
     number: int
     """1 for the largest object of its prompt."""
-    colour: RGB
+    color: RGB
     """Color of the prompt, for the swatch."""
     mask: Bool[Tensor, " n"]
     """Gaussians of the object, for the buttons only, hide and export."""
@@ -39,9 +39,9 @@ class ObjectRow:
     """Number of Gaussians."""
     reliability: float
     """Mean R, weighted by the total evidence of each Gaussian."""
-    views: float
+    mean_views: float
     """Mean N_eff, weighted in the same way."""
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     """Point that the camera looks at, for the button go to."""
     extent: float
     """Diagonal of the box around the central 90 % of the Gaussian centers, for the button go to."""
@@ -55,7 +55,7 @@ class ObjectRow:
     def evidence(self) -> str:
         """Strength of the evidence in words, with R and the number of views."""
         grade = "strong" if self.reliability >= _STRONG else "fair" if self.reliability >= WEAK_RELIABILITY else "weak"
-        return f"{grade} evidence (R {self.reliability:.2f}, {self.views:.1f} views)"
+        return f"{grade} evidence (R {self.reliability:.2f}, {self.mean_views:.1f} views)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +70,15 @@ class ObjectList:
     """Number of Gaussians in components too small to be objects."""
 
 
-def list_objects(state: State, *, most: int = 12, min_size: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
+def list_objects(state: State, *, max_objects: int = 12, min_size: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
     """Return the objects that are selected and drawn, of each prompt that selects or of the selection by hand.
 
     Args:
-        most: largest number of objects listed; each prompt gets its largest object before any gets a second.
+        max_objects: largest number of objects listed; each prompt gets its largest object before any gets a second.
         min_size: fewest Gaussians of an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
-    if answer is None or not state.from_answer:
+    if answer is None or not state.prompts_select:
         groups = [(_BY_HAND, _BY_HAND_COLOR, selected)]
     else:
         prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
@@ -91,7 +91,7 @@ def list_objects(state: State, *, most: int = 12, min_size: int = OBJECT_MIN_GAU
         count = sum(size >= min_size for size in sizes)
         small += sum(sizes[count:])
         rows += [(number, group, text, color, labels, size) for number, size in enumerate(sizes[:count])]
-    listed = sorted(sorted(rows, key=lambda row: row[:2])[:most], key=lambda row: (row[1], row[0]))
+    listed = sorted(sorted(rows, key=lambda row: row[:2])[:max_objects], key=lambda row: (row[1], row[0]))
     objects = [_object(state, text, n, color, labels == n, size) for n, _, text, color, labels, size in listed]
     return ObjectList(tuple(objects), len(rows) - len(listed), small)
 
@@ -122,7 +122,7 @@ _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
 class LookAtTarget:
     """Point to look at that is not an object."""
 
-    centre: Position
+    center: Position
     extent: float
     """Size of the region around the point that is to be visible."""
 
@@ -149,14 +149,14 @@ def unoccluded_viewpoint(
         field_of_view: of the camera, in radians.
     """
     first = viewpoint(target, camera_position, field_of_view)
-    center = torch.tensor(target.centre, dtype=torch.float64)
-    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(target.centre)))
+    center = torch.tensor(target.center, dtype=torch.float64)
+    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(target.center)))
     means = scene.means.detach().double().cpu()
     near = (means - center).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < distance
     near = near if drawn is None else near & drawn.cpu()
     parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
     occluders, best, least = GaussianScene(*parts), first, np.inf
-    for position in _candidates(np.asarray(first), np.asarray(target.centre), np.asarray(up, float)):
+    for position in _candidates(np.asarray(first), np.asarray(target.center), np.asarray(up, float)):
         occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
         if occlusion < least:
             best, least = (float(position[0]), float(position[1]), float(position[2])), occlusion
@@ -175,7 +175,7 @@ def viewpoint(
         camera_position: current position of the camera.
         field_of_view: of the camera, in radians.
     """
-    center = np.asarray(target.centre)
+    center = np.asarray(target.center)
     offset = np.asarray(camera_position, float) - center
     length = float(np.linalg.norm(offset))
     offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])

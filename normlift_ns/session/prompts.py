@@ -33,11 +33,11 @@ class Prompt:
     text: str
     vector: Float[np.ndarray, " d"] | None = None
     """Vector of the prompt; None if there is an error."""
-    problem: str = ""
+    error: str = ""
     """Error message for the user; empty if there is none."""
 
     @property
-    def clicked(self) -> bool:
+    def is_click(self) -> bool:
         """True if the prompt is a click on the scene instead of a text."""
         return is_click(self.text)
 
@@ -76,28 +76,28 @@ def join_prompts(texts: Sequence[str]) -> str:
     return ", ".join(f'"{line}"' if re.search("[,;]", line) else line for line in lines)
 
 
-def encode_prompts(text: str, read: EncodeTexts, known: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
+def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
     """Encode a line of prompts. A text that cannot be encoded gets the encoder's message instead of a vector.
 
     Args:
         text: prompts as typed.
         read: encoder of texts.
-        known: vectors by text that need no encoder: those of clicks, and of prompts stored in the run.
+        known_vectors: vectors by text that need no encoder: those of clicks, and of prompts stored in the run.
     Raises:
         ValueError: there are no prompts, or too many.
         OSError, MemoryError: the encoder cannot be loaded.
     """
-    texts, known = split_prompts(text), known or {}
+    texts, known_vectors = split_prompts(text), known_vectors or {}
     if len(texts) == 0:
         raise InputError("Type what to look for, then press Ask.")
     if len(texts) > MAX_PROMPTS:
         raise InputError(f"{len(texts)} prompts were typed; ask at most {MAX_PROMPTS} at a time.")
-    new = [one for one in texts if one not in known]
+    new = [one for one in texts if one not in known_vectors]
     try:
         vectors: dict[str, Any] = dict(zip(new, read(new) if len(new) > 0 else []))
     except ValueError:
         vectors = {one: _read_alone(one, read) for one in new}
-    return tuple(_row(one, known[one] if one in known else vectors[one]) for one in texts)
+    return tuple(_row(one, known_vectors[one] if one in known_vectors else vectors[one]) for one in texts)
 
 
 def _read_alone(text: str, read: EncodeTexts) -> Any:
@@ -112,7 +112,7 @@ def _read_alone(text: str, read: EncodeTexts) -> Any:
 
 def _row(text: str, result: Any) -> Prompt:
     if isinstance(result, str):
-        return Prompt(text, problem=result)
+        return Prompt(text, error=result)
     return Prompt(text, np.asarray(result, np.float32))
 
 
@@ -140,18 +140,18 @@ def build_query(
     """
     valid = [prompt for prompt in prompts if prompt.vector is not None]
     if len(valid) == 0:
-        raise InputError(prompts[0].problem if len(prompts) > 0 else "Type what to look for, then press Ask.")
+        raise InputError(prompts[0].error if len(prompts) > 0 else "Type what to look for, then press Ask.")
     options: dict[str, Any] = {"min_reliability": min_reliability, "refined": refined}
-    if all(prompt.clicked for prompt in valid):
+    if all(prompt.is_click for prompt in valid):
         threshold = CLICK_THRESHOLD if threshold is None else threshold
         question = _question(field, valid, read, negatives=(), rule="cosine", threshold=threshold, **options)
         return tuple(prompts), question
     options |= {"negatives": negatives, "rule": rule, "threshold": threshold}
     question = _question(field, valid, read, **options)
-    if not RELEVANCY_RULES[question.rule].compares or not any(prompt.clicked for prompt in valid):
+    if not RELEVANCY_RULES[question.rule].needs_negatives or not any(prompt.is_click for prompt in valid):
         return tuple(prompts), question
-    error: dict[str, Any] = {"vector": None, "problem": _CLICK_RULE}
-    rows = tuple(replace(p, **error) if p.clicked and p.vector is not None else p for p in prompts)
+    error: dict[str, Any] = {"vector": None, "error": _CLICK_RULE}
+    rows = tuple(replace(p, **error) if p.is_click and p.vector is not None else p for p in prompts)
     return rows, _question(field, [prompt for prompt in rows if prompt.vector is not None], read, **options)
 
 
@@ -168,7 +168,7 @@ def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
     """Return the rows of a query, for instance of the one that a run stores. None: no rows."""
     if question is None:
         return ()
-    return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.vectors))
+    return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.embeddings))
 
 
 def merge_queries(stored: Query | None, asked: Query) -> Query:
@@ -191,4 +191,4 @@ def merge_queries(stored: Query | None, asked: Query) -> Query:
     rows: dict[str, Any] = {
         prompt.text: prompt.vector for prompt in (*prompts_of_query(stored), *prompts_of_query(asked))
     }
-    return replace(asked, texts=tuple(rows), vectors=np.stack(list(rows.values())))
+    return replace(asked, texts=tuple(rows), embeddings=np.stack(list(rows.values())))

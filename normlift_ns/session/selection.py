@@ -44,7 +44,7 @@ class SelectionContext:
     def __len__(self) -> int:
         return len(self.means)
 
-    def none(self) -> Bool[Tensor, " n"]:
+    def empty_mask(self) -> Bool[Tensor, " n"]:
         """Return an empty mask."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
 
@@ -54,8 +54,8 @@ class SelectionContext:
         Raises:
             ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
         """
-        negative = None if question.negative_vectors is None else question.negative_vectors.tobytes()
-        key = (question.texts, question.vectors.tobytes(), negative, question.rule, question.refined)
+        negative = None if question.negative_embeddings is None else question.negative_embeddings.tobytes()
+        key = (question.texts, question.embeddings.tobytes(), negative, question.rule, question.refined)
         with self._lock:
             result = self._answers.pop(key, None)
         result = run_query(self.field, self.means, question) if result is None else result
@@ -65,7 +65,7 @@ class SelectionContext:
                 self._answers.popitem(last=False)
         return apply_threshold(result, question)
 
-    def alike(
+    def similar_to(
         self, vector: Float[Tensor, " d"], least: float = CLICK_THRESHOLD, *, refined: bool = True
     ) -> Bool[Tensor, " n"]:
         """Return the mask of Gaussians whose cosine to a direction is at least `least`."""
@@ -83,13 +83,13 @@ class SelectionContext:
         """
         if not bool(selected[gaussian]):
             (direction,) = self.field.directions(torch.tensor([gaussian], device=self.means.device), refined=refined)
-            selected = self.alike(direction, refined=refined)
+            selected = self.similar_to(direction, refined=refined)
         labels = connected_components(self.means, selected)
-        mask = labels == labels[gaussian] if int(labels[gaussian]) >= 0 else self.none()
+        mask = labels == labels[gaussian] if int(labels[gaussian]) >= 0 else self.empty_mask()
         mask[gaussian] = True
         return mask
 
-    def resized(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
+    def grow_or_shrink(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
         Growing adds Gaussians that are connected to the selection and similar to its mean direction. Their cosine is at
@@ -110,7 +110,7 @@ class SelectionContext:
         if not bool(mean.any()):
             return selected
         seeds = selected.cpu().numpy()
-        candidates = seeds | self.alike(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
+        candidates = seeds | self.similar_to(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
         _, labels = _components(self._graph(candidates))
         reached = np.zeros(labels.max() + 1, bool)
         reached[labels[seeds]] = True
@@ -131,7 +131,7 @@ class SelectionContext:
         farthest = np.zeros(count)
         np.maximum.at(farthest, labels, hops)
         inner = torch.from_numpy(rows[hops * _FRACTIONS <= farthest[labels] * (_FRACTIONS - steps)])
-        mask = self.none()
+        mask = self.empty_mask()
         mask[inner.to(mask.device)] = True
         return mask
 
@@ -166,7 +166,7 @@ def _components(graph: Any) -> tuple[int, np.ndarray]:
 class SelectionBox:
     """Box that cuts a selection, in scene units."""
 
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     size: tuple[float, float, float]
     """Side lengths, > 0."""
     wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -185,17 +185,17 @@ class SelectionBox:
         w, *imaginary = np.array(self.wxyz) / np.linalg.norm(self.wxyz)
         local, axis = signs * np.array(self.size) / 2, np.array(imaginary)
         turn = 2 * np.cross(axis, local)
-        return np.array(self.centre) + local + w * turn + np.cross(axis, turn)
+        return np.array(self.center) + local + w * turn + np.cross(axis, turn)
 
-    def kept(self, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    def mask(self, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """Return the mask of Gaussians whose centers the box keeps.
 
-        >>> SelectionBox((0, 0, 0), (2, 2, 2)).kept(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
+        >>> SelectionBox((0, 0, 0), (2, 2, 2)).mask(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
         [True, False]
         """
         w, *imaginary = torch.nn.functional.normalize(torch.tensor(self.wxyz, dtype=torch.float64), dim=0)
         axis = -torch.stack(imaginary).to(means.device)
-        offset = means.double() - torch.tensor(self.centre, dtype=torch.float64, device=means.device)
+        offset = means.double() - torch.tensor(self.center, dtype=torch.float64, device=means.device)
         turn = 2 * torch.linalg.cross(axis.expand_as(offset), offset)
         local = offset + w.to(means.device) * turn + torch.linalg.cross(axis.expand_as(offset), turn)
         half = torch.tensor(self.size, dtype=torch.float64, device=means.device) / 2

@@ -31,34 +31,34 @@ class State:
     space: SelectionContext
     prompts: tuple[Prompt, ...] = ()
     """All rows, including those with errors."""
-    question: Query | None = None
+    query: Query | None = None
     """Query of the rows without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
     """Index of the only prompt of the query that selects; None: all of them select."""
-    from_answer: bool = True
+    prompts_select: bool = True
     """True if the prompts select; False: the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
-    steps: int = 0
+    grow_steps: int = 0
     """Steps of growth over the neighbor graph; negative: steps of shrinking."""
     box: SelectionBox | None = None
     hidden: Bool[Tensor, " n"] | None = None
     """Gaussians that are not drawn."""
-    look: str = "colours"
+    color_mode: str = "colours"
     """Color mode; each viewer defines the names."""
-    did: str = ""
+    action: str = ""
     """Description of the action that led to this state."""
 
     @cached_property
     def answer(self) -> Answer | None:
         """Answer to the query; None without one."""
-        return None if self.question is None else self.space.answer(self.question)
+        return None if self.query is None else self.space.answer(self.query)
 
     @cached_property
-    def unresized(self) -> Bool[Tensor, " n"]:
+    def selection_before_resize(self) -> Bool[Tensor, " n"]:
         """Gaussians selected by prompts and clicks, before growing and cutting."""
-        mask = self.space.none()
-        if self.answer is not None and self.from_answer:
+        mask = self.space.empty_mask()
+        if self.answer is not None and self.prompts_select:
             mask = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]
         mask = mask if self.added is None else mask | self.added
         return mask if self.removed is None else mask & ~self.removed
@@ -66,49 +66,49 @@ class State:
     @cached_property
     def selection(self) -> Bool[Tensor, " n"]:
         """Selected Gaussians, whether hidden or not."""
-        mask = self.space.resized(self.unresized, self.steps, refined=self.refined)
-        return mask if self.box is None else mask & self.box.kept(self.space.means)
+        mask = self.space.grow_or_shrink(self.selection_before_resize, self.grow_steps, refined=self.refined)
+        return mask if self.box is None else mask & self.box.mask(self.space.means)
 
     @property
     def drawn(self) -> Bool[Tensor, " n"]:
         """Gaussians that are not hidden."""
-        return ~self.space.none() if self.hidden is None else ~self.hidden
+        return ~self.space.empty_mask() if self.hidden is None else ~self.hidden
 
     @property
-    def by_hand(self) -> str:
+    def by_hand_suffix(self) -> str:
         """Suffix for the number of selected Gaussians if the selection was made by hand; empty if prompts select."""
-        return "" if self.from_answer else ", by hand"
+        return "" if self.prompts_select else ", by hand"
 
     @property
     def name(self) -> str:
         """Name for a file of the selection: the prompts that select, or "selection" if none does."""
-        if self.question is None or not self.from_answer:
+        if self.query is None or not self.prompts_select:
             return "selection"
-        texts = self.question.texts
+        texts = self.query.texts
         return join_prompts(texts if self.shown is None else texts[self.shown : self.shown + 1])
 
     @property
     def refined(self) -> bool:
         """True if the query uses refined features."""
-        return True if self.question is None else self.question.refined
+        return True if self.query is None else self.query.refined
 
     @cached_property
-    def poor(self) -> float:
+    def weak_fraction(self) -> float:
         """Fraction of the selection with weak evidence; 0 if nothing is selected."""
         reliability = self.space.field.scalars.reliability[self.selection]
         return float((reliability < WEAK_RELIABILITY).float().mean()) if len(reliability) > 0 else 0.0
 
     @property
-    def remark(self) -> str:
+    def warning(self) -> str:
         """Warning if at least a quarter of the selection has weak evidence, else empty.
 
         `actions.leave_out_poor` removes the Gaussians in question.
         """
-        if self.poor < 0.25:
+        if self.weak_fraction < 0.25:
             return ""
-        return f"{self.poor:.0%} of this selection has weak evidence (R < {WEAK_RELIABILITY:g})."
+        return f"{self.weak_fraction:.0%} of this selection has weak evidence (R < {WEAK_RELIABILITY:g})."
 
-    def lean(self) -> State:
+    def without_caches(self) -> State:
         """Return a copy without cached results, for a history. They are computed again when it is shown again."""
         return replace(self)
 
@@ -134,33 +134,33 @@ class History(Generic[T]):
     """
 
     states: tuple[T, ...]
-    at: int = 0
+    index: int = 0
     """Index of the current state."""
     key: str | None = None
     """Key of the last step, if successive steps with this key are merged."""
 
-    lean: Callable[[T], T] = _identity
-    """Applied to a state when another one becomes current, for instance `State.lean`."""
+    compact: Callable[[T], T] = _identity
+    """Applied to a state when another one becomes current, for instance `State.without_caches`."""
 
     @staticmethod
     def of(state: T, *, lean: Callable[[T], T] = _identity) -> History[T]:
         """Return a history with a single state."""
-        return History((state,), lean=lean)
+        return History((state,), compact=lean)
 
     @property
     def now(self) -> T:
         """The current state."""
-        return self.states[self.at]
+        return self.states[self.index]
 
     @property
     def can_undo(self) -> bool:
         """True if there is an earlier state."""
-        return self.at > 0
+        return self.index > 0
 
     @property
     def can_redo(self) -> bool:
         """True if there is a later state, after an undo."""
-        return self.at < len(self.states) - 1
+        return self.index < len(self.states) - 1
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
         """Make a new state current, and drop undone ones. The state that is current already adds no step.
@@ -170,28 +170,28 @@ class History(Generic[T]):
         """
         if state is self.now:
             return self
-        merge = key is not None and key == self.key and self.at > 0
-        states = (*self._leaned[: self.at + (not merge)], state)[-MAX_STATES:]
-        return History(states, len(states) - 1, key, self.lean)
+        merge = key is not None and key == self.key and self.index > 0
+        states = (*self._leaned[: self.index + (not merge)], state)[-MAX_STATES:]
+        return History(states, len(states) - 1, key, self.compact)
 
     def undo(self) -> History[T]:
         """Return to the previous state; the same history if there is none."""
-        return self.go_to(self.at - 1)
+        return self.go_to(self.index - 1)
 
     def redo(self) -> History[T]:
         """Return to the state undone last; the same history if there is none."""
-        return self.go_to(self.at + 1)
+        return self.go_to(self.index + 1)
 
     def go_to(self, index: int) -> History[T]:
         """Make any state of the list current; the same history if the index is out of range."""
-        if index == self.at or not 0 <= index < len(self.states):
+        if index == self.index or not 0 <= index < len(self.states):
             return self
-        return replace(self, states=self._leaned, at=index, key=None)
+        return replace(self, states=self._leaned, index=index, key=None)
 
     @property
     def _leaned(self) -> tuple[T, ...]:
         """The states with `lean` applied to the current one."""
-        return (*self.states[: self.at], self.lean(self.now), *self.states[self.at + 1 :])
+        return (*self.states[: self.index], self.compact(self.now), *self.states[self.index + 1 :])
 
 
 # Request tokens that discard stale results: a number per user that increases with every request.
@@ -202,7 +202,7 @@ class RequestToken:
     """Token of one request."""
 
     number: int
-    what: str
+    description: str
     """Description of the request, shown while it runs."""
 
 
@@ -226,7 +226,7 @@ class RequestTokens:
             self._last, self._running = RequestToken(self._last.number + 1, description), True
             return self._last
 
-    def wanted(self, token: RequestToken) -> bool:
+    def is_current(self, token: RequestToken) -> bool:
         """Return whether the result of a request is still wanted."""
         with self._lock:
             return self._running and token.number == self._last.number
@@ -248,7 +248,7 @@ class RequestTokens:
     def busy(self) -> str:
         """Description of the running request; empty if there is none."""
         with self._lock:
-            return self._last.what if self._running else ""
+            return self._last.description if self._running else ""
 
 
 # Job queue that keeps slow work out of viser's few threads, which serve all pages.
@@ -258,7 +258,7 @@ class JobQueue:
     """Queue that runs jobs one after another, in a thread that ends when the queue is empty.
 
     >>> event, worker = threading.Event(), JobQueue()
-    >>> worker.put(event.set)
+    >>> worker.submit(event.set)
     >>> event.wait(5)
     True
     """
@@ -268,7 +268,7 @@ class JobQueue:
         self._jobs: deque[tuple[str, Callable[[], None]]] = deque()
         self._running = self._ended = False
 
-    def put(self, job: Callable[[], None], key: str = "") -> None:
+    def submit(self, job: Callable[[], None], key: str = "") -> None:
         """Add a job to the end of the queue.
 
         Args:
@@ -286,12 +286,12 @@ class JobQueue:
             self._running = True
         threading.Thread(target=self._run, daemon=True).start()
 
-    def drop(self) -> None:
+    def clear(self) -> None:
         """Discard the waiting jobs; the running one continues."""
         with self._lock:
             self._jobs.clear()
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Discard the waiting jobs and accept no further ones."""
         with self._lock:
             self._ended = True

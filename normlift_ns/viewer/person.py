@@ -394,14 +394,14 @@ class Panel:
             self._values["shown"] = ALL
             self.shown.options = options
         self.set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
-        if state.question is not None:
-            self.set("threshold", self.threshold, min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.question.threshold)))
-            self.set("min_reliability", self.sure, state.question.min_reliability)
-        self.set("look", self.look, state.look)
-        self.set("resize", self.steps, state.steps)
+        if state.query is not None:
+            self.set("threshold", self.threshold, min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold)))
+            self.set("min_reliability", self.sure, state.query.min_reliability)
+        self.set("look", self.look, state.color_mode)
+        self.set("resize", self.steps, state.grow_steps)
         if state.box is not None:
-            self.centre.value, self.size.value = state.box.centre, state.box.size
-        self.poor.visible = state.remark != ""
+            self.centre.value, self.size.value = state.box.center, state.box.size
+        self.poor.visible = state.warning != ""
 
     def place(self, value: str) -> int | None:
         """The prompt that a choice of the dropdown names."""
@@ -423,11 +423,11 @@ class Panel:
         for button in self._nearest:
             button.remove()
         self._nearest = []
-        for i, one in enumerate(verdict for verdict in found if verdict.nearest is not None):
+        for i, one in enumerate(verdict for verdict in found if verdict.nearest_position is not None):
             label = f"Go to nearest: {clip_text(one.text, 20)}"
             place = self.histograms.order + (i + 1) / 100
             button = self._gui.add_button(label, color="gray", order=place)
-            button.on_click(lambda _, one=one: self._act("nearest", one.nearest))
+            button.on_click(lambda _, one=one: self._act("nearest", one.nearest_position))
             self._nearest.append(button)
 
     def box(self, name: str, state: State) -> SelectionBox | None:
@@ -455,15 +455,15 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
         drawable: selected Gaussians that are drawn at all.
     """
     lines = [f"**{escape_mdx(busy)}**"] * (busy != "") + [escape_mdx(clip_text(message, 400))] * (message != "")
-    if state.question is None and not bool(state.selection.any()):
+    if state.query is None and not bool(state.selection.any()):
         return "\n\n".join(lines) or "Type what to look for, then press Ask or Enter."
     count = int(state.selection.sum())
     why = "" if drawable == count else f" ({drawable:,} of them are drawn: others are too faint, hidden or left out)"
-    lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}{why}")
+    lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}{why}")
     if state.answer is not None:
         lines.append("\n".join(_rows(state, state.answer)))
-    if state.remark:
-        lines.append(escape_mdx(f"{state.remark} Below R = {WEAK_RELIABILITY:g} few views saw it, or they disagree."))
+    if state.warning:
+        lines.append(escape_mdx(f"{state.warning} Below R = {WEAK_RELIABILITY:g} few views saw it, or they disagree."))
     return "\n\n".join([*lines, *filter(None, [legend(state)])])
 
 
@@ -473,10 +473,10 @@ def _rows(state: State, answer: Answer) -> list[str]:
     lines = ["| | prompt | found |", "|---|---|---|"]
     for prompt in state.prompts[:20]:
         name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.text in counts and not prompt.problem:
+        if prompt.text in counts and not prompt.error:
             lines.append(f"| {color_swatch(colours[prompt.text])} | {name} | {counts[prompt.text]:,} |")
         else:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.problem, 120))} |")
+            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} |")
     if len(state.prompts) > 20:
         lines.append(f"| | and {len(state.prompts) - 20} more | |")
     return lines
@@ -517,7 +517,7 @@ class Person:
 
     def __init__(self, run: Run, page: BrowserPage, remember: Callable[[str, int], tuple[Memory, str]]) -> None:
         self._run, self._page, self._remember = run, page, remember
-        self._memory = Memory(History.of(State(run.space), lean=State.lean))
+        self._memory = Memory(History.of(State(run.space), lean=State.without_caches))
         self._lock, self._turns, self._eye = threading.RLock(), RequestTokens(), Eye(page, run.records)
         self._reasons = Explanation(run.opened_votes)
         self._deeds, self._asking, self._explaining, self._resting = JobQueue(), JobQueue(), JobQueue(), JobQueue()
@@ -544,19 +544,19 @@ class Person:
             self._memory.view = self._eye.view
         self._memory.line, self._memory.page = self._panel.prompts.value, None
         self._turns.cancel()
-        self._reasons.forget()
+        self._reasons.clear()
         self._painter.end()
         for worker in (self._deeds, self._asking, self._explaining, self._resting):
-            worker.end()
+            worker.close()
 
     def _act(self, name: str, value: Any) -> None:
         """What a widget does, after what was pressed before; returns at once."""
         if name == "Cancel":  # what waits is not wanted any more
-            self._deeds.drop()
+            self._deeds.clear()
             self._turns.cancel()
-            self._reasons.forget()
+            self._reasons.clear()
         key = name if name in _SLIDERS else ""
-        self._deeds.put(lambda: self._told(lambda: self._deed(name, value)), key)
+        self._deeds.submit(lambda: self._told(lambda: self._deed(name, value)), key)
 
     def _told(self, work: Callable[[], None]) -> None:
         """Does something; whatever goes wrong is told in the panel."""
@@ -609,7 +609,7 @@ class Person:
         elif name == "Download selection":
             self._download(now.selection, now.name)
         elif name == "Save prompts in run":
-            self._tell(self._run.save(now.question))
+            self._tell(self._run.save(now.query))
         elif name == "Link":
             self._memory.link = write_link(link_of(now, self._memory.clicks, self._eye.view))
             self._page.address(self._memory.link)
@@ -626,11 +626,11 @@ class Person:
         turn = self._turns.start(what)
         self._panel.ask.disabled = True
         self._tell("")
-        self._asking.put(lambda: self._told(lambda: self._take(turn, work)), "the last")
+        self._asking.submit(lambda: self._told(lambda: self._take(turn, work)), "the last")
 
     def _take(self, turn: RequestToken, work: Callable[[RequestToken], None]) -> None:
         try:
-            if self._turns.wanted(turn):
+            if self._turns.is_current(turn):
                 work(turn)
         finally:
             if self._turns.finish(turn):  # it failed: an answer finishes its turn itself
@@ -640,7 +640,7 @@ class Person:
     def _answer(self, turn: RequestToken, line: str, **how: Any) -> None:
         """Shows the answer to a line of prompts, unless it comes too late. Texts are read without the lock."""
         with self._lock:
-            before, clicks, sure = self.state.question, dict(self._memory.clicks), self._panel.sure.value
+            before, clicks, sure = self.state.query, dict(self._memory.clicks), self._panel.sure.value
         prompts = encode_prompts(line, self._run.read, self._run.known(clicks))
         how = {"min_reliability": min(1.0, max(0.0, sure)) if before is None else before.min_reliability, **how}
         prompts, question = build_query(self._run.space.field, prompts, self._run.read, **how)
@@ -669,11 +669,11 @@ class Person:
 
         def find() -> None:
             try:
-                self._reasons.find(turn, state)
+                self._reasons.compute(turn, state)
             finally:
                 self._say()
 
-        self._explaining.put(lambda: self._told(find), "the last")
+        self._explaining.submit(lambda: self._told(find), "the last")
 
     def _arm(self, name: str) -> None:
         """What the next click on the scene does; an empty name: nothing."""
@@ -700,7 +700,7 @@ class Person:
             with self._lock:
                 self._hit(self._mode, weights)
 
-        self._deeds.put(lambda: self._told(hit))
+        self._deeds.submit(lambda: self._told(hit))
 
     def _hit(self, name: str, weights: torch.Tensor) -> None:
         if name in _ONCE:
@@ -726,7 +726,7 @@ class Person:
     def _go_to(self, what: ObjectRow | LookAtTarget) -> None:
         eye, gaussians = self._eye.view, self._run.scene.gaussians
         place = unoccluded_viewpoint(what, gaussians, self.state.drawn, eye.position, eye.up, eye.fov)
-        self._eye.look(place, what.centre)
+        self._eye.look(place, what.center)
 
     def _download(self, mask: torch.Tensor, name: str) -> None:
         file, content, message = self._run.exported(mask, name, self.state.answer)
@@ -801,7 +801,7 @@ class Person:
         """A state was sent: the panel follows, unless there is a later one already."""
         with self._lock:
             if state is self.state:
-                self._reasons.follow(state)
+                self._reasons.update(state)
                 self._panel.follow(state)
                 self._say()
 
@@ -809,10 +809,10 @@ class Person:
         """Nothing has changed for a while: what takes longer follows, while the next state may be drawn already."""
 
         def follow() -> None:
-            self._panel.rows.show(list_objects(state, most=MAX_OBJECT_ROWS))
+            self._panel.rows.show(list_objects(state, max_objects=MAX_OBJECT_ROWS))
             self._panel.judge(diagnostics_mdx(state), diagnose_prompts(state))
 
-        self._resting.put(lambda: self._told(follow), "the last")
+        self._resting.submit(lambda: self._told(follow), "the last")
 
 
 # Everyone who looks: a page each, and what is kept for those who come back.
@@ -863,7 +863,7 @@ class People:
                     Memory(found.history, found.line, dict(found.clicks), found.view, found.link),
                 )
             if found is None:
-                found = Memory(History.of(State(self._run.space), lean=State.lean))
+                found = Memory(History.of(State(self._run.space), lean=State.without_caches))
             found.page = page
             self._memories[token] = found
             self._memories.move_to_end(token)

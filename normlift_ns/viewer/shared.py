@@ -188,13 +188,13 @@ def painted(records: Records, state: State) -> tuple[UInt8[np.ndarray, "m 3"], B
     rows = records.rows
     drawn = _array(state.drawn)[rows]
     colours = records.colours
-    if state.look == "reliability":
+    if state.color_mode == "reliability":
         return _ramp(_array(state.space.field.scalars.reliability)[rows]), drawn
-    if state.look == "colours":
+    if state.color_mode == "colours":
         return colours, drawn
     chosen = _array(state.selection)[rows]
     grey = np.repeat((colours @ np.array([0.3, 0.59, 0.11]) * 0.8).astype(np.uint8)[:, None], 3, axis=1)
-    share, over = _overlay(state, rows) if state.look == "overlay" else _prompts(state, rows)
+    share, over = _overlay(state, rows) if state.color_mode == "overlay" else _prompts(state, rows)
     mixed = (1 - share[:, None]) * grey + share[:, None] * over
     return np.where(chosen[:, None], mixed.round().astype(np.uint8), grey), drawn
 
@@ -204,7 +204,7 @@ def opacities(records: Records, state: State) -> UInt8[np.ndarray, " m"]:
     it can be seen.
     """
     chosen = _array(state.selection)[records.rows]
-    by_hand = state.look == "overlay" and (state.answer is None or not state.from_answer)
+    by_hand = state.color_mode == "overlay" and (state.answer is None or not state.prompts_select)
     if not by_hand or not chosen.any() or np.median(records.alpha[chosen]) >= _FAINT:
         return records.alpha
     return np.where(chosen, np.maximum(records.alpha, _SEEN), records.alpha).astype(np.uint8)
@@ -212,7 +212,7 @@ def opacities(records: Records, state: State) -> UInt8[np.ndarray, " m"]:
 
 def coloured(state: State) -> State:
     """The state, with what is selected in colours where it would not be seen."""
-    return replace(state, look="overlay") if state.look == "colours" else state
+    return replace(state, color_mode="overlay") if state.color_mode == "colours" else state
 
 
 def scale(state: State) -> tuple[float, float]:
@@ -230,17 +230,17 @@ def legend(state: State) -> str:
     """As MDX: a bar of the colours with the numbers at its ends; empty where colours are those of the scene, or
     say only that something is selected.
     """
-    by_hand = state.answer is None or not state.from_answer
-    if state.look in ("colours", "prompts") or (state.look == "overlay" and by_hand):
+    by_hand = state.answer is None or not state.prompts_select
+    if state.color_mode in ("colours", "prompts") or (state.color_mode == "overlay" and by_hand):
         return ""
-    low, high, what = (0.0, 1.0, "reliability R") if state.look == "reliability" else (*scale(state), "relevancy")
+    low, high, what = (0.0, 1.0, "reliability R") if state.color_mode == "reliability" else (*scale(state), "relevancy")
     stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in _ramp(np.linspace(0, 1, 6)).tolist())
     style = f'{{{{background: "linear-gradient(to right,{stops})", height: "0.6em", borderRadius: "3px"}}}}'
     return f"<div style={style}></div>\n\n{low:.2f} {what} {high:.2f}"
 
 
 def _overlay(state: State, rows: np.ndarray) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
-    if state.answer is None or not state.from_answer:
+    if state.answer is None or not state.prompts_select:
         return np.ones(len(rows)), np.broadcast_to(np.array(_HAND) * 255, (len(rows), 3))
     answer = state.answer
     relevancy = _array(answer.relevancy.amax(dim=1) if state.shown is None else answer.relevancy[:, state.shown])[rows]
@@ -252,7 +252,7 @@ def _overlay(state: State, rows: np.ndarray) -> tuple[Float[np.ndarray, " m"], F
 def _prompts(state: State, rows: np.ndarray) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
     colours = np.array([_HAND])
     best = np.zeros(len(rows), int)
-    if state.answer is not None and state.from_answer:
+    if state.answer is not None and state.prompts_select:
         colours = np.array(prompt_rgb_tuples(state.answer.texts))
         relevancy = state.answer.relevancy.where(state.answer.selected, -9.0)
         best = _array(relevancy.argmax(dim=1))[rows] if state.shown is None else np.full(len(rows), state.shown)
@@ -326,12 +326,12 @@ def link_of(state: State, clicks: Mapping[str, int], view: View) -> Link:
     Args:
         clicks: Gaussians that were clicked, by the names of the prompts.
     """
-    question = state.question
+    question = state.query
     if question is None:
-        return Link(view=view, look=state.look)
+        return Link(view=view, look=state.color_mode)
     asked = {name: gaussian for name, gaussian in clicks.items() if name in question.texts}
     line = join_prompts(question.texts)
-    return Link(line, asked, question.threshold, question.min_reliability, state.look, view)
+    return Link(line, asked, question.threshold, question.min_reliability, state.color_mode, view)
 
 
 def write_link(link: Link) -> str:

@@ -79,7 +79,7 @@ class ObjectRows:
             if i < len(self._objects):
                 row = self._objects[i]
                 details = escape_mdx(f"object {row.number}: {row.size:,} Gaussians, {row.evidence}")
-                text.content = f"{color_swatch(row.colour)} **{escape_mdx(clip_text(row.text, 40))}** {details}"
+                text.content = f"{color_swatch(row.color)} **{escape_mdx(clip_text(row.text, 40))}** {details}"
             text.visible = buttons.visible = i < len(self._objects)
 
     def _row(self, gui: Any, i: int, act: Callable[[str, ObjectRow, Any], None]) -> tuple[Any, Any]:
@@ -150,9 +150,9 @@ def diagnostics_mdx(state: State) -> str:
     """Return histograms and warnings of the prompts that select; empty if no prompt selects."""
     diagnostics, lines = diagnose_prompts(state), []
     for one in diagnostics:
-        lines += [f"{color_swatch(one.colour)} {escape_mdx(clip_text(one.text, 40))}"] * (len(diagnostics) > 1)
-        lines.append(_image("image/svg+xml", histogram_svg(one.histogram, one.colour).encode()))
-        lines += [escape_mdx(clip_text(one.words, 400))] * (one.words != "")
+        lines += [f"{color_swatch(one.color)} {escape_mdx(clip_text(one.text, 40))}"] * (len(diagnostics) > 1)
+        lines.append(_image("image/svg+xml", histogram_svg(one.histogram, one.color).encode()))
+        lines += [escape_mdx(clip_text(one.warning, 400))] * (one.warning != "")
     count = 0 if state.answer is None or state.shown is not None else len(state.answer.texts)
     if 0 < len(diagnostics) < count:
         lines.append(f"and {count - len(diagnostics)} more; choose one to see its histogram.")
@@ -242,7 +242,7 @@ class Explanation:
         self._selection, self.content = state.selection, ""
         return self._turns.start(_BUSY)
 
-    def find(self, token: RequestToken, state: State) -> None:
+    def compute(self, token: RequestToken, state: State) -> None:
         """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
 
         Raises:
@@ -251,7 +251,7 @@ class Explanation:
         content = ""
         try:
             with _explain_lock:
-                if self._turns.wanted(token):
+                if self._turns.is_current(token):
                     content = explanation_mdx(self._votes(), state.selection, refined=state.refined)
         except Exception:
             if self._turns.finish(token):
@@ -259,12 +259,12 @@ class Explanation:
         if self._turns.finish(token):
             self.content = content
 
-    def follow(self, state: State) -> None:
+    def update(self, state: State) -> None:
         """Drop the explanation if the selection of this state is another one."""
         if self._selection is not None and not torch.equal(self._selection, state.selection):
-            self.forget()
+            self.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drop the explanation and any running computation."""
         self._turns.cancel()
         self._selection, self.content = None, ""

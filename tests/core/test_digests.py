@@ -253,7 +253,7 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
 def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     evidence.save(path)
-    save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).facts.items() if k != "digest"})
+    save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).metadata.items() if k != "digest"})
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
     with pytest.raises(ValueError, match="does not record one"):
         Evidence.load(path, key="a")
@@ -297,7 +297,7 @@ def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
     for i in range(20):  # safetensors alone makes many files of it
         save_tensors(tmp_path / str(i), tensors, facts)
         contents.add((tmp_path / str(i)).read_bytes())
-    assert load_tensors(tmp_path / "0").facts == facts
+    assert load_tensors(tmp_path / "0").metadata == facts
     assert len(contents) == 1
 
 

@@ -68,8 +68,8 @@ def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):
     write_text_file(path, "second", overwrite=True)
     assert path.read_text() == "second"
     with pytest.raises(FileExistsError, match=r"b\.txt exists.* --json.*--overwrite"):
-        refuse_existing(tmp_path / "c.txt", path, overwrite=False, instead="--json")
-    refuse_existing(path, overwrite=True, instead="--json")
+        refuse_existing(tmp_path / "c.txt", path, overwrite=False, flags="--json")
+    refuse_existing(path, overwrite=True, flags="--json")
     path.unlink()
     path.symlink_to("nowhere")
     with pytest.raises(FileExistsError):
@@ -180,7 +180,7 @@ def test_of_processes_that_write_at_once_none_loses_anything(system: str, tmp_pa
             made, named = make_folder(folder / "new", str(i)), number(i, folder / "2024-05-01_120000")
             found.append((won, made, named, make_folder(tmp_path / "replaced", f"{i}", overwrite=True)))
             written, gone = (paths, []) if i % 2 else (paths[:2], paths[2:])
-            with atomic_files(*written, overwrite=True, remove=gone) as drafts:
+            with atomic_files(*written, overwrite=True, delete=gone) as drafts:
                 for draft in drafts:
                     draft.write_text(f"{i} {turn}")
         return found
@@ -252,7 +252,7 @@ def test_files_that_belong_together_are_completed_after_a_kill(every: int, overw
 
     def export() -> None:
         written, gone = (paths[:2], paths[2:]) if overwrite else (paths, [])
-        with atomic_files(*written, overwrite=overwrite, remove=gone) as drafts:
+        with atomic_files(*written, overwrite=overwrite, delete=gone) as drafts:
             for draft in drafts:
                 draft.write_text("new")
 
@@ -265,7 +265,7 @@ def test_files_that_belong_together_are_completed_after_a_kill(every: int, overw
     for _ in after_kills(export, reset, folder, every):
         gaps += texts() not in (["old"] * 3, ["new"] * 2, ["new"] * 3, [])
         with suppress(FileExistsError):
-            refuse_existing(*paths, overwrite=False, instead="--output-dir")  # as the next command does
+            refuse_existing(*paths, overwrite=False, flags="--output-dir")  # as the next command does
         after = texts()
         assert after in ((["old"] * 3, ["new"] * 2) if overwrite else ([], ["new"] * 3))
         seen.append("new" in after)

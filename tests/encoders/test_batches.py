@@ -25,7 +25,7 @@ def test_batches_shrink_until_they_fit_and_stay_so():
     function, asked = narrow(3)
     assert torch.cat(list(batches(function, torch.arange(10)))).tolist() == list(range(0, 20, 2))
     assert asked == [10, 5, 2, 3, 5, 2, 3]
-    assert batches.size == 3
+    assert batches.batch_size == 3
     del asked[:]
     assert torch.cat(list(batches(function, torch.arange(7)))).tolist() == list(range(0, 14, 2))
     assert asked == [3, 3, 1]
@@ -44,7 +44,7 @@ def test_batches_are_filled_from_several_parts(counts, size):
         sizes.append(len(items))
         return torch.tensor(items)[:, None] * 2
 
-    for i, rows in enumerate(AdaptiveBatches(size).across(double, parts())):
+    for i, rows in enumerate(AdaptiveBatches(size).map_across(double, parts())):
         assert [int(row) for row in rows] == list(range(2 * first[i], 2 * (first[i] + counts[i]), 2))
         assert first[len(asked) - 1] < first[i] + counts[i] + size  # no part is asked for without need
     assert asked == list(range(len(counts)))

@@ -60,16 +60,16 @@ def test_crops_are_seen_as_the_librarys_processor_prepares_them(both: Both) -> N
 
 def test_texts_are_read_as_the_librarys_processor_reads_them(both: Both) -> None:
     how = {"padding": "max_length", "max_length": LENGTH, "truncation": True, "return_tensors": "pt"}
-    prompts = [both.encoder.family.read(text) for text in PROMPTS] if both.name == "siglip" else PROMPTS
+    prompts = [both.encoder.family.preprocess_text(text) for text in PROMPTS] if both.name == "siglip" else PROMPTS
     expected = both.pooled(**both.processor.tokenizer(prompts, **how))
-    found = both.network.texts([both.encoder.family.read(text) for text in PROMPTS])
+    found = both.network.texts([both.encoder.family.preprocess_text(text) for text in PROMPTS])
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     rows = torch.nn.functional.normalize(expected, dim=1)
     torch.testing.assert_close(both.encoder.text(PROMPTS).double(), rows, rtol=0, atol=1e-6)
     assert (expected[0] - expected[2]).abs().max() > 1e-3
     same = bool((found[0] - found[1]).abs().max() < 1e-12)
     assert same == (both.name == "siglip")  # nothing else leaves punctuation out
-    lower = both.network.texts([both.encoder.family.read(text) for text in ("a red mug", "A RED MUG")])
+    lower = both.network.texts([both.encoder.family.preprocess_text(text) for text in ("a red mug", "A RED MUG")])
     assert bool((lower[0] - lower[1]).abs().max() < 1e-12) == (both.name != "metaclip2")
     # The comparison notices what SigLIP's users forget most often, but for MetaCLIP 2, which does not see what follows.
     unpadded = both.pooled(**both.processor.tokenizer(["a red mug"], return_tensors="pt"))

@@ -356,7 +356,7 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
     write_text_embeddings(file, {"fox": torch.tensor([3.0, 4.0]), "file": torch.tensor([0.0, -2.0])})
     expected = TextEmbeddingFile(file).text(["fox", "file"]).tolist()
     assert np.allclose(expected, [[0.6, 0.8], [0, -1]])
-    assert TextEmbeddingFile(file).names == ("fox", "file")
+    assert TextEmbeddingFile(file).texts == ("fox", "file")
     refused(lambda: TextEmbeddingFile(file).text(["fxo"]), "'fxo'", "texts.npz", "fox")
     refused(lambda: TextEmbeddingFile(file).text([]))
     with pytest.raises(FileExistsError):

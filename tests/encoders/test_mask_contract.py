@@ -113,7 +113,7 @@ def test_half_precision_is_within_its_error(folders, kind):
         if kind == "sam3":
             network, out = Sam3Network.load(folder, "cpu", precision), []
             network._model.register_forward_hook(lambda module, given, found, out=out: out.append(found))
-            network.find(IMAGE, ["mug"])
+            network.segment(IMAGE, ["mug"])
             answers.append((out[0].pred_masks.float(), out[0].pred_logits.float()))
         else:
             network = load_sam_network(folder, "cpu", precision)

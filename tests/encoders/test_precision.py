@@ -80,4 +80,4 @@ def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
 
 def test_other_devices_get_the_settings_of_the_cpu() -> None:
     assert resolve_precision("auto", "mps") == "float32" and resolve_precision("float16", "mps") == "float16"
-    assert OpenClipEncoder(device="mps")._crops.size == OpenClipEncoder()._crops.size
+    assert OpenClipEncoder(device="mps")._crops.batch_size == OpenClipEncoder()._crops.batch_size

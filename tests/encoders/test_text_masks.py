@@ -29,7 +29,7 @@ def test_masks_are_those_of_transformers(written, unsure, transformers):
     network = Sam3Network.load(str(written), "cpu")
     for size in ((60, 90), (56, 56)):
         image = photograph(*size)
-        found = network.find(image, texts)
+        found = network.segment(image, texts)
         for text, ours in zip(texts, found):
             inputs = processor(images=Image.fromarray(image.numpy()), text=text, return_tensors="pt")
             exact = {name: x.double() if x.is_floating_point() else x for name, x in inputs.items()}
@@ -66,7 +66,7 @@ def test_where_masks_overlap_the_higher_score_counts(written, monkeypatch):
         "mug": TextMasks(torch.stack([left, empty]), torch.tensor([0.6, 0.9])),
         "plate": TextMasks(right[None], torch.tensor([0.8])),
     }
-    monkeypatch.setattr(Sam3Network, "find", lambda self, image, texts: [answers[text] for text in texts])
+    monkeypatch.setattr(Sam3Network, "segment", lambda self, image, texts: [answers[text] for text in texts])
     regions = Sam3Masks(("mug", "plate"), str(written))
     labels = regions.labels(photograph(10, 20), "a.jpg")
     assert labels.shape == (1, 2, 10, 20) and int(labels.max()) == 1
@@ -88,7 +88,7 @@ def test_identity_holds_texts_and_words(written, tmp_path):
 def test_what_is_refused(written, tmp_path, monkeypatch):
     refused(lambda: Sam3Masks((), str(written)), "--queries")
     network = Sam3Network.load(str(written), "cpu")
-    refused(lambda: network.find(photograph(20, 20), ["bowl " * 40]), "32 tokens", "has ")
+    refused(lambda: network.segment(photograph(20, 20), ["bowl " * 40]), "32 tokens", "has ")
     copied(written, tmp_path)
     for name in ("tokenizer.json", "vocab.json"):
         (tmp_path / name).unlink(missing_ok=True)

@@ -126,7 +126,7 @@ def test_the_views_are_those_of_the_lift(lifted):
     cameras = [camera for block in lifted_batches(lifted, "cpu") for camera in block.cameras]
     every = list(map(id, lifted.scene.train.cameras))
     assert [every.index(id(camera)) for camera in cameras] == [0, 1, 3, 4]
-    few = [camera for block in lifted_batches(lifted, "cpu", most=2) for camera in block.cameras]
+    few = [camera for block in lifted_batches(lifted, "cpu", max_views=2) for camera in block.cameras]
     assert [every.index(id(camera)) for camera in few] == [0, 4]
 
 

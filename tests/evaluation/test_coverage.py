@@ -294,7 +294,7 @@ def test_free_places():
         (-3.2, 0.3, 0.2): True,  # beside a camera
         (-6.0, 0.0, 0.0): False,  # behind the cameras
     }
-    assert space.free(torch.tensor(list(places), dtype=torch.float64)).tolist() == list(places.values())
+    assert space.is_free(torch.tensor(list(places), dtype=torch.float64)).tolist() == list(places.values())
 
 
 @pytest.mark.slow

@@ -154,7 +154,7 @@ def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
 def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text(json.dumps(NAMES))
     names = read_names(tmp_path / "labels.json")
-    masks = LabelFiles(tmp_path, what="instance mask", flag="--labels")
+    masks = LabelFiles(tmp_path, description="instance mask", flag="--labels")
     for array, message in (
         (np.zeros((2, 3), np.float32), "instance mask .*a.npy holds float32"),
         (np.zeros((2, 2, 3), int), r"a\.npy has shape \(2, 2, 3\), but its image x/a\.png is 2 x 3"),
@@ -166,4 +166,4 @@ def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[-(2**62), 7, 2**62]]))
     assert read_classes(masks, "x/a.png", names, 1, 3).tolist() == [[-1, 0, -1]]
     with pytest.raises(FileNotFoundError, match=r"nowhere .*--labels"):
-        LabelFiles(tmp_path / "nowhere", what="instance mask", flag="--labels")
+        LabelFiles(tmp_path / "nowhere", description="instance mask", flag="--labels")

@@ -45,7 +45,7 @@ def test_groups_name_refined_and_unrefined_answers():
     counted = one.truth != NO_CLASS
     for name, group in (("zero", zero), ("seen", ~zero), ("all", zero | ~zero)):
         chosen = (group & counted).nonzero().squeeze(1).tolist()
-        for kind, answer in one.answers.items():
+        for kind, answer in one.predictions.items():
             right = sum(int(answer[i]) == int(one.truth[i]) for i in chosen)
             assert found[f"{name}.accuracy_{kind}"] == pytest.approx(right / len(chosen))
         assert found[f"{name}.share"] == pytest.approx(float(group.double().mean()))

@@ -64,7 +64,7 @@ def test_every_encoder_has_a_default_that_selects_something():
         (None, {}, 0.5, True),
     ):
         question = asked(encoder, **how)
-        assert (question.threshold, question.suggest) == (threshold, suggest), (encoder, how)
+        assert (question.threshold, question.suggest_threshold) == (threshold, suggest), (encoder, how)
     with pytest.raises(InputError, match=r"threshold .*auto.*much"):
         asked("colour", threshold="much")
 
@@ -72,10 +72,10 @@ def test_every_encoder_has_a_default_that_selects_something():
 def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
     lifted, means, source = example(0)
     field = SemanticField.build(lifted, means, source)
-    question = Query(("a", "b"), unit_rows(2, D, 3).float().numpy(), suggest=True)
+    question = Query(("a", "b"), unit_rows(2, D, 3).float().numpy(), suggest_threshold=True)
     found = engine.run_query(field, means, question)
     wanted = suggest_threshold(found.relevancy.numpy(), found.valid.numpy())
-    assert (found.question.threshold, found.question.suggest) == (wanted, False)
+    assert (found.question.threshold, found.question.suggest_threshold) == (wanted, False)
     assert torch.equal(found.selected, (found.relevancy > wanted) & found.valid[:, None])
     assert bool(found.mask.any())
     with pytest.raises(InputError, match="threshold"):

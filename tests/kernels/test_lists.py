@@ -49,14 +49,14 @@ def test_lists_are_those_of_the_reference(kind, antialiased, rules, monkeypatch)
         tiles = assign_tiles(projected, camera.width, camera.height, constants.tile_size)
         faint = projected.opacities < constants.min_alpha  # no pixel draws them
         for tile in range(grid.cells):
-            there = tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
+            there = tiles.indices[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
             place = view * grid.cells + tile
             splats = lists.members[bounds[place] : bounds[place + 1]].long()
-            ours, theirs = seen.seen[splats] // 2, projected.gaussian[there[~faint[there]]]
+            ours, theirs = seen.keys[splats] // 2, projected.gaussian[there[~faint[there]]]
             if (kind, antialiased) == ("hard", True):  # no digit of a needle's determinant, and so of its opacity
                 ours, theirs = ours[ours >= NEEDLES], theirs[theirs >= NEEDLES]
             assert torch.equal(ours, theirs)
-            assert (seen.seen[splats] % 2 == view).all()
+            assert (seen.keys[splats] % 2 == view).all()
 
 
 def felt(grid, splat, camera, min_alpha):
@@ -110,7 +110,7 @@ def test_depths_are_rounded_as_cuda_rounds_them(seed):
     scene = random_scene(50, seed=seed, dtype=torch.float32)
     camera = orbit(7, width=20, height=18)[seed % 7]
     _, seen, lists = see(scene, [camera])
-    depth = camera_depths(scene.means, camera)[seen.seen]
+    depth = camera_depths(scene.means, camera)[seen.keys]
     assert torch.equal(seen.depth, depth)
     for first, second in itertools.pairwise(lists.offsets.tolist()):
         members = lists.members[first:second].long()
@@ -125,7 +125,7 @@ def test_an_empty_scene_and_an_empty_view():
     camera = orbit(1, width=20, height=9)[0]
     for scene in (empty, far):
         grid, seen, lists = see(scene, [camera])
-        assert (len(seen.seen), len(lists.members), len(lists.offsets)) == (0, 0, grid.cells + 1)
+        assert (len(seen.keys), len(lists.members), len(lists.offsets)) == (0, 0, grid.cells + 1)
         job = RasterJob(scene.to(DEVICE), False, RasterSettings(), torch.float32)
         entries = triton.views_evidence(job, RasterBatch([camera], [random_labels(camera, 3).to(DEVICE)], [3]))
         assert len(entries.weight) == 0
@@ -141,6 +141,6 @@ def test_many_cells_need_wider_keys():
     _, seen, lists = see(scene, [camera])
     assert len(lists.offsets) - 1 > 2**15
     _, few, _ = see(scene, [small])
-    assert torch.equal(seen.seen, few.seen)
-    counts = torch.bincount(lists.members, minlength=len(seen.seen))
+    assert torch.equal(seen.keys, few.keys)
+    counts = torch.bincount(lists.members, minlength=len(seen.keys))
     assert counts.max() > 100

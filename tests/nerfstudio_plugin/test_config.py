@@ -86,17 +86,17 @@ def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: P
     moved = tmp_path / "moved"
     with working_directory(tmp_path):
         location = locate_run(read_trainer_config(copied), copied.relative_to(tmp_path))
-    assert (location.root, location.output_dir, location.moved_data) == (moved, moved / "outputs", False)
+    assert (location.root, location.output_dir, location.data_moved) == (moved, moved / "outputs", False)
     assert location.data == location.folder == moved / "scene"
-    assert location.portable(moved / "outputs" / "x") == Path("outputs/x")
-    assert location.portable(tmp_path) == tmp_path
+    assert location.relative_to_root(moved / "outputs" / "x") == Path("outputs/x")
+    assert location.relative_to_root(tmp_path) == tmp_path
     assert opened(copied).train.files[0] == moved / "scene" / "images" / "000.jpg"
     with working_directory(stock.workspace / "outputs"):  # outputs/scene/ is the experiment, not the dataset
         assert locate_run(read_trainer_config(stock.config), stock.config).data == stock.workspace / "scene"
     shutil.copytree(copied.parent, tmp_path / "alone")  # out of its folders
     with working_directory(moved):
         location = opened(tmp_path / "alone" / "config.yml").location
-    assert (location.root, location.moved_data) == (None, True)
+    assert (location.root, location.data_moved) == (None, True)
     assert (location.data, location.output_dir) == (moved / "scene", moved / "outputs")
 
 
@@ -104,8 +104,8 @@ def test_beside_an_absolute_output_directory_relative_data_is_found(copied: Path
     config, moved = read_trainer_config(copied), copied.parents[4]
     config.output_dir = moved / "runs" / "all"
     location = locate_run(config, config.output_dir / copied.relative_to(moved / "outputs"))
-    assert (location.root, location.data, location.moved_data) == (None, moved / "scene", True)
-    assert location.output_dir == location.portable(config.output_dir) == config.output_dir
+    assert (location.root, location.data, location.data_moved) == (None, moved / "scene", True)
+    assert location.output_dir == location.relative_to_root(config.output_dir) == config.output_dir
 
 
 def test_a_moved_dataset_is_named_or_given(copied: Path, tmp_path: Path) -> None:
@@ -117,5 +117,5 @@ def test_a_moved_dataset_is_named_or_given(copied: Path, tmp_path: Path) -> None
     with working_directory(tmp_path):
         for data in (Path("elsewhere"), Path("elsewhere/transforms.json")):
             run = opened(copied, data=data)
-            assert (run.location.moved_data, run.location.data) == (True, tmp_path / data)
+            assert (run.location.data_moved, run.location.data) == (True, tmp_path / data)
             assert (run.train.names[0], run.train[0].image.shape) == ("images/000.jpg", (35, 47, 3))

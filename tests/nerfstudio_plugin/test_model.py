@@ -47,7 +47,7 @@ def _outputs(pipeline: Any, index: int = 0, obb_box: Any = None) -> dict[str, to
 def renderer(pipeline: Any, on_cpu: bool) -> Iterator[pytest.MonkeyPatch]:
     """That of the CPU, or the way of CUDA: stock splatfacto, and gsplat for the scalars."""
     with pytest.MonkeyPatch.context() as patch, splatfacto_on_cpu():
-        patch.setattr(type(pipeline.model), "on_cpu", on_cpu)
+        patch.setattr(type(pipeline.model), "renders_on_cpu", on_cpu)
         yield patch
 
 
@@ -106,7 +106,7 @@ def test_colors_without_spherical_harmonics(workspace: Path, registered: None, t
     torch.testing.assert_close(_outputs(pipeline, 1)["rgb"].cpu(), theirs["rgb"], atol=2e-5, rtol=1e-4)
     picture = render_image(run, run.train.cameras[1])
     torch.testing.assert_close(picture.float() / 255, theirs["rgb"], atol=0.51 / 255, rtol=0)
-    assert pipeline.model.splats()[1:] == (False, "antialiased")  # as a PLY file of it has to say
+    assert pipeline.model.splat_parameters()[1:] == (False, "antialiased")  # as a PLY file of it has to say
 
 
 def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticField) -> None:
@@ -256,13 +256,13 @@ def test_a_crop_box_crops_the_scalars_too(pipeline: Any) -> None:
 def test_what_is_hidden_cannot_be_clicked(pipeline: Any, stock: StockRun) -> None:
     model, camera = pipeline.model, opened(stock.config).train.cameras[0]
     pose = camera.world_to_camera.inverse()
-    weights = model.in_sight(pose[:3, 3], pose[:3, 2])
+    weights = model.ray_weights(pose[:3, 3], pose[:3, 2])
     front = int(weights.argmax())
     assert float(weights[front]) > 0.01
     answer = engine.run_query(model.field, model.means, question())
     answer.selected[:] = (torch.arange(60) == front)[:, None]
     model.show(make_display(model.field, answer, drawn=~answer.mask))
-    behind, others = model.in_sight(pose[:3, 3], pose[:3, 2]), torch.arange(60) != front
+    behind, others = model.ray_weights(pose[:3, 3], pose[:3, 2]), torch.arange(60) != front
     assert float(behind[front]) == 0 < behind.sum()
     assert (behind[others] >= weights[others]).all()
 

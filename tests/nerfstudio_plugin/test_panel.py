@@ -156,7 +156,7 @@ def button(panel: Any, label: str) -> Any:
 
 
 def said(panel: Any) -> str:
-    return html.unescape(panel._widgets.status.content + "\n\n" + panel._widgets.found.content)
+    return html.unescape(panel._widgets.status.content + "\n\n" + panel._widgets.prompt_table.content)
 
 
 def outputs(pipeline: Any) -> dict[str, torch.Tensor]:
@@ -223,59 +223,59 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     ask(panel, "left")
     counts = []
     for threshold in (-0.2, 0.8, 0.99):
-        panel.act("Threshold", threshold)
+        panel.on_action("Threshold", threshold)
         counts.append(int(chosen(pipeline).sum()))
         assert panel.answer.question.threshold == widgets.threshold.value == threshold
         assert f"**{counts[-1]}** of 60" in said(panel)
     assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
-    panel.act("Undo")  # the drag of a slider is one step
+    panel.on_action("Undo")  # the drag of a slider is one step
     assert widgets.threshold.value == 0.5
-    panel.act("Redo")
+    panel.on_action("Redo")
     assert widgets.threshold.value == 0.99
-    panel.act("Threshold", 0.7)
+    panel.on_action("Threshold", 0.7)
     ask(panel, "right")
     assert panel.answer.question.threshold == 0.7  # stays for the same rule
     least = float(model.field.scalars.reliability.median())
-    panel.act("Minimum reliability", least)
+    panel.on_action("Minimum reliability", least)
     assert (model.field.scalars.reliability[chosen(pipeline)] >= least).all()
     ask(panel, "left")
     assert panel.answer.question.min_reliability == pytest.approx(least)
-    panel.act("Suggested")
+    panel.on_action("Suggested")
     assert widgets.threshold.value == pytest.approx(threshold_suggestion(panel.state), abs=1e-6)
-    panel.act("colormap", "magma")
+    panel.on_action("colormap", "magma")
     assert pipeline.model._display.colormap == "magma" == panel._colormap
 
-    panel.act("refined", False)
+    panel.on_action("refined", False)
     assert not panel.answer.question.refined
-    panel.act("Undo")
-    panel.act("Threshold", 0.5)
+    panel.on_action("Undo")
+    panel.on_action("Threshold", 0.5)
     whole = chosen(pipeline)
     assert widgets.refined.value and whole.any()
     widgets.steps.value = -4
     press(widgets.steps)  # viser calls what it calls for a button
-    until(lambda: panel.state.steps == -4)
-    assert torch.equal(chosen(pipeline), panel.state.space.resized(whole, -4, refined=True))
-    panel.act("Undo")
+    until(lambda: panel.state.grow_steps == -4)
+    assert torch.equal(chosen(pipeline), panel.state.space.grow_or_shrink(whole, -4, refined=True))
+    panel.on_action("Undo")
     assert widgets.steps.value == 0
     before = outputs(pipeline)["accumulation"].sum()
-    panel.act("Hide")
+    panel.on_action("Hide")
     assert torch.equal(model._display.drawn, ~whole) and outputs(pipeline)["accumulation"].sum() < before
     assert f"{int(whole.sum())} Gaussians are hidden" in said(panel)
-    panel.act("All")
+    panel.on_action("All")
     assert model._display.drawn is None
-    panel.act("Only")
+    panel.on_action("Only")
     ask(panel, "up")
     assert torch.equal(model._display.drawn, whole)  # what is hidden stays hidden
-    panel.act("Undo")
+    panel.on_action("Undo")
     assert widgets.prompts.value == "left"
-    panel.act("All")
+    panel.on_action("All")
     ask(panel, "up")
     for name in ("Hide", "Only"):  # nothing is hidden, and no screen is blank
-        panel.act(name)
+        panel.on_action(name)
         assert "Nothing is selected" in said(panel)
         assert model._display.drawn is None
     widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
-    panel.act("Threshold", 0.7)
+    panel.on_action("Threshold", 0.7)
     assert widgets.reliability.value == 0.25
     ask(panel, "left")
     press(widgets.reliability)
@@ -290,17 +290,17 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     ask(panel, "left, banana")
     question = panel.answer.question
     assert (question.min_reliability, question.rule, question.refined) == (1.0, "cosine", False)
-    panel.act("Minimum reliability", 0.0)
-    panel.act("Hide")
-    panel.act("More like this", client=(browser := Browser()))
-    panel.act("Clear")
+    panel.on_action("Minimum reliability", 0.0)
+    panel.on_action("Hide")
+    panel.on_action("More like this", client=(browser := Browser()))
+    panel.on_action("Clear")
     assert {name: getattr(widgets, name).value for name in settings} == before
     assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
     assert not chosen(pipeline).any()
-    panel.act("Suggested")
+    panel.on_action("Suggested")
     assert "threshold" in said(panel)
-    panel.act("Undo")
+    panel.on_action("Undo")
     assert panel.answer.texts == ("left",)
     ask(panel, "right")
     assert panel.answer.question.min_reliability == 0.0 and chosen(pipeline).any()
@@ -329,10 +329,10 @@ def test_poor_evidence_is_said_and_can_be_left_out(panel: Any, pipeline: Any) ->
     pipeline.model.attach(replace(field, scalars=replace(field.scalars, reliability=reliability)), asking("left"))
     share = float((reliability[chosen(pipeline)] < 0.6).float().mean())
     assert f"{share:.0%} of this selection" in said(panel)
-    assert panel._widgets.poor.visible
-    press(panel._widgets.poor)
+    assert panel._widgets.remove_weak.visible
+    press(panel._widgets.remove_weak)
     assert chosen(pipeline).any() and (reliability[chosen(pipeline)] == 0.9).all()
-    assert not panel._widgets.poor.visible
+    assert not panel._widgets.remove_weak.visible
 
 
 def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,13 +340,13 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     first = int(chosen(pipeline).nonzero()[0])
     faint[first] = -9.0
     splats = TrainedSplat({**pipeline.model.gauss_params, "opacities": faint}, True, "classic")
-    monkeypatch.setattr(pipeline.model, "splats", lambda: splats)
+    monkeypatch.setattr(pipeline.model, "splat_parameters", lambda: splats)
     ask(panel, "left, left again")
     rows = chosen(pipeline)
     count = int(rows.sum())
     assert "1 of them are never drawn" in said(panel)
     assert f"{count} of them are selected by several prompts" in said(panel)
-    panel.act("Download selection", client=(browser := Browser()))
+    panel.on_action("Download selection", client=(browser := Browser()))
     assert f" {count - 1} Gaussians" in said(panel)
     rows[first] = False
     vertices = PlyData.read(io.BytesIO(browser.files["left__left_again.ply"]))["vertex"]
@@ -355,7 +355,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     faint[:] = -9.0
     for prompts, message in (("left", "ever drawn"), ("up", "Nothing is selected")):
         ask(panel, prompts)
-        panel.act("Download selection", client=browser)
+        panel.on_action("Download selection", client=browser)
         assert message in said(panel) and len(browser.files) == 1
 
 
@@ -364,7 +364,7 @@ def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
     assert sum(name.startswith("relevancy_") for name in outputs(pipeline)) == 50
     assert said(panel).count("■") == 8 and "42 more" in said(panel)
     ask(panel, "left {alert(1)} <img src=x onerror=alert(1)> | `x` ![](http://a); right")
-    (row,) = [line for line in panel._widgets.found.content.splitlines() if "alert" in line]
+    (row,) = [line for line in panel._widgets.prompt_table.content.splitlines() if "alert" in line]
     assert not set(re.sub(r"&#\d+;", "", row.split(" | ")[1])) & set("{}<>|`![]()#\n=&")
 
 
@@ -388,14 +388,14 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert panel._widgets.histograms.content.count("data:image/svg+xml") == 2
     first, camera = objects[0], browser.camera
     press_row(groups[0], "go to", browser)
-    assert camera.look_at == pytest.approx(10 * np.array(first.centre))
+    assert camera.look_at == pytest.approx(10 * np.array(first.center))
     assert np.linalg.norm(camera.position - camera.look_at) == pytest.approx(10 * first.extent / np.tan(0.5))
     press_row(groups[0], "export", browser)
     assert 0 < PlyData.read(io.BytesIO(browser.files["left_1.ply"]))["vertex"].count <= first.size
     press_row(groups[0], "hide", browser)
     assert torch.equal(pipeline.model._display.drawn, ~first.mask)
     assert len(listed(panel)) == len(list_objects(panel.state).objects) < len(objects)
-    panel.act("Undo")
+    panel.on_action("Undo")
     press_row(listed(panel)[0], "only", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
@@ -404,7 +404,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     press_row(groups[0], "hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
-    panel.act("Clear")
+    panel.on_action("Clear")
     listed(panel)
     assert panel._widgets.histograms.content == ""
 
@@ -429,8 +429,8 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
 
     for prompts in ("up", "left"):
         ask(panel, prompts)
-        press(panel._widgets.why)
-        assert not panel._widgets.why.disabled
+        press(panel._widgets.explain_button)
+        assert not panel._widgets.explain_button.disabled
     assert str(panel._folder.parent) in said(panel) and "Traceback" not in said(panel)  # no run is there
     assert panel._widgets.reasons.content == ""
     how = {"source": SourceOptions(encoder="colour"), "lift": LiftOptions(storage="evidence")}
@@ -439,7 +439,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     device = panel.state.space.means.device
     field, means = run.field.to(device), run.scene.gaussians.means.to(device)
     state = actions.select(State(SelectionContext(field, means)), field.scalars.weight > 0)
-    reasons.find(reasons.start(state), state)
+    reasons.compute(reasons.start(state), state)
     why = run.why(state.selection.cpu())
     text = html.unescape(reasons.content)
     assert why.words in text
@@ -491,7 +491,7 @@ def test_the_button_shows_that_it_works_and_the_picture_stays_live(pipeline: Any
     viewer.train_lock.release()
     assert torch.equal(chosen(pipeline), before)
     assert panel._widgets.ask.disabled and panel._widgets.cancel.visible
-    panel.act("Threshold", 0.6)  # the panel can be used, and still says what it waits for
+    panel.on_action("Threshold", 0.6)  # the panel can be used, and still says what it waits for
     assert panel.answer.texts == ("left",) and "Reading the prompts" in said(panel)
     assert panel._widgets.prompts.value == "right"  # what is typed is nobody else's
     encoder.go_on.set()
@@ -519,7 +519,7 @@ def test_a_stale_answer_is_dropped(pipeline: Any, slow: tuple[Slow, list[str]], 
         encoder.reading.clear()
         asking = in_thread(panel, "right")
         assert encoder.reading.wait(60)
-        panel.act(end)
+        panel.on_action(end)
         assert not panel._widgets.ask.disabled
         encoder.go_on.set()
         asking.join(60)
@@ -535,8 +535,8 @@ def ray(pipeline: Any) -> SimpleNamespace:
 
 def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> None:
     browser, event, field = Browser(), ray(pipeline), pipeline.model.field
-    panel.act("More like this", client=browser)
-    weights = pipeline.model.in_sight(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
+    panel.on_action("More like this", client=browser)
+    weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
     met = weights.where(field.valid(), 0.0).argmax()
     browser._scene_pointer_cb(SimpleNamespace(ray_origin=None, ray_direction=None))  # not on the scene
     browser._scene_pointer_cb(event)
@@ -544,19 +544,19 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
     assert torch.equal(clicked, (similar > 0.9) & field.valid())
-    panel.act("Save prompts in run")
+    panel.on_action("Save prompts in run")
     assert "one prompt" in said(panel)
     ask(panel, "left")
     assert panel.answer.question.threshold == 0.5  # not that of the click
     pipeline.model.attach(field, load_query(pipeline.model.config.semantics))  # as after a restart
-    assert panel._clicks.known == {}
+    assert panel._clicks.directions == {}
     ask(panel, "left")
     ask(panel, "like click 1")
     assert torch.equal(chosen(pipeline), clicked)
-    panel.act("More like this", client=browser)
+    panel.on_action("More like this", client=browser)
     browser._scene_pointer_cb(event)
     assert panel.answer.texts == ("like click 2",)  # the saved one is not replaced
-    panel.act("More like this", client=browser)
+    panel.on_action("More like this", client=browser)
     event.ray_direction = tuple(-x for x in event.ray_direction)
     browser._scene_pointer_cb(event)
     assert "nothing with semantics" in said(panel) and panel.answer.texts == ("like click 2",)
@@ -564,10 +564,10 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
 
 def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipeline: Any) -> None:
     browser, event = Browser(), ray(pipeline)
-    weights = pipeline.model.in_sight(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
+    weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
     for name, mode in (("Select", "select"), ("Drop", "take away"), ("Add", "add")):
         expected = actions.click(panel.state, weights, mode).selection  # type: ignore[arg-type]
-        panel.act(name, client=browser)
+        panel.on_action(name, client=browser)
         browser._scene_pointer_cb(event)
         assert torch.equal(chosen(pipeline), expected), name
     assert expected.any()
@@ -578,11 +578,11 @@ def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any
     browser, other, event = Browser(1), Browser(2), ray(pipeline)
     for name, cancels in (("Cancel", True), ("Clear", True), ("Ask", True), ("Hide", False)):
         ask(panel, "left")
-        panel.act("More like this", client=browser)
+        panel.on_action("More like this", client=browser)
         assert panel._widgets.cancel.visible
         assert other._scene_pointer_cb is viewer.viser_server.scene._scene_pointer_cb is None
         armed = browser._scene_pointer_cb
-        panel.act(name, client=other)
+        panel.on_action(name, client=other)
         assert (browser._scene_pointer_cb is None) == cancels
         assert panel._widgets.cancel.visible != cancels
         before = chosen(pipeline)
@@ -590,7 +590,7 @@ def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any
             armed(event)  # was on its way
             assert torch.equal(chosen(pipeline), before)
     for gone in (other, browser):
-        panel.forget(gone)
+        panel.on_disconnect(gone)
         assert panel._clicks.armed == panel._widgets.cancel.visible == (gone is other)
 
 
@@ -598,7 +598,7 @@ def test_a_browser_that_goes_while_another_one_presses_stops_nobody(panel: Any, 
     """viser tells that it is gone under the lock that `get_clients` takes, which every picture needs."""
     browser = Browser(3)
     ask(panel, "left")
-    panel.act("More like this", client=browser)
+    panel.on_action("More like this", client=browser)
     going = Thread(target=viewer.viser_server._client_disconnect_cb[-1], args=[browser], daemon=True)
     with panel._lock:  # which the other one has, who waits for the lock of viser
         going.start()
@@ -616,7 +616,7 @@ def test_a_browser_that_comes_or_goes_leaves_no_other_with_an_old_picture(panel:
     monkeypatch.setattr(viewer, "render_statemachines", {5: there})
     ask(panel, "left")
     drawn.clear()
-    panel.act("Hide")
+    panel.on_action("Hide")
     assert len(drawn) == 1
 
 
@@ -628,13 +628,13 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
     for prompts, negatives in (("left", ""), ("right, left", ""), ("up", "left")):  # the last of another rule
         ask(panel, prompts, negatives)
         assert not replace.visible
-        panel.act("Save prompts in run")
+        panel.on_action("Save prompts in run")
     assert stored().texts == ("left", "right") and replace.visible
     press(replace)
     assert (stored().texts, stored().negatives, stored().rule) == (("up",), ("left",), "lerf")
     assert not replace.visible
-    panel.act("Clear")
-    panel.act("Save prompts in run")
+    panel.on_action("Clear")
+    panel.on_action("Save prompts in run")
     assert "No query yet" in said(panel)
 
 
@@ -645,7 +645,7 @@ def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
     assert panel._widgets.ask.disabled
     assert "No semantics yet" in said(panel)
     for name in ("Ask", "Hide", "Undo", "Clear", "Save prompts in run", "More like this"):
-        panel.act(name, client=Browser())
+        panel.on_action(name, client=Browser())
         assert "No semantics yet" in said(panel), name
     pipeline.model.attach(field)
     assert not panel._widgets.ask.disabled

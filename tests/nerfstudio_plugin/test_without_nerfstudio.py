@@ -92,7 +92,7 @@ def test_the_config_of_a_lifted_run_is_the_edited_one(stock: StockRun) -> None:
         run_dir = outputs / "scene" / "normlift" / "first"
         config: Any = yaml.load(stock.config.read_text(), Loader=yaml.Loader)
         config.method_name, config.timestamp = "normlift", run_dir.name
-        config.output_dir = scene.location.portable(run_dir.parents[2])
+        config.output_dir = scene.location.relative_to_root(run_dir.parents[2])
         config.relative_model_dir = Path("nerfstudio_models")
         config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
         config.pipeline.model = NormLiftModelConfig.upgrade(config.pipeline.model, semantics=Path(FIELD_FOLDER))
@@ -128,7 +128,7 @@ def assert_equal(datamanager: config_classes.FullImageDatamanagerConfig, folder:
         assert (split.masks or None) == dataset._dataparser_outputs.mask_filenames  # nerfstudio: None for no masks
         assert torch.equal(split.poses, dataset.cameras.camera_to_worlds)
         if len(split) > 0:
-            assert split.kind == CameraType(int(dataset.cameras.camera_type[0])).name
+            assert split.camera_type == CameraType(int(dataset.cameras.camera_type[0])).name
         ours = TrainedViews(split, folder, split.poses, GREY, _reading(datamanager))
         theirs = DatasetViews(dataset, folder, dataset.cameras.camera_to_worlds, GREY)
         remarks = attempt(ours.check_files)

@@ -144,7 +144,7 @@ def test_of_lifts_at_once_all_are_numbered_or_all_but_one_refused(copied: Path, 
     default, chosen = (run_directory(source.runs_dir, source.name, name) for name in ("2024-05-01_120000", "now"))
 
     def lift(_: int) -> str:
-        return write_run(source, field, default, exact=False).name
+        return write_run(source, field, default, exact_name=False).name
 
     def lift_there(seed: int) -> Exception | Path:
         try:

@@ -12,11 +12,11 @@ from normlift_ns.planning import Measurements, Rate, _observe_loaded, _Observed,
 
 FACTS = Measurements(
     device="cpu, 2 threads", views=40, gaussians=1000, dimension=8, regions=10, entries=500, entry_bytes=8,
-    before_s={"start": 1.0, "open": 2.0}, load_s=5.0, features_s=0.5, kept_features_s=0.1, features_kept=0.25,
-    evidence_s=0.2, kept_evidence_s=0.01, evidence_kept=0.5,
+    preparation_s={"start": 1.0, "open": 2.0}, load_s=5.0, features_s=0.5, cached_features_s=0.1,
+    cached_features_share=0.25, evidence_s=0.2, cached_evidence_s=0.01, cached_evidence_share=0.5,
     core_s={"lift": Rate(1.0, 0.001, 2000), "vote": Rate(0.5, 0.002, 1000)},
     field_bytes=Rate(100, 10, 1000), run_bytes=900, write_bytes_s=1000, view_bytes=50,
-    host_bytes=10_000, device_bytes=None, looked_at=4,
+    host_bytes=10_000, device_bytes=None, measured_views=4,
 )  # fmt: skip
 
 
@@ -54,8 +54,8 @@ def test_memory_holds_evidence_and_directions() -> None:
 
 
 def test_what_is_cached_costs_no_disk_and_no_network() -> None:
-    new = make_plan(replace(FACTS, features_kept=0.0, evidence_kept=0.0))
-    kept = make_plan(replace(FACTS, features_kept=1.0, evidence_kept=1.0, features_s=None))
+    new = make_plan(replace(FACTS, cached_features_share=0.0, cached_evidence_share=0.0))
+    kept = make_plan(replace(FACTS, cached_features_share=1.0, cached_evidence_share=1.0, features_s=None))
     run = 100 + 10 * 1000 + 900
     assert kept.disk_bytes == run
     assert new.disk_bytes == run + 40 * 50 + 500 * 40 * 8 + 1000 * 16 * 40 // 16

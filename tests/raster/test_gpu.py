@@ -176,7 +176,7 @@ def test_projection_is_that_of_gsplat_bit_for_bit(kind, mode):
     theirs = gsplat.project_views(ready, [camera])
     drawn = (theirs.radii[0].view(len(scene), -1) > 0).all(1) & (theirs.opacities[0] >= rules.min_alpha)
     found = torch.zeros_like(drawn)
-    found[seen.seen] = True
+    found[seen.keys] = True
     both = found & drawn
     row, splat = (found.cumsum(0) - 1)[both], seen.splats
     ours = {

@@ -36,7 +36,7 @@ def shapes_of_all_kinds(n: int, seed: int, dtype: torch.dtype) -> GaussianScene:
 
 def listed(scene: GaussianScene, camera: Camera, dtype: torch.dtype, rules: RasterSettings):
     job = RasterJob(scene, False, rules, dtype)
-    projected = project(job.world, camera, rules, antialiased=False)
+    projected = project(job.prepared, camera, rules, antialiased=False)
     return job, projected, backend._tiles(projected, camera, rules)
 
 
@@ -48,8 +48,8 @@ def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed):
         shapes_of_all_kinds(300, seed, dtype), camera, dtype, SETTINGS
     )
     tiles = assign_tiles(projected, camera.width, camera.height, 16)
-    assert len(culled) < 0.9 * len(tiles.members)
-    offsets, members = tiles.offsets.numpy(), tiles.members.numpy()
+    assert len(culled) < 0.9 * len(tiles.indices)
+    offsets, members = tiles.offsets.numpy(), tiles.indices.numpy()
     everywhere = np.zeros_like(shapes)
     everywhere[:, 2] = np.inf  # every row of a tile
     most = np.diff(offsets) * kernels.count_labels(labels.numpy(), 16)

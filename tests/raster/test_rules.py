@@ -137,7 +137,7 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
     tiles = assign_tiles(seen, camera.width, camera.height, settings.tile_size)
     bounds = [*found.offsets.flatten().tolist(), len(found.members)]
     for tile, (first, last) in enumerate(itertools.pairwise(bounds)):
-        members = seen.gaussian[tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()]
+        members = seen.gaussian[tiles.indices[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()]
         # outside the rectangle of 3.33 standard deviations nothing is drawn: a later gsplat lists none of those
         missing = set(members.tolist()) ^ set(found.members[first:last].tolist())
         assert not missing or (later and rules == "1.4")

@@ -164,7 +164,7 @@ def test_a_question_that_could_not_be_loaded_is_not_stored(tmp_path: Path) -> No
         {"threshold": float("inf")},
         {"min_reliability": 2.0},
         {"texts": ("a", " ")},
-        {"vectors": torch.zeros(2, 3)},
+        {"embeddings": torch.zeros(2, 3)},
         {"negatives": ()},
         {"texts": ("a", "\ud800")},
     ):

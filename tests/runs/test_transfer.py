@@ -23,16 +23,16 @@ def test_nearest_rows_are_those_of_loops(seed, most):
     for i, point in enumerate(points):
         distances = [float(np.sqrt(((point - mean) ** 2).sum())) for mean in means]
         if i == 3:
-            assert not found.near[i]
+            assert not found.within_limit[i]
             continue
         assert found.row[i] == int(np.argmin(distances))
-        assert found.near[i] == (min(distances) <= most)
+        assert found.within_limit[i] == (min(distances) <= most)
 
 
 def test_points_however_far_away_have_no_label():
     for far in (1e150, 1e200, 1e300, np.finfo(np.float64).max):
         found = nearest_gaussians(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
-        assert found.near.tolist() == [False, True] and set(found.row) <= {0, 1, 2}, far
+        assert found.within_limit.tolist() == [False, True] and set(found.row) <= {0, 1, 2}, far
 
 
 def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:

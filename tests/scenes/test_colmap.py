@@ -55,7 +55,7 @@ def test_projects_are_read(tmp_path: Path) -> None:
             lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in kept}
             for image, frame in zip(images, frames()):
                 assert np.allclose(colmap_pose(image), frame.pose, atol=1e-12)
-                assert cameras[image.camera] == DISTORTED._replace(**lost), (model, binary)
+                assert cameras[image.camera_id] == DISTORTED._replace(**lost), (model, binary)
             assert np.array_equal(read_colmap_points(folder), points)
 
 

@@ -57,8 +57,8 @@ def test_a_broken_reader_names_itself(options: SplatOptions, tmp_path: Path) -> 
     splat.means[0, 0] = float("nan")
     torch.save(splat.parameters, path)
     for number, (value, result, problem) in enumerate((
-        ("nowhere:read", SPLAT, "package zipping cannot be loaded .*convert the splat to PLY"),
-        ("zipping:__name__", SPLAT, "is of type str, expected Callable"),
+        ("nowhere:read", SPLAT, "package zipping cannot be loaded .*use another splat format"),
+        ("zipping:__name__", SPLAT, "is of type str, expected function"),
         ("zipping:read", "1 / 0", "'zipped' .ZeroDivisionError"),
         ("zipping:read", "3", "returned int, expected a SplatFile"),
         ("zipping:read", SPLAT, "whose means are NaN"),

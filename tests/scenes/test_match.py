@@ -55,13 +55,13 @@ def scene(trained: Path):
 def test_what_belongs_together_passes(scene) -> None:
     match = measure_alignment(scene)
     assert match.psnr > 40  # the photographs are pictures of these very Gaussians
-    assert match.in_view > 0.5
-    assert match.grey_psnr < 20
-    assert alignment_warning(match, own_cameras=True) is None
+    assert match.visible_fraction > 0.5
+    assert match.mean_color_psnr < 20
+    assert alignment_warning(match, trained_cameras=True) is None
 
 
 def warning_of(scene, change) -> str:
-    warning = alignment_warning(measure_alignment(Changed(scene, change)), own_cameras=True)
+    warning = alignment_warning(measure_alignment(Changed(scene, change)), trained_cameras=True)
     assert warning is not None
     return warning
 
@@ -74,13 +74,13 @@ def test_another_focal_length_or_look_is_warned_of(scene) -> None:
 
 def test_cameras_and_images_of_another_scene_are_refused(scene) -> None:
     with pytest.raises(InputError, match=r"0\.00%"):
-        alignment_warning(measure_alignment(Changed(scene, shifted)), own_cameras=True)
+        alignment_warning(measure_alignment(Changed(scene, shifted)), trained_cameras=True)
     upside_down = Changed(scene, lambda view: view._replace(image=255 - view.image.flip(0)))
     match = measure_alignment(upside_down)
     with pytest.raises(InputError, match="does not show"):
-        alignment_warning(match, own_cameras=False)
+        alignment_warning(match, trained_cameras=False)
     assert "stopped early" in str(
-        alignment_warning(match, own_cameras=True)
+        alignment_warning(match, trained_cameras=True)
     )  # a run that was hardly trained can be lifted
 
 
@@ -95,7 +95,7 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
 
         match = measure_alignment(Changed(scene, change))
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
-        warning = alignment_warning(match, own_cameras=True)
+        warning = alignment_warning(match, trained_cameras=True)
         assert warning is not None and f"dB on {name}, one of the three training images" in warning
 
 
@@ -114,5 +114,5 @@ def test_masked_pixels_do_not_count(scene) -> None:
 def test_real_captures() -> None:
     for name, factor in (("fox", 0.98), ("tabletop", 1.02)):
         scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
-        assert alignment_warning(measure_alignment(scene), own_cameras=True) is None
+        assert alignment_warning(measure_alignment(scene), trained_cameras=True) is None
         assert "fit the images better" in warning_of(scene, focal(factor))

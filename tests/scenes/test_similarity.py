@@ -23,7 +23,7 @@ def test_a_matrix_is_read_in_its_parts(tmp_path: Path) -> None:
         world = read_world_transform(path)
         assert world.scale == pytest.approx(2.5)
         assert np.allclose(world.scale * world.transform, MATRIX[:3]), path
-        assert not world.single
+        assert not world.float32
 
 
 def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
     transform = np.column_stack([ROTATION, [1.0, 2.0, 3.0]])
     (tmp_path / "a.json").write_text(json.dumps({"transform": transform.tolist(), "scale": 0.5}))
     world = read_world_transform(tmp_path / "a.json", applied, 2.0)
-    assert world.single
+    assert world.float32
     assert world.scale == 0.25
     point = np.array([3.0, -1.0, 2.0])
     assert np.allclose(world.transform @ np.append(applied[:3, :3] @ point, 1), transform @ np.append(point, 1))

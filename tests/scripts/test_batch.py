@@ -66,7 +66,7 @@ class Batch:
         self.list.write_text("# captures\n\n" + "".join(f"{config}\n" for config in self.configs))
 
     def work(self, *options: str, patience: float = PATIENCE) -> dict[str, Outcome]:
-        return lift_captures(read_captures(self.list, options), self.results, patience, program=STAND_IN)
+        return lift_captures(read_captures(self.list, options), self.results, patience, command=STAND_IN)
 
     def start(self) -> FORK.Process:  # type: ignore[name-defined]
         process = FORK.Process(target=self.work)
@@ -155,12 +155,12 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
         made.results.mkdir()
 
         def first(made: Batch = made, captures: Sequence[Capture] = captures) -> None:
-            lift_captures(captures, made.results, 0.3, program=STAND_IN)
+            lift_captures(captures, made.results, 0.3, command=STAND_IN)
 
         if not killed_at(step, first, made.results):
             break
         killed.add(tuple(sorted(read_claim_states(made.results / "claims").values(), key=str)))
-        lift_captures(captures, made.results, 0.3, program=STAND_IN)
+        lift_captures(captures, made.results, 0.3, command=STAND_IN)
         made.check_lifted_once()
     assert step > 24
     one, done = ClaimState(1, None), ClaimState(1, "done")
@@ -188,7 +188,7 @@ def test_a_process_that_ends_has_time_to_clean_up(tmp_path):
         signal.signal(signal.SIGTERM, end); open(sys.argv[2], "w").close(); time.sleep(60)"""
     ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
     words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready)]
-    assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), every=0.01) is None
+    assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), interval=0.01) is None
     assert cleaned.exists()
 
 
@@ -217,8 +217,8 @@ def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     made = Batch(tmp_path, ["0"] * 4)
     made.work()
     captures = read_captures(made.list, ())
-    shutil.rmtree(captures[1].run)  # type: ignore[arg-type]
-    (captures[2].run / "normlift" / "manifest.json").write_text("{")  # type: ignore[operator]
+    shutil.rmtree(captures[1].run_dir)  # type: ignore[arg-type]
+    (captures[2].run_dir / "normlift" / "manifest.json").write_text("{")  # type: ignore[operator]
     checkpoint = made.configs[3].parent / "nerfstudio_models" / "step-000000009.ckpt"
     checkpoint.parent.mkdir()
     checkpoint.write_bytes(b"trained anew")
@@ -226,7 +226,7 @@ def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     assert made.begun() == {"c00": 1, "c01": 2, "c02": 1, "c03": 2}
     assert made.states() == ["done", "done", "failed", "done"]
     message = outcomes[captures[2].key].message
-    assert "manifest.json" in message and f"delete {captures[2].run}" in message
+    assert "manifest.json" in message and f"delete {captures[2].run_dir}" in message
     made.work("--encoder", "colour")  # other options: all of them
     assert made.begun() == {"c00": 2, "c01": 3, "c02": 2, "c03": 3}
     shutil.rmtree(made.results)  # the runs themselves say that they are there
@@ -289,16 +289,16 @@ def test_lines_of_the_list(tmp_path, monkeypatch):
     lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
     Path("list.txt").write_text("\r\n".join(lines), "utf8")
     found = read_captures(Path("list.txt"), ("--encoder", "colour"))
-    assert [capture.words[2:-2] for capture in found] == [
+    assert [capture.arguments[2:-2] for capture in found] == [
         ("--load-config", "a/config.yml"),
         ("--load-ply", "b c.ply", "--colmap", "b c", "--beta", "2"),
         ("--load-gsplat", "x#1.pt", "--transforms", "t.json"),
         ("--load-ply", "X.PLY"),
     ]
-    assert all(capture.words[:2] == ("--encoder", "colour") for capture in found)
-    assert all(capture.words[-2:] == ("--timestamp", f"batch_{capture.key}") for capture in found)
-    assert found[0].run is None  # the config is not there
-    assert found[1].run == tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}"
+    assert all(capture.arguments[:2] == ("--encoder", "colour") for capture in found)
+    assert all(capture.arguments[-2:] == ("--timestamp", f"batch_{capture.key}") for capture in found)
+    assert found[0].run_dir is None  # the config is not there
+    assert found[1].run_dir == tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}"
     assert len({capture.key for capture in found}) == 4
 
 
@@ -416,9 +416,9 @@ def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str
 
 def held(parts: list[Shard], size: int) -> list[int]:
     """How many parts hold each entry of a list; no part is larger than another by more than one."""
-    sizes = [sum(map(part.holds, range(size))) for part in parts]
+    sizes = [sum(map(part.contains, range(size))) for part in parts]
     assert max(sizes) - min(sizes) <= 1
-    return [sum(part.holds(position) for part in parts) for position in range(size)]
+    return [sum(part.contains(position) for part in parts) for position in range(size)]
 
 
 @given(st.integers(1, 50), st.integers(0, 200))

@@ -165,7 +165,7 @@ def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, 
 def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:
     run = open_run(lifted)
     answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
-    points = np.concatenate([run.to_capture.points(means[:50].double().numpy()), [[1e6, 0, 0]]])
+    points = np.concatenate([run.to_capture.transform_points(means[:50].double().numpy()), [[1e6, 0, 0]]])
     table = np.array([tuple(point) for point in points], [(axis, "f8") for axis in "xyz"])
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "cloud.ply"))
     flags = ("--load-config", lifted, "--output-dir", tmp_path, "--transfer", tmp_path / "cloud.ply")

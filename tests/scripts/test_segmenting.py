@@ -28,7 +28,7 @@ def weights(tmp_path, monkeypatch, asked) -> Path:
         there = {"red": (r > 2 * g) & (r > 2 * b) & (r > 60), "green": torch.zeros_like(r, dtype=torch.bool)}
         return [TextMasks(there[text][None], torch.tensor([0.9])) for text in texts]
 
-    monkeypatch.setattr(Sam3Network, "find", find)
+    monkeypatch.setattr(Sam3Network, "segment", find)
     from tests.encoders.tiny_library import write_tiny  # noqa: PLC0415 (transformers)
 
     write_tiny(tmp_path / "sam3", "sam3")

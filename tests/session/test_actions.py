@@ -67,14 +67,14 @@ def test_a_click_selects_the_connected_object_adds_and_takes_away():
 def test_the_thresholds_go_on_after_a_click_that_adds_and_stay_within_their_sliders():
     state = actions.click(asked("red"), ray(BLOCK), "add")
     assert chosen(actions.set_threshold(state, 1.5), 1)
-    assert actions.set_threshold(state, state.question.threshold) is state
+    assert actions.set_threshold(state, state.query.threshold) is state
     assert torch.equal(
         actions.set_min_reliability(asked("red"), 0.9).selection,
         rows(0, 2) & (world().field.scalars.reliability >= 0.9),
     )
     for typed, threshold, reliability in ((99.0, 1.0, 1.0), (-5.0, -0.2, 0.0), (0.3, 0.3, 0.3)):
-        assert actions.set_threshold(state, typed).question.threshold == threshold
-        assert actions.set_min_reliability(state, typed).question.min_reliability == reliability
+        assert actions.set_threshold(state, typed).query.threshold == threshold
+        assert actions.set_min_reliability(state, typed).query.min_reliability == reliability
     for act in (actions.set_threshold, actions.set_min_reliability):  # nothing is asked
         assert act(empty := State(world()), 0.3) is empty
 
@@ -90,7 +90,7 @@ def test_growing_goes_from_part_to_whole_and_shrinking_to_the_core():
     two = actions.resize(actions.select(State(world()), rows(0, 2)), -10)
     assert bool((two.selection & rows(0)).any()) and bool((two.selection & rows(2)).any())
     assert actions.resize(whole, 0) is whole
-    assert (actions.resize(whole, 99).steps, actions.resize(whole, -99).steps) == (10, -10)
+    assert (actions.resize(whole, 99).grow_steps, actions.resize(whole, -99).grow_steps) == (10, -10)
     assert chosen(actions.resize(State(world()), 3))
     shrunk = actions.resize(whole, -5)  # what is added or taken away then is so from what is left
     assert torch.equal(actions.add(shrunk, rows(1)).selection, shrunk.selection | rows(1))
@@ -101,7 +101,7 @@ def test_growing_goes_from_part_to_whole_and_shrinking_to_the_core():
 def test_every_step_of_growth_holds_the_one_before(some, steps):
     selected = torch.zeros(4 * BLOCK, dtype=torch.bool)
     selected[list(some)] = True
-    less, more = world().resized(selected, steps), world().resized(selected, steps + 1)
+    less, more = world().grow_or_shrink(selected, steps), world().grow_or_shrink(selected, steps + 1)
     assert not bool((less & ~more).any())
     assert steps < 0 or not bool((selected & ~more).any())
 
@@ -110,16 +110,16 @@ def test_a_box_cuts_inside_outside_and_turned():
     state = asked("red")
     box = SelectionBox((1.5, 1.5, 1.5), (10, 10, 10))
     assert chosen(actions.set_box(state, box), 0)
-    assert chosen(actions.set_box(state, SelectionBox(box.centre, box.size, keeps_inside=False)), 2)
+    assert chosen(actions.set_box(state, SelectionBox(box.center, box.size, keeps_inside=False)), 2)
     assert chosen(actions.add(actions.set_box(state, box), rows(1)), 0, 1)
     assert chosen(actions.set_box(actions.set_box(state, box), None), 0, 2)
     half = 0.5**0.5
     turned = SelectionBox((1, 2, 3), (2, 4, 6), (0.5, 0.1, -0.7, 0.2))
-    inside = torch.from_numpy(np.array(turned.centre) + 0.999 * (turned.corners - turned.centre))
-    outside = torch.from_numpy(np.array(turned.centre) + 1.001 * (turned.corners - turned.centre))
-    assert bool(turned.kept(inside).all()) and not bool(turned.kept(outside).any())
+    inside = torch.from_numpy(np.array(turned.center) + 0.999 * (turned.corners - turned.center))
+    outside = torch.from_numpy(np.array(turned.center) + 1.001 * (turned.corners - turned.center))
+    assert bool(turned.mask(inside).all()) and not bool(turned.mask(outside).any())
     turned = SelectionBox((101.5, 1.5, 1.5), (10, 300, 10), (half, 0, 0, half))  # y of the box is x of the world
-    assert torch.equal(turned.kept(world().means), rows(0, 1, 2))
+    assert torch.equal(turned.mask(world().means), rows(0, 1, 2))
 
 
 def test_every_deed_is_undone_and_done_again():
@@ -135,7 +135,7 @@ def test_every_deed_is_undone_and_done_again():
         actions.clear,
         actions.show_all,
     )
-    history, seen = History.of(State(world()), lean=State.lean), [(rows(), ~rows())]
+    history, seen = History.of(State(world()), lean=State.without_caches), [(rows(), ~rows())]
     for deed in deeds:
         history = history.do(deed(history.now))
         seen.append((history.now.selection, history.now.drawn))
@@ -170,7 +170,7 @@ def test_steps_of_a_slider_are_one_and_old_states_go_and_hold_no_masks():
     for value in range(2 * MAX_STATES):
         history = history.do(value)
     assert (len(history.states), history.now) == (MAX_STATES, 2 * MAX_STATES - 1)
-    history = History.of(asked("red"), lean=State.lean)
+    history = History.of(asked("red"), lean=State.without_caches)
     _ = history.now.selection
     history = history.do(actions.clear(history.now))
     assert "selection" not in vars(history.states[0])
@@ -182,15 +182,15 @@ def test_objects_are_listed_with_what_their_buttons_need():
     assert [(row.name, row.size) for row in found.objects] == [("red 1", 64), ("red 2", 64), ("blue 1", 64)]
     assert (found.left_out, found.in_smaller_parts) == (0, 0)
     first, blue = found.objects[0], found.objects[2]
-    assert first.centre == pytest.approx((1.5, 1.5, 1.5))
+    assert first.center == pytest.approx((1.5, 1.5, 1.5))
     assert first.extent == pytest.approx(np.linalg.norm(3 * [3 * 1.0]), rel=0.1)  # of the cube
-    assert first.colour[0] > 0.8 > first.colour[2]
-    assert (first.views, blue.views) == pytest.approx((2.0, 1.0))
+    assert first.color[0] > 0.8 > first.color[2]
+    assert (first.mean_views, blue.mean_views) == pytest.approx((2.0, 1.0))
     for row in (first, blue):
         grade = "strong" if row.reliability >= 0.8 else "fair" if row.reliability >= 0.6 else "weak"
         assert row.evidence.startswith(grade) and f"{row.reliability:.2f}" in row.evidence
     assert [row.size for row in list_objects(actions.hide(asked("red"), first.mask)).objects] == [64]
-    few = list_objects(asked("red, blue"), most=2)
+    few = list_objects(asked("red, blue"), max_objects=2)
     assert ([row.name for row in few.objects], few.left_out) == (["red 1", "blue 1"], 1)
     assert list_objects(asked("red"), min_size=65).in_smaller_parts == 128
     assert [row.name for row in list_objects(actions.show_prompt(asked("red, blue"), 1)).objects] == ["blue 1"]
@@ -202,25 +202,25 @@ def test_poor_evidence_is_told_and_left_out():
     state = asked("red, blue")
     poor = world().field.scalars.reliability < 0.6
     share = float((poor & rows(0, 1, 2)).sum() / (3 * BLOCK))
-    assert state.poor == pytest.approx(share) and share > 0.25
-    assert state.remark.startswith(f"{share:.0%} ")
+    assert state.weak_fraction == pytest.approx(share) and share > 0.25
+    assert state.warning.startswith(f"{share:.0%} ")
     sure = actions.remove_weak(state)
-    assert (sure.poor, sure.remark) == (0.0, "")
+    assert (sure.weak_fraction, sure.warning) == (0.0, "")
     assert torch.equal(sure.selection, rows(0, 1, 2) & ~poor)
     few = poor & rows(0, 1, 2)  # 20 % of what is selected
     few = actions.select(state, (few & (few.cumsum(0) <= 16)) | (~poor & rows(0, 1, 2)))
-    assert 0 < few.poor < 0.25 and few.remark == ""
+    assert 0 < few.weak_fraction < 0.25 and few.warning == ""
 
 
 def test_late_answers_do_not_count():
     turns = RequestTokens()
     first = turns.start("one")
     second = turns.start("two")
-    assert (turns.wanted(first), turns.wanted(second)) == (False, True)
+    assert (turns.is_current(first), turns.is_current(second)) == (False, True)
     assert not turns.finish(first)
     assert turns.busy == "two"
     assert turns.cancel()
-    assert not turns.wanted(second) and not turns.finish(second)
+    assert not turns.is_current(second) and not turns.finish(second)
     assert not turns.cancel()
     assert turns.busy == ""
 
@@ -233,6 +233,6 @@ def test_a_file_is_called_after_what_selects_and_what_is_selected_by_hand_says_s
         (state, "red, blue", ""), (actions.show_prompt(state, 1), "blue", ""), (floating, "selection", ", by hand"),
         (State(world()), "selection", ""),
     ):  # fmt: skip
-        assert (one.name, one.by_hand) == (name, by_hand)
+        assert (one.name, one.by_hand_suffix) == (name, by_hand)
     with pytest.raises(InputError, match="floaters"):
         actions.select_floaters(state, rows())

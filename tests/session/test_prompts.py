@@ -41,12 +41,12 @@ def test_an_unknown_word_marks_its_row_and_the_rest_is_answered():
         return read(texts)
 
     found = encode_prompts("red, zebra; blue", counted)
-    assert [(one.text, "'zebra'" in one.problem) for one in found] == [("red", False), ("zebra", True), ("blue", False)]
-    assert (found[0].problem, calls[0]) == ("", ("red", "zebra", "blue"))
+    assert [(one.text, "'zebra'" in one.error) for one in found] == [("red", False), ("zebra", True), ("blue", False)]
+    assert (found[0].error, calls[0]) == ("", ("red", "zebra", "blue"))
     prompts, question = build_query(world().field, found, read, negatives=())
     assert prompts == found
     assert question.texts == ("red", "blue")
-    np.testing.assert_array_equal(question.vectors, np.eye(3)[:2])
+    np.testing.assert_array_equal(question.embeddings, np.eye(3)[:2])
     with pytest.raises(InputError, match="zebra"):
         build_query(world().field, encode_prompts("zebra", read), read)
     with pytest.raises(InputError, match="Ask"):
@@ -70,20 +70,20 @@ def test_a_click_is_asked_by_its_direction_and_beside_texts_by_the_rule_cosine_a
     field, click = world().field, np.array([0.6, 0.8, 0], np.float32)
     known = {click_name(1): click}
     (prompt,) = encode_prompts("like click 1", read, known)
-    assert prompt.clicked
+    assert prompt.is_click
     _, question = build_query(field, [prompt], read)
     assert (question.rule, question.threshold, question.negatives) == ("cosine", 0.9, ())
     again = {row.text: row.vector for row in prompts_of_query(question)}
     (prompt,) = encode_prompts(join_prompts(question.texts), read, again)
     np.testing.assert_array_equal(prompt.vector, click)
     (lost,) = encode_prompts("like click 2", read, known)
-    assert lost.vector is None and "'like click 2'" in lost.problem
+    assert lost.vector is None and "'like click 2'" in lost.error
 
     prompts = [Prompt("red", read(["red"])[0]), prompt]
     assert build_query(field, prompts, read, negatives=())[1].texts == ("red", "like click 1")
     marked, question = build_query(field, prompts, read, negatives=["green"])
     assert question.texts == ("red",)
-    assert marked[0].problem == "" and "cosine" in marked[1].problem
+    assert marked[0].error == "" and "cosine" in marked[1].error
 
 
 def test_saving_keeps_what_is_saved():
@@ -95,7 +95,7 @@ def test_saving_keeps_what_is_saved():
     one, two = posed("red, blue", negatives=()), posed("blue, green", negatives=(), threshold=0.7)
     both = merge_queries(one, two)
     assert (both.texts, both.threshold) == (("red", "blue", "green"), 0.7)
-    np.testing.assert_array_equal(both.vectors, np.eye(3))
+    np.testing.assert_array_equal(both.embeddings, np.eye(3))
     assert merge_queries(None, two) is two and prompts_of_query(None) == ()
     for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
         with pytest.raises(InputError, match=f"2 prompts .*cosine.*{other.rule}"):

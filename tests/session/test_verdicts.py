@@ -35,24 +35,24 @@ def asked(space: SelectionContext, line: str, state: State | None = None) -> Sta
 
 def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     (verdict,) = diagnose_prompts(asked(coloured(), "green"))
-    assert verdict.words.startswith("green: ") and "0.00" in verdict.words and "0.9 " in verdict.words
-    place = verdict.nearest
-    assert place is not None and " ".join(f"{x:.2f}" for x in place) in verdict.words
+    assert verdict.warning.startswith("green: ") and "0.00" in verdict.warning and "0.9 " in verdict.warning
+    place = verdict.nearest_position
+    assert place is not None and " ".join(f"{x:.2f}" for x in place) in verdict.warning
     red, blue = diagnose_prompts(asked(coloured(), "red, blue"))
-    assert [(one.words, one.nearest) for one in (red, blue)] == 2 * [("", None)]
-    assert red.colour != blue.colour
+    assert [(one.warning, one.nearest_position) for one in (red, blue)] == 2 * [("", None)]
+    assert red.color != blue.color
     (unknown,) = diagnose_prompts(asked(world(), "green"))
-    assert unknown.words == ""  # of bare cosines of an unknown encoder nobody can tell
+    assert unknown.warning == ""  # of bare cosines of an unknown encoder nobody can tell
     state = asked(coloured(), "red")
     (verdict,) = diagnose_prompts(actions.set_threshold(state, 1.0))  # that nothing reaches
-    assert verdict.words.startswith("red: ") and verdict.words.count("1.00") == 2
-    assert "Suggested" in verdict.words and verdict.nearest is not None
+    assert verdict.warning.startswith("red: ") and verdict.warning.count("1.00") == 2
+    assert "Suggested" in verdict.warning and verdict.nearest_position is not None
 
 
 def test_histograms_are_of_the_prompts_that_select():
     state = asked(coloured(), "red, blue, green")
     assert [one.text for one in diagnose_prompts(state)] == ["red", "blue", "green"]
-    assert [one.text for one in diagnose_prompts(state, most=2)] == ["red", "blue"]
+    assert [one.text for one in diagnose_prompts(state, max_prompts=2)] == ["red", "blue"]
     assert [one.text for one in diagnose_prompts(actions.show_prompt(state, 1))] == ["blue"]
     counts = diagnose_prompts(state)[0].histogram.counts
     assert counts.tolist() == [BLOCK] + 30 * [0] + [2 * BLOCK]  # one cube is blue, two are red, one has no direction
@@ -66,7 +66,7 @@ def test_the_suggested_threshold_is_that_of_the_histogram():
     expected = np.median(values) + 0.6 * (np.quantile(values, 0.999) - np.median(values))
     assert threshold_suggestion(state) == pytest.approx(expected, abs=1e-6)
     after = actions.use_suggested_threshold(state)
-    assert after.question is not None and after.question.threshold == pytest.approx(expected, abs=1e-6)
+    assert after.query is not None and after.query.threshold == pytest.approx(expected, abs=1e-6)
     assert actions.use_suggested_threshold(after) is after
     assert threshold_suggestion(actions.show_prompt(state, 1)) == pytest.approx(0.6, abs=1e-6)
     assert threshold_suggestion(State(coloured())) is None
@@ -76,27 +76,27 @@ def test_the_suggested_threshold_is_that_of_the_histogram():
 
 def test_a_suggested_threshold_gives_way_to_the_person():
     state = asked(world(), "blue")
-    assert state.question is not None and state.answer is not None
-    assert not state.question.suggest
-    assert state.question.threshold == state.answer.question.threshold == pytest.approx(0.6, abs=1e-6)
+    assert state.query is not None and state.answer is not None
+    assert not state.query.suggest_threshold
+    assert state.query.threshold == state.answer.question.threshold == pytest.approx(0.6, abs=1e-6)
     again = asked(world(), "blue")  # the space remembers the relevancies, and suggests all the same
-    assert again.question is not None and again.question.threshold == state.question.threshold
+    assert again.query is not None and again.query.threshold == state.query.threshold
     moved = actions.set_threshold(state, 0.3)
     assert moved.answer is not None and moved.answer.question.threshold == 0.3
-    assert History.of(state).do(moved).undo().now.answer.question.threshold == state.question.threshold
+    assert History.of(state).do(moved).undo().now.answer.question.threshold == state.query.threshold
     for before, threshold in ((state, 0.6), (moved, 0.3)):  # two of three cubes are red, and are selected
         red = asked(world(), "red", before)
-        assert red.question is not None and red.question.threshold == pytest.approx(threshold, abs=1e-6)
+        assert red.query is not None and red.query.threshold == pytest.approx(threshold, abs=1e-6)
         assert torch.equal(red.selection, rows(0, 2))
 
 
 def test_the_threshold_stays_only_where_the_rule_does():
     state = actions.set_threshold(asked(coloured(), "red"), 0.8)
     after = asked(coloured(), "blue", state)
-    assert after.question is not None and after.question.threshold == 0.8
-    other = carry_threshold(state, replace(after.question, rule="margin", threshold=0.02))
+    assert after.query is not None and after.query.threshold == 0.8
+    other = carry_threshold(state, replace(after.query, rule="margin", threshold=0.02))
     assert other.threshold == 0.02
     prompts = encode_prompts("like click 1", read, {"like click 1": [1, 0, 0]})
     click = actions.ask(state, *build_query(coloured().field, prompts, read))
-    assert click.question is not None
-    assert carry_threshold(state, click.question).threshold == click.question.threshold == 0.9
+    assert click.query is not None
+    assert carry_threshold(state, click.query).threshold == click.query.threshold == 0.9

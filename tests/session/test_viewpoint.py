@@ -33,7 +33,7 @@ def walls(*sides: tuple[float, float, float], scale: float = 0.05) -> GaussianSc
 def test_a_spot_fills_half_the_picture_from_the_side_where_the_camera_is_unless_a_wall_is_there():
     seen = (0, -AWAY, 0)
     assert viewpoint(SPOT, FROM) == pytest.approx(seen)
-    assert viewpoint(SPOT, SPOT.centre) == pytest.approx(seen)
+    assert viewpoint(SPOT, SPOT.center) == pytest.approx(seen)
     assert viewpoint(LookAtTarget((1.0, 0.0, 0.0), 2.0), (1.0, 0.0, 9.0), np.pi / 2) == pytest.approx((1, 0, 2))
     for sides in ((), ((0, 1, 0),), ((1, 0, 0), (-1, 0, 0), (0, 0, 1))):  # nothing in the way
         assert unoccluded_viewpoint(SPOT, walls(*sides), None, FROM, UP) == pytest.approx(seen), sides

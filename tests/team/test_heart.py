@@ -84,7 +84,7 @@ class World:
         """Time passes, and then all who are well have beaten, and have heard all the others."""
         self.now += seconds
         for _ in range(2):
-            alive = [f"beat/{one.rank}" for one in self.hearts if not one._stop.is_set() and one.lost is None]
+            alive = [f"beat/{one.rank}" for one in self.hearts if not one._stop.is_set() and one.failure is None]
             before = {key: self.store.values.get(key) for key in alive}
             until(lambda before=before: all(self.store.values.get(key) != beat for key, beat in before.items()))
 
@@ -107,7 +107,7 @@ def test_a_slow_process_is_waited_for(world: World) -> None:
     hearts = world.team(3)
     for _ in range(4):
         world.pass_by(0.95 * HEARTBEAT_TIMEOUT)
-    assert [one.lost for one in hearts] == [None] * 3
+    assert [one.failure for one in hearts] == [None] * 3
     for one in reversed(hearts):
         one.stop(well=True)
     assert world.signals == []
@@ -119,11 +119,11 @@ def test_a_heartbeat_that_stands_still_is_noticed_by_all_others(world: World) ->
     hearts[0]._waiting = hearts[2]._waiting = True
     world.pass_by(0.4 * HEARTBEAT_TIMEOUT)
     world.pass_by(0.5 * HEARTBEAT_TIMEOUT)
-    assert hearts[0].lost is hearts[2].lost is None
+    assert hearts[0].failure is hearts[2].failure is None
     world.now += 0.2 * HEARTBEAT_TIMEOUT
-    found = [hearts[r].wait_for_a_loss() for r in (0, 2)]
-    assert [lost is not None and (lost.rank, lost.failed) for lost in found] == [(1, False)] * 2
-    assert str(os.getpid()) in found[0].place and world.signals == []  # type: ignore[union-attr]
+    found = [hearts[r].wait_for_failure() for r in (0, 2)]
+    assert [lost is not None and (lost.rank, lost.reported) for lost in found] == [(1, False)] * 2
+    assert str(os.getpid()) in found[0].host and world.signals == []  # type: ignore[union-attr]
 
 
 def test_one_that_ends_well_is_not_missed(world: World) -> None:
@@ -131,7 +131,7 @@ def test_one_that_ends_well_is_not_missed(world: World) -> None:
     hearts[1].stop(well=True)
     for _ in range(3):
         world.pass_by(0.9 * HEARTBEAT_TIMEOUT)
-    assert hearts[0].lost is None and world.signals == []
+    assert hearts[0].failure is None and world.signals == []
     hearts[0].stop(well=True)
 
 
@@ -140,8 +140,8 @@ def test_one_that_fails_says_so_and_only_the_first_one_speaks(world: World) -> N
     hearts[0]._waiting = hearts[1]._waiting = True
     assert hearts[2].stop(well=False)
     for r in (0, 1):
-        lost = hearts[r].wait_for_a_loss()
-        assert lost is not None and (lost.rank, lost.failed) == (2, True)
+        lost = hearts[r].wait_for_failure()
+        assert lost is not None and (lost.rank, lost.reported) == (2, True)
         assert not hearts[r].stop(well=False)
 
 
@@ -154,15 +154,15 @@ def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(
     world.store.values["end/1"] = b"failed"
     until(lambda: len(world.exits) > 0)
     assert (world.signals, world.exits) == ([15], [1])
-    assert [(lost.rank, lost.failed) for lost in world.words] == [(1, True)]
+    assert [(lost.rank, lost.reported) for lost in world.words] == [(1, True)]
 
 
 def test_a_store_that_is_gone_is_process_0(world: World) -> None:
     hearts = world.team(2)
     hearts[0]._waiting = True
     world.store.gone = True
-    lost = hearts[1].wait_for_a_loss()
-    assert lost is not None and (lost.rank, lost.failed) == (0, False)
+    lost = hearts[1].wait_for_failure()
+    assert lost is not None and (lost.rank, lost.reported) == (0, False)
     assert hearts[1].stop(well=False)  # to nobody, and it reports the loss
 
 

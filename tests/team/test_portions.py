@@ -45,10 +45,12 @@ def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
     means = torch.randn(n, 3, generator=generator(seed))
 
     def work(team: Threads) -> tuple[torch.Tensor, torch.Tensor]:
-        portion = Partition.of(team, means)
-        assert torch.equal(portion.gaussians, portion.gaussians.sort().values)
-        assert torch.equal(torch.cat([*portion.blocks(), portion.along[:0]]).sort().values, torch.arange(len(portion)))
-        return portion.gaussians, portion.join(means[portion.gaussians])
+        portion = Partition.from_means(team, means)
+        assert torch.equal(portion.indices, portion.indices.sort().values)
+        assert torch.equal(
+            torch.cat([*portion.blocks(), portion.curve_rows[:0]]).sort().values, torch.arange(len(portion))
+        )
+        return portion.indices, portion.all_gather(means[portion.indices])
 
     found = together(size, work)
     assert torch.equal(torch.cat([mine for mine, _ in found]).sort().values, torch.arange(n))
@@ -61,9 +63,11 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
     chunks = [[0], [1, 2], [3], [4]]
 
     def work(team: Threads) -> tuple[Evidence, torch.Tensor]:
-        portion = Partition.of(team, means)
-        pieces = {c: EvidenceShard.of(evidence.select_views(chunks[c]), portion) for c in team.chunks(len(chunks))}
-        return redistribute_evidence(pieces, portion, len(chunks)), portion.gaussians
+        portion = Partition.from_means(team, means)
+        pieces = {
+            c: EvidenceShard.split(evidence.select_views(chunks[c]), portion) for c in team.claim_chunks(len(chunks))
+        }
+        return redistribute_evidence(pieces, portion, len(chunks)), portion.indices
 
     for found, gaussians in together(size, work):
         expected = evidence.select_gaussians(gaussians)
@@ -85,8 +89,8 @@ def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:
 def lifted_by(team: Threads, seed: int, vote: str, storage: Storage) -> SemanticField | None:
     """All that follows from evidence, by the process of a team."""
     means, evidence, features = world(seed)
-    portion = Partition.of(team, means)
-    mine = evidence.select_gaussians(portion.gaussians)
+    portion = Partition.from_means(team, means)
+    mine = evidence.select_gaussians(portion.indices)
     levels = torch.zeros(REGIONS, dtype=torch.int64)
     table = consensus_distributed(ViewObservations(mine, features, levels), portion, sample=5).features
     lifted = lift(mine, table)

@@ -19,7 +19,7 @@ class Threads(Communicator):
     """One of some threads."""
 
     def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
-        self.rank, self.size, self._board, self._barrier = rank, size, board, barrier
+        self.rank, self.world_size, self._board, self._barrier = rank, size, board, barrier
         self.taken: list[int] = []
 
     def _all(self, value: Any) -> list[Any]:
@@ -29,34 +29,34 @@ class Threads(Communicator):
         self._barrier.wait(60)
         return found
 
-    def join(self, rows: Tensor) -> Tensor:
+    def all_gather(self, rows: Tensor) -> Tensor:
         return torch.cat(self._all(rows))
 
-    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+    def gather(self, rows: Tensor) -> list[Tensor] | None:
         found = self._all(rows)
         return found if self.rank == 0 else None
 
-    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+    def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         return [given[self.rank] for given in self._all(list(parts))]
 
-    def add(self, values: Tensor) -> Tensor:
+    def all_reduce(self, values: Tensor) -> Tensor:
         return torch.stack(self._all(values)).sum(dim=0)
 
-    def spread(self, values: Tensor) -> Tensor:
+    def broadcast(self, values: Tensor) -> Tensor:
         return self._all(values)[0]
 
-    def tell(self, value: Any) -> Any:
+    def broadcast_object(self, value: Any) -> Any:
         return self._all(value)[0]
 
-    def tell_all(self, value: Any) -> list[Any]:
+    def all_gather_object(self, value: Any) -> list[Any]:
         return self._all(value)
 
     @contextmanager
-    def shares(self, folder: Any) -> Iterator[None]:
+    def shared_folder(self, folder: Any) -> Iterator[None]:
         yield
 
-    def chunks(self, count: int) -> Iterator[int]:
-        return iter(range(count)[::-1][self.rank :: self.size])  # in an order that nobody expects
+    def claim_chunks(self, count: int) -> Iterator[int]:
+        return iter(range(count)[::-1][self.rank :: self.world_size])  # in an order that nobody expects
 
 
 def together(size: int, work: Callable[[Threads], T]) -> list[T]:

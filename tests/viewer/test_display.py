@@ -77,7 +77,10 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
     )
     image, alpha = torch.rand(200, 300, 7, generator=torch.Generator().manual_seed(1)), torch.ones(200, 300)
     rgb = torch.full((200, 300, 3), 0.5)
-    told, seen = render_outputs(display, rgb, image, alpha), render_outputs(display, rgb, image, alpha, by_text=True)
+    told, seen = (
+        render_outputs(display, rgb, image, alpha),
+        render_outputs(display, rgb, image, alpha, named_by_text=True),
+    )
     assert list(told)[:2] == ["relevancy_0", "relevancy_1"]
     assert list(seen)[:2] == ["relevancy_sky_blue", "relevancy_sky_blue_2"]
     others = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
@@ -94,10 +97,13 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
 
 
 def test_the_scale_is_that_of_all_prompts_and_views() -> None:
-    assert make_display((a := shown(("a", "b"), torch.rand(3, 2) * 0.3)).field, a).whole == (0.0, pytest.approx(0.55))
+    assert make_display((a := shown(("a", "b"), torch.rand(3, 2) * 0.3)).field, a).map_scale == (
+        0.0,
+        pytest.approx(0.55),
+    )
     answer = shown(("a", "b"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))
     for one in (None, 0, 1):
-        assert make_display(answer.field, answer, shown=one).whole == (0.0, pytest.approx(0.9))
+        assert make_display(answer.field, answer, shown=one).map_scale == (0.0, pytest.approx(0.9))
     assert make_display(answer.field, answer, shown=1).scale == (0.5, pytest.approx(0.7))
     assert (make_display(answer.field, answer, shown=1).title, make_display(answer.field, answer).title) == (
         "relevancy: b", "relevancy, all prompts",

@@ -366,7 +366,9 @@ def test_objects_and_nearest_matches_have_buttons(crowd, run):
     page.draws(4 * BLOCK)
 
     panel, place = crowd._here[0]._panel, (1.0, 2.0, 3.0)
-    panel.judge("", [SimpleNamespace(text="zebra", nearest=place), SimpleNamespace(text="red", nearest=None)])
+    panel.judge(
+        "", [SimpleNamespace(text="zebra", nearest_position=place), SimpleNamespace(text="red", nearest_position=None)]
+    )
     before = page.camera.position
     page.press("Go to nearest: zebra")
     page.until(lambda: page.camera.position is not before)
@@ -440,7 +442,7 @@ def test_a_slow_page_gets_the_last_picture_and_not_all_of_them(crowd):
     page.slow = True
     for deed in ("Hide", "Unhide", "Only"):
         page.press("Selection", deed)
-    page.until(lambda: int(state().drawn.sum()) == 2 * BLOCK and "Only" in state().did)
+    page.until(lambda: int(state().drawn.sum()) == 2 * BLOCK and "Only" in state().action)
     looks = page.looks
     page.until(lambda: page.looks > looks + 2)
     assert drawn == []
@@ -508,7 +510,7 @@ def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run):
     page.asks("red", 2 * BLOCK)
     page.ask("blue")
     page.until(lambda: not page.gui["Ask"].disabled)
-    question = crowd._here[0].state.question
+    question = crowd._here[0].state.query
     assert question is not None and question.texts == ("red",)
 
     def gone(_):

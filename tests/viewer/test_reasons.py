@@ -71,14 +71,14 @@ def test_three_that_weigh_most_and_those_that_disagree():
 def test_reasons_belong_to_their_selection():
     reasons = Explanation(FakeVotes)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="nothing is selected"):
-        reasons.find(reasons.start(State(world())), State(world()))
+        reasons.compute(reasons.start(State(world())), State(world()))
     assert (reasons.content, reasons.busy) == ("", "")
     state = actions.select(State(world()), rows(0))
-    reasons.find(reasons.start(state), state)
+    reasons.compute(reasons.start(state), state)
     assert "weigh most" in reasons.content
-    reasons.follow(actions.hide(state))  # the selection is the same
+    reasons.update(actions.hide(state))  # the selection is the same
     assert reasons.content != ""
-    reasons.follow(actions.select(state, rows(1)))
+    reasons.update(actions.select(state, rows(1)))
     assert reasons.content == ""
 
 
@@ -99,7 +99,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
 
     def find() -> None:
         try:
-            reasons.find(reasons.start(state), state)
+            reasons.compute(reasons.start(state), state)
         except InputError as error:
             raised.append(error)
 
@@ -107,7 +107,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
     thread.start()
     assert begun.wait(20)
     assert reasons.busy
-    reasons.follow(actions.select(state, rows(1)))
+    reasons.update(actions.select(state, rows(1)))
     go_on.set()
     thread.join(20)
     assert (reasons.content, reasons.busy, raised) == ("", "", [])

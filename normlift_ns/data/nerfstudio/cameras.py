@@ -207,7 +207,7 @@ class DatasetSplit:
 
     files: list[Path]
     masks: list[Path] | None
-    kind: str
+    camera_type: str
     """PERSPECTIVE, FISHEYE or another of nerfstudio's camera types."""
     poses: Float[Tensor, "v 3 4"]
     intrinsics: Float[Tensor, "v 4"]
@@ -225,7 +225,7 @@ class DatasetSplit:
         return DatasetSplit(
             [self.files[i] for i in indices],
             None if self.masks is None else [self.masks[i] for i in indices],
-            self.kind,
+            self.camera_type,
             self.poses[rows],
             self.intrinsics[rows],
             self.sizes[rows],
@@ -241,7 +241,7 @@ class DatasetSplit:
         elif rounding == "ceil":
             sides = torch.ceil(sides)
         return DatasetSplit(
-            self.files, self.masks, self.kind, self.poses, self.intrinsics * scale, sides.to(torch.int64),
+            self.files, self.masks, self.camera_type, self.poses, self.intrinsics * scale, sides.to(torch.int64),
             self.distortion,
         )  # fmt: skip
 

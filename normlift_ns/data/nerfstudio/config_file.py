@@ -136,7 +136,7 @@ class RunLocation:
     because output_dir is absolute or the run was moved."""
     data: Path
     """The dataset: a folder or a .json file."""
-    moved_data: bool
+    data_moved: bool
     """Whether `data` differs from the path in the config, read relative to `root`."""
 
     @property
@@ -144,7 +144,7 @@ class RunLocation:
         """Folder of the dataset."""
         return self.data.parent if self.data.suffix == ".json" else self.data
 
-    def portable(self, path: Path) -> Path:
+    def relative_to_root(self, path: Path) -> Path:
         """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
         return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
 
@@ -172,13 +172,13 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
                 f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
                 "transforms.json that the run was trained with."
             )
-        return RunLocation(run_dir, output_dir, root, _absolute(data), moved_data=True)
+        return RunLocation(run_dir, output_dir, root, _absolute(data), data_moved=True)
     stored = dataset_in_config(config)
     tried = _dataset_candidates(stored, output_dir, root)
     for path in tried:
         if path.exists():
             moved = root is None or path != _absolute(root / stored)
-            return RunLocation(run_dir, output_dir, root, path, moved_data=moved)
+            return RunLocation(run_dir, output_dir, root, path, data_moved=moved)
     raise FileNotFoundError(
         f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
         "If it was moved, give its path with --data."

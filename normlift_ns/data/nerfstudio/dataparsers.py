@@ -205,7 +205,7 @@ def parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
         poses[:, :3, :4],
         torch.tensor([row[:4] for row in values], dtype=torch.float32),
         torch.tensor(
-            [[cameras[image.camera].width, cameras[image.camera].height] for image in images], dtype=torch.int64
+            [[cameras[image.camera_id].width, cameras[image.camera_id].height] for image in images], dtype=torch.int64
         ),
         torch.tensor([row[4:] for row in values], dtype=torch.float32),
     )
@@ -220,10 +220,10 @@ def _colmap_cameras(
 ) -> tuple[str, list[list[float]]]:
     """Return nerfstudio's type of all cameras, and fx, fy, cx, cy and k1, k2, k3, k4, p1, p2 of each image."""
     intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
-    kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera].model else "PERSPECTIVE" for image in images}
+    kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera_id].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
         raise InputError("multiple camera models are not supported")
-    values = [intrinsics[image.camera] for image in images]
+    values = [intrinsics[image.camera_id] for image in images]
     if any(row[7] != 0 for row in values):
         raise InputError("the distortion k4 of a camera is not zero")
     return kinds.pop(), values
@@ -233,7 +233,7 @@ def _colmap_camera(camera: ColmapCamera) -> list[float]:
     """Return fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
     if camera.model not in _INTRINSICS_AND_DISTORTION:
         raise InputError(f"{camera.model} camera model is not supported yet")
-    values = _INTRINSICS_AND_DISTORTION[camera.model](*camera.parameters)
+    values = _INTRINSICS_AND_DISTORTION[camera.model](*camera.params)
     return [*values, *[0.0] * (10 - len(values))]
 
 

@@ -226,7 +226,7 @@ class TrainedViews(SplitViews):
         width, height = self._sizes[index]
         distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
         fx, fy, cx, cy = self._split.intrinsics[index].tolist()
-        return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
+        return _Lens(self._split.camera_type, Intrinsics(fx, fy, cx, cy, width, height), distortion)
 
     def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
         lens = self._lens(index)
@@ -361,7 +361,7 @@ class NerfstudioScene:
     """Config and step, for the manifest; for a lifted run also the gsplat rules of its rasterization."""
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
-    added: tuple[Frame, ...] = ()
+    extra_frames: tuple[Frame, ...] = ()
     """Frames of the extra views at the end of `train`, which the run was not trained with, in the world of the
     Gaussians."""
 
@@ -428,7 +428,7 @@ of the dataset, the training poses and the background color."""
 
 
 def load_nerfstudio_scene(
-    load_config: Path, *, data: Path | None = None, load_step: int | None = None, by_nerfstudio: ViewsFactory
+    load_config: Path, *, data: Path | None = None, load_step: int | None = None, make_nerfstudio_views: ViewsFactory
 ) -> NerfstudioScene:
     """Load a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
 
@@ -438,7 +438,7 @@ def load_nerfstudio_scene(
         load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
         data: current path of the dataset, if it was moved.
         load_step: step of the checkpoint; None: the last.
-        by_nerfstudio: creates the views for Aria's cameras (FISHEYE624), which only nerfstudio can undistort.
+        make_nerfstudio_views: creates the views for Aria's cameras (FISHEYE624), which only nerfstudio can undistort.
     Raises:
         FileNotFoundError: if the config, the checkpoint, the dataset or an image is missing.
         ValueError: if the config belongs to another method or program, the checkpoint is damaged, or the dataset is not
@@ -457,8 +457,8 @@ def load_nerfstudio_scene(
     remarks = _check_transform(dataset.transform, dataset.scale, location)
     poses = _training_poses(dataset.train, model, checkpoint)
     color = background_color(model)
-    if dataset.train.kind == "FISHEYE624":
-        train, held_out = by_nerfstudio(config, location.folder, poses, color)
+    if dataset.train.camera_type == "FISHEYE624":
+        train, held_out = make_nerfstudio_views(config, location.folder, poses, color)
     else:
         reading = _reading(datamanager)
         train = TrainedViews(dataset.train, location.folder, poses, color, reading)
