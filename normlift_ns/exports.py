@@ -282,7 +282,7 @@ def nearest_gaussians(
         max_distance: maximum distance, inclusive.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
-    NearestGaussians(row=array([1, 0]), near=array([ True, False]))
+    NearestGaussians(row=array([1, 0]), within_limit=array([ True, False]))
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 (nothing else here needs it)
 
@@ -459,7 +459,7 @@ def _export_ply(job: ExportJob, path: Path) -> list[str]:
 def _export_masks(job: ExportJob, folder: Path) -> list[str]:
     assert job.answer is not None
     settings = RasterSettings.recorded(job.field.manifest)
-    kwargs = {"rest": job.rest, "settings": settings, "overwrite": job.overwrite}
+    kwargs = {"invert": job.rest, "settings": settings, "overwrite": job.overwrite}
     lines = [f"{len(write_masks(job.scene, job.answer.mask, folder, **kwargs))} masks in {folder}"]
     with suppress(FileNotFoundError, InputError):  # the first image may be missing
         if job.scene.train[0].original is not None:

@@ -144,7 +144,7 @@ def measure(report: Report, case: Case) -> None:
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         job = RasterJob(case.scene, False, RasterSettings(), torch.float32)
-        intersections = len(project_views(job, case.cameras[:1]).members)
+        intersections = len(project_views(job, case.cameras[:1]).indices)
         evidence_s, evidence = timed(case.evidence)
         evidence_gib = torch.cuda.max_memory_allocated() / 2**30
         table = features(evidence.num_regions)
@@ -217,7 +217,7 @@ def agreement(report: Report, cases: Sequence[Case]) -> None:
                 job = RasterJob(case.scene, mode == "antialiased", RasterSettings(), torch.float32)
                 seen = project_views(job, [camera])
                 drawing = (seen.means2d, seen.conics, torch.zeros(1, len(case.scene), 1, device="cuda"), seen.opacities)
-                _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.members)
+                _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.indices)
                 alpha += float(alphas.double().sum())
             alpha_worst = max(alpha_worst, abs(float(weight) / alpha - 1))
             repeatable &= all(torch.equal(getattr(ours.rows, x), getattr(again.rows, x)) for x in ("weight", "column"))

@@ -310,7 +310,7 @@ def dense_sums(
     for camera, features in zip(cameras, maps):
         projected = project_views(job, [camera])
         splats = (projected.means2d, projected.conics, blank, projected.opacities, None, None)
-        tiles = (job.settings.tile_size, projected.offsets, projected.members)
+        tiles = (job.settings.tile_size, projected.offsets, projected.indices)
         inputs = (*splats, camera.width, camera.height, *tiles)
         _, alphas, last = forward(*inputs)
         alpha_gradient = torch.zeros_like(alphas)

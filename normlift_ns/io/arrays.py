@@ -134,7 +134,7 @@ def read_safetensors(
     framework: str,
     digest: Callable[[Any, dict[str, str], str], str],
     key: str,
-    undigested: Collection[str] | None,
+    legacy_keys: Collection[str] | None,
     remedy: str,
 ) -> tuple[dict[str, Any], dict[str, str], str | None]:
     """Read a file, check its digest, and return its arrays, metadata and digest.
@@ -142,7 +142,7 @@ def read_safetensors(
     Args:
         framework: "np" or "pt", the type of the returned arrays.
         digest: computes the digest of arrays, metadata and key.
-        key, undigested, remedy: as in `tensors.load_tensors`.
+        key, legacy_keys, remedy: as in `tensors.load_tensors`.
     Raises:
         FileNotFoundError, ValueError: as in `tensors.load_tensors`.
     """
@@ -153,7 +153,7 @@ def read_safetensors(
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
         expected = facts.pop(DIGEST_KEY, None)
-        has_digest = expected is not None or undigested is None or set(facts) != set(undigested)
+        has_digest = expected is not None or legacy_keys is None or set(facts) != set(legacy_keys)
         actual = digest(arrays, facts, key) if has_digest else None
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
@@ -246,7 +246,7 @@ class TensorFile(NamedTuple):
     """Content of a file."""
 
     tensors: dict[str, Tensor]
-    facts: dict[str, str]
+    metadata: dict[str, str]
     """Metadata, without the digest."""
     digest: str | None
     """None for files of version 0.1."""
@@ -302,20 +302,20 @@ def save_tensors(
 
 
 def load_tensors(
-    path: Path, *, key: str = "", undigested: Collection[str] | None = None, remedy: str = "write it again"
+    path: Path, *, key: str = "", legacy_keys: Collection[str] | None = None, remedy: str = "write it again"
 ) -> TensorFile:
     """Read a file of `save_tensors` and check its digest.
 
     Args:
         key: the key that the file was saved with.
-        undigested: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
+        legacy_keys: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
             these keys is read without a check. None: every file must have a digest.
         remedy: what the error message suggests if the file is missing or damaged.
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: the digest does not match, or the file is not a safetensors file.
     """
-    return TensorFile(*read_safetensors(path, "pt", tensor_digest, key, undigested, remedy))
+    return TensorFile(*read_safetensors(path, "pt", tensor_digest, key, legacy_keys, remedy))
 
 
 def check_tensor(

@@ -95,8 +95,8 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged or not an evidence file.
     """
-    undigested = None if key else ("format", *EVIDENCE_COUNTS)
-    arrays, metadata, digest = load_arrays(path, key=key, legacy_keys=undigested, remedy=remedy)
+    legacy_keys = None if key else ("format", *EVIDENCE_COUNTS)
+    arrays, metadata, digest = load_arrays(path, key=key, legacy_keys=legacy_keys, remedy=remedy)
     if metadata.get("format") != EVIDENCE_FORMAT:
         raise InputError(
             f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "

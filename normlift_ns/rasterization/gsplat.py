@@ -44,10 +44,10 @@ class GsplatProjection(NamedTuple):
     means2d: Float32[Tensor, "c n 2"]
     conics: Float32[Tensor, "c n 3"]
     opacities: Float32[Tensor, "c n"]
-    members: Int32[Tensor, " intersections"]
+    indices: Int32[Tensor, " intersections"]
     """Indices into c * n, sorted by camera, tile and depth."""
     offsets: Int32[Tensor, "c tiles_y tiles_x"]
-    """Start of each tile in `members`."""
+    """Start of each tile in `indices`."""
     depths: Float32[Tensor, "c n"]
     radii: Int32[Tensor, "c n *axes"]
     """Half sides of squares or rectangles; 0: not drawn."""
@@ -74,9 +74,9 @@ def project_views(job: RasterJob, cameras: Sequence[Camera]) -> GsplatProjection
     opacities = opacities * compensations if job.antialiased else opacities.contiguous()
     _project_enormous(job, cameras, radii, means2d, depths, conics, opacities)
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
-    _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down)
+    _, keys, indices = isect_tiles(means2d, radii, depths, settings.tile_size, across, down)
     offsets = isect_offset_encode(keys, len(cameras), across, down)
-    return GsplatProjection(means2d, conics, opacities, members, offsets, depths, radii)
+    return GsplatProjection(means2d, conics, opacities, indices, offsets, depths, radii)
 
 
 def _squares(conics: Float32[Tensor, "c n 3"], settings: RasterSettings) -> Int32[Tensor, "c n 2"]:
@@ -203,7 +203,7 @@ def composite(
     if len(job.scene) == 0 or values.shape[1] == 0:
         return values.new_zeros(*size, values.shape[1]), values.new_zeros(size)
     projections = project_views(job, [camera])
-    tiles = (camera.width, camera.height, job.settings.tile_size, projections.offsets, projections.members)
+    tiles = (camera.width, camera.height, job.settings.tile_size, projections.offsets, projections.indices)
     parts = [
         rasterize_to_pixels(
             projections.means2d, projections.conics, part[None].contiguous(), projections.opacities, *tiles
@@ -226,7 +226,7 @@ def _gradients(
     projections, settings = project_views(job, [camera]), job.settings
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
     splats = (projections.means2d, projections.conics, colors, projections.opacities)
-    lists = (None, camera.width, camera.height, settings.tile_size, projections.offsets, projections.members)
+    lists = (None, camera.width, camera.height, settings.tile_size, projections.offsets, projections.indices)
     forward, backward = compiled_rasterizer()
     transmittance, alphas, last = forward(*splats, colors.new_ones(1, _CHANNELS), *lists)
     correction = transmittance[..., :1] / (1 - alphas)

@@ -136,7 +136,7 @@ def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(folders, kind, monkeypatch)
     source = make(kind, folders[kind])
     if kind != "sam3":
         source = replace(source, rules=replace(EVERY, points_per_side=5))
-        source.network.masks.size = 4
+        source.network.masks.batch_size = 4
     together = 2 if kind == "sam3" else 4
     _ = source.network
     with Largest() as largest:

@@ -115,7 +115,7 @@ def stock(monkeypatch):
             drawn = drawn[depths[0, drawn].argsort(stable=True)]
             shape = SimpleNamespace(means2d=means2d[0, drawn], radii=square[drawn].float())
             tiles = assign_tiles(shape, across * size, down * size, size)
-            return None, tiles.offsets, drawn[tiles.members.long()].int()
+            return None, tiles.offsets, drawn[tiles.indices.long()].int()
 
         module = ModuleType("gsplat.cuda._wrapper")
         module.fully_fused_projection, module.isect_tiles = fully_fused_projection, isect_tiles
@@ -135,15 +135,15 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
     found = gsplat.project_views(RasterJob(scene, antialiased, settings, torch.float32), [camera])
     seen = project(prepare_gaussians(scene, torch.float32), camera, settings, antialiased)
     tiles = assign_tiles(seen, camera.width, camera.height, settings.tile_size)
-    bounds = [*found.offsets.flatten().tolist(), len(found.members)]
+    bounds = [*found.offsets.flatten().tolist(), len(found.indices)]
     for tile, (first, last) in enumerate(itertools.pairwise(bounds)):
         members = seen.gaussian[tiles.indices[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()]
         # outside the rectangle of 3.33 standard deviations nothing is drawn: a later gsplat lists none of those
-        missing = set(members.tolist()) ^ set(found.members[first:last].tolist())
+        missing = set(members.tolist()) ^ set(found.indices[first:last].tolist())
         assert not missing or (later and rules == "1.4")
         kept = [x for x in members.tolist() if x not in missing]
-        assert found.members[first:last].tolist() == kept
-    listed = torch.isin(seen.gaussian, found.members)
+        assert found.indices[first:last].tolist() == kept
+    listed = torch.isin(seen.gaussian, found.indices)
     at = seen.gaussian[listed]
     assert torch.allclose(found.opacities[0, at], seen.opacities[listed], rtol=1e-5, atol=1e-7)
     assert torch.allclose(found.means2d[0, at], seen.means2d[listed])
