@@ -190,7 +190,7 @@ def test_mistakes_are_told_before_torch_is_loaded(empty_hub: Path, monkeypatch: 
 
 @pytest.mark.slow
 def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
-    recipe = (ROOT / "CONTRIBUTING.md").read_text("utf8").split("## An encoder of your own")[1].split("## Dep")[0]
+    recipe = (ROOT / "CONTRIBUTING.md").read_text("utf8").split("## An encoder of your own")[1].split("\n## ")[0]
     (project,), (code,) = (re.findall(f"```{kind}\n(.*?)```", recipe, re.DOTALL) for kind in ("toml", "python"))
     source, installed = tmp_path / "source", tmp_path / "installed"
     source.mkdir()

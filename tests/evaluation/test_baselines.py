@@ -256,7 +256,7 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
     weights = iter([weights for _, weights, _ in seen])
 
     def project_views(job: RasterJob, cameras: list[Camera]) -> SimpleNamespace:
-        return SimpleNamespace(means2d=None, conics=None, opacities=None, offsets=None, members=next(weights))
+        return SimpleNamespace(means2d=None, conics=None, opacities=None, offsets=None, indices=next(weights))
 
     def backward(*given: Any) -> tuple[Any, ...]:
         gradient = given[13]
