@@ -60,8 +60,14 @@ def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGauss
     """Return the drawable Gaussians with their covariances R diag(scale ** 2) R^T."""
     gaussian = scene.drawable.nonzero().squeeze(1)
     quats, scales, opacities = (x[gaussian].to(dtype) for x in (scene.quats, scene.scales, scene.opacities))
+    half = rotation_matrices(quats) * scales[:, None, :]
+    return PreparedGaussians(gaussian, scene.means[gaussian], half @ half.transpose(1, 2), opacities)
+
+
+def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Return the rotations of quaternions (w, x, y, z) of any length but 0."""
     w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True)).unbind(1)
-    rotation = torch.stack(
+    return torch.stack(
         [
             torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
             torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
@@ -69,8 +75,6 @@ def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGauss
         ],
         1,
     )
-    half = rotation * scales[:, None, :]
-    return PreparedGaussians(gaussian, scene.means[gaussian], half @ half.transpose(1, 2), opacities)
 
 
 def project(
