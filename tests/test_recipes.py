@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING.md for a rule, an output and a scene source, applied to a copy of the package."""
+"""The recipes of CONTRIBUTING.md, applied to a copy of the package."""
 
 import csv
 import json
@@ -21,13 +21,13 @@ PARTS = dict(part.partition(" of your own\n")[::2] for part in re.split(r"^## ",
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package with all three."""
+    """The package with all of them."""
     copy = tmp_path_factory.mktemp("copy")
     shutil.copytree(ROOT / "normlift_ns", copy / "normlift_ns", ignore=shutil.ignore_patterns("__pycache__"))
     (code,) = re.findall("```python\n(.*?)```", PARTS["An output"], re.DOTALL)
     (entry_points,) = re.findall(r"```toml\n\[project\.entry-points\.(.*?)```", PARTS["An output"], re.DOTALL)
     install(copy, "normlift_table", re.sub('"(.*?)"', r"\1", f"[{entry_points}"), code)
-    for name in ("A rule", "A scene source"):
+    for name in ("A rule", "A scene source", "A reliability", "A rasterizer"):
         (recipe,) = re.findall("```diff\n(.*?)```", PARTS[name], re.DOTALL)
         words = ["git", "apply", "--verbose", "-"]
         outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(copy.parent)}
@@ -80,10 +80,31 @@ else:
 """
 
 
+FLAT = """
+import torch, normlift_ns as nl
+from normlift_ns.core.lift import reliability
+assert reliability(0.6, torch.tensor([2.0]), beta=1.0).allclose(torch.tensor(0.24))
+n, turn = 60, 3 * torch.rand(60)
+quats = torch.stack([turn.cos(), 0 * turn, 0 * turn, turn.sin()], 1)
+scales = (0.02 + 0.1 * torch.rand(n, 3)) * torch.tensor([1.0, 1, 0])
+scene = nl.GaussianScene(2 * torch.rand(n, 3) + torch.tensor([-1.0, -1, 2]), quats, scales, 0.3 * torch.rand(n))
+camera = nl.Camera(torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), torch.eye(4), 64, 48)
+how = {"settings": nl.RasterSettings(eps2d=0.0, frustum_margin=1e3, min_discriminant=0.0), "dtype": torch.float64}
+labels = [torch.arange(3072).view(48, 64).int() % 5 - 2]
+for run in (
+    lambda backend: nl.render(scene, camera, scene.means, backend=backend, **how)[0],
+    lambda backend: nl.rasterize_evidence(scene, [camera], labels, backend=backend, **how).rows.weight,
+):
+    flat, usual = run("surfels"), run("torch")
+    assert flat.shape == usual.shape and 0 < (flat - usual).abs().max() < 1e-6 * usual.max()
+"""
+
+
 @pytest.mark.slow
-def test_a_rule_an_output_and_a_scene_source(extended: Path, lifted: Path, tmp_path: Path) -> None:
+def test_all_recipes_work(extended: Path, lifted: Path, tmp_path: Path) -> None:
     python(extended, "-c", SOURCE, lifted, tmp_path)
     python(extended, "-c", RULE, lifted)
+    python(extended, "-c", FLAT)
     asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
     python(extended, "-m", "normlift_ns.cli.query", *asked, "--json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())
