@@ -445,6 +445,7 @@ class Panel:
             raise InputError("Nothing is selected; there is nothing to put a box around.")
         low, high = chosen.amin(dim=0), chosen.amax(dim=0)
         centre, size = ((low + high) / 2).tolist(), (1.001 * (high - low) + 1e-9).tolist()
+        self.centre.value, self.size.value = tuple(centre), tuple(size)  # at once: Inside and Outside read them
         return SelectionBox(tuple(centre), tuple(size))
 
 

@@ -32,6 +32,7 @@ class Server:
         place = ["--port", port]
         if "nerfstudio" in program:
             place = ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port]
+            place += ["--viewer.max-num-display-images", "0"]  # no training cameras in front of the scene
         self._words = [str(python), "-W", "ignore", "-c", program, "--load-config", str(config), *place]
         self._log, self._cwd, self._flags = log, cwd, ()
         self.process: subprocess.Popen[bytes] | None = None

@@ -8,6 +8,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -132,6 +133,19 @@ def test_messages_keep_their_order_and_no_page_waits_for_another(server, pages):
             _ = 1 / 0
         page.notice("still there")
         received(browser, NOTICE)
+
+
+def test_what_is_slow_is_not_overtaken_by_what_comes_after_it(server, pages):
+    with browsing(server, pages) as (browser, page):
+        heard, overtaken, kind = [], Event(), "GuiTextMessage" if ONE else "GuiAddTextMessage"
+        page.gui.add_text("slow", "").on_update(lambda _: (overtaken.wait(0.1), heard.append("slow")))
+        made = [received(browser, kind)]
+        page.gui.add_text("quick", "").on_update(lambda _: (overtaken.set(), heard.append("quick")))
+        made.append(received(browser, kind))
+        for one in made:
+            changes(browser, one, "red")
+        until(lambda: len(heard) == 2)
+        assert heard == ["slow", "quick"]
 
 
 def test_nonsense_in_a_widget_is_passed_over_and_clicks_come_until_nobody_listens(server, pages, capsys):
