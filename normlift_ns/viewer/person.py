@@ -746,7 +746,8 @@ class Person:
                 self._page.become(token)
             memory = self._memory
             fresh = memory.view is None and len(memory.history.states) == 1
-            if memory.line:
+            typed = self._panel.prompts.value  # before the server has read the greeting: it stays
+            if memory.line and not typed:
                 self._panel.prompts.value = memory.line
             if memory.view is not None:
                 self._eye.go(memory.view)
@@ -758,7 +759,7 @@ class Person:
         memory.link = hello.link
         if link is not None:
             self._follow(link)
-        elif fresh and len(texts := list(self._run.stored())) > 0:
+        elif fresh and not typed and len(texts := list(self._run.stored())) > 0:
             self._panel.prompts.value = join_prompts(texts)
             self._tell(f"The run stores these prompts; press Ask. {note}".rstrip())
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,8 @@ import urllib.request
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+
+from tests.viewer.scenes import free_port
 
 OWN = "from normlift_ns.cli.view import main; main()"
 STOCK = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
@@ -26,9 +27,7 @@ class Server:
     def __init__(
         self, program: str, config: Path, log: Path, *, cwd: Path | None = None, python: Path | str = sys.executable
     ) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = str(free.getsockname()[1])
+        port = str(free_port())
         place = ["--port", port]
         if "nerfstudio" in program:
             place = ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port]

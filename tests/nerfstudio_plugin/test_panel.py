@@ -9,9 +9,7 @@ import html
 import io
 import re
 import shutil
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +35,7 @@ from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
 from tests.nerfstudio_plugin.conftest import set_up
 from tests.nerfstudio_plugin.stock_run import StockRun
+from tests.viewer.scenes import free_port, until
 
 NAMES = {"left": 0, "right": 1, "up": 2}
 
@@ -89,10 +88,8 @@ def viewed(stock_lifted: Path, nerfstudio: Any, tmp_path_factory: pytest.TempPat
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
         pipeline = set_up(stock_lifted)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    config, folder = ViewerConfig(websocket_host="127.0.0.1", websocket_port=port), tmp_path_factory.mktemp("viewer")
+    config = ViewerConfig(websocket_host="127.0.0.1", websocket_port=free_port())
+    folder = tmp_path_factory.mktemp("viewer")
     viewer = Viewer(config, folder / "log" / "viewer.log", folder, pipeline, train_lock=Lock())
     yield pipeline, viewer
     viewer.viser_server.stop()
@@ -166,14 +163,6 @@ def chosen(pipeline: Any) -> torch.Tensor:
     """The Gaussians of the selection that is rendered."""
     display = pipeline.model._display
     return display.values[:, display.num_prompts + 1] > 0
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Waits for what other threads do."""
-    deadline = time.monotonic() + 60
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: Any, viewer: Any) -> None:

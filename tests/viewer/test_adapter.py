@@ -116,13 +116,14 @@ def test_splats_are_swapped_and_not_sent_under_the_same_name(server, pages):
 
 
 def test_messages_keep_their_order_and_no_page_waits_for_another(server, pages):
+    kind = "GuiTextMessage" if ONE else "GuiAddTextMessage"
     with browsing(server, pages) as (browser, page), browsing(server, pages) as (other, another):
         with page.together():
             for i in range(200):  # more than viser has threads
                 with page.together():
                     page.gui.add_text(f"text {i}", "")
             another.gui.add_text("Prompts", "").on_update(lambda _: another.notice("heard"))
-            changes(other, received(other, "GuiTextMessage" if ONE else "GuiAddTextMessage"), "red")
+            changes(other, received(other, kind), "red")
             received(other, NOTICE)
         texts = []
         while len(texts) < 200:
@@ -133,15 +134,10 @@ def test_messages_keep_their_order_and_no_page_waits_for_another(server, pages):
             _ = 1 / 0
         page.notice("still there")
         received(browser, NOTICE)
-
-
-def test_what_is_slow_is_not_overtaken_by_what_comes_after_it(server, pages):
-    with browsing(server, pages) as (browser, page):
-        heard, overtaken, kind = [], Event(), "GuiTextMessage" if ONE else "GuiAddTextMessage"
-        page.gui.add_text("slow", "").on_update(lambda _: (overtaken.wait(0.1), heard.append("slow")))
-        made = [received(browser, kind)]
-        page.gui.add_text("quick", "").on_update(lambda _: (overtaken.set(), heard.append("quick")))
-        made.append(received(browser, kind))
+        heard, made, overtaken = [], [], Event()
+        for name, act in (("slow", lambda: overtaken.wait(0.1)), ("quick", overtaken.set)):
+            page.gui.add_text(name, "").on_update(lambda _, name=name, act=act: (act(), heard.append(name)))
+            made.append(received(browser, kind))
         for one in made:
             changes(browser, one, "red")
         until(lambda: len(heard) == 2)
