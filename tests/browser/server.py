@@ -17,7 +17,7 @@ from tests.viewer.scenes import free_port
 
 OWN = "from normlift_ns.cli.view import main; main()"
 STOCK = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
-PATIENCE = 180.0
+PATIENCE = 600.0
 """Seconds after which a state that is waited for does not come any more, on a machine with much else to do."""
 
 
