@@ -36,7 +36,7 @@ from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRES
 from normlift_ns.session.objects import ObjectList, ObjectRow, list_objects, unoccluded_viewpoint
 from normlift_ns.session.prompts import click_name, merge_queries
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
-from normlift_ns.viewer.adapter import ignore_closed_clients
+from normlift_ns.viewer.adapter import handle_in_order, ignore_closed_clients, send_in_order
 from normlift_ns.viewer.widgets import (
     MAX_OBJECT_ROWS,
     Explanation,
@@ -552,7 +552,9 @@ def rerender_clients(viewer: Any) -> None:
         return
     for number, client in viewer.viser_server.get_clients().items():
         with suppress(KeyError):  # connecting, and about to render anyway, or disconnecting
-            viewer.render_statemachines[number].action(RenderAction("move", viewer.get_camera_state(client)))
+            machine = viewer.render_statemachines[number]
+            machine.action(RenderAction("move", viewer.get_camera_state(client)))
+            machine.state = "low_move"  # its thread renders again soon even if it has just overwritten the action
 
 
 class _Control(ViewerControl):
@@ -582,6 +584,7 @@ class PanelView(torch.nn.Module):
         self._history: History[State] | None = None
         self._line, self._message, self._negatives = "", "", ""
         self._colormap: Colormap = COLORMAPS[0]
+        self._overlay_due = False
         self._turns, self._lock = RequestTokens(), RLock()
         self._reasons: Explanation | None = None
         self._details = BackgroundDetails(self._show_details, lambda error: self.show_message(describe_error(error)[0]))
@@ -618,6 +621,9 @@ class PanelView(torch.nn.Module):
     def install(self, viewer: Any) -> None:
         """Add the tab to a viewer."""
         self._viewer = viewer
+        handle_in_order(viewer.viser_server)
+        send_in_order(viewer.viser_server)
+        self._follow_outputs(viewer.control_panel)
         self._widgets = PanelWidgets(viewer.viser_server, self.on_action, self._lock)
         viewer.viser_server.on_client_disconnect(self._on_disconnect)
         ignore_closed_clients(viewer.viser_server)
@@ -670,9 +676,28 @@ class PanelView(torch.nn.Module):
     def _select_output(self, display: Display, *, answered: bool) -> None:
         """Switch to the overlay if the current output no longer exists, or if it is rgb and there is a new answer."""
         output = self._viewer.control_panel._output_render
-        outdated = output.value.startswith("relevancy_") and output.value not in output_names(display.texts)
-        if "overlay" in output.options and (outdated or (answered and output.value == "rgb")):
+        if output.value.startswith("relevancy_") and output.value not in output_names(display.texts):
             output.value = "overlay"
+        self._overlay_due = answered or (self._overlay_due and len(display.texts) > 0)
+        self._show_overlay()
+
+    def _show_overlay(self) -> None:
+        """Switch from rgb to the overlay if it is due and the viewer knows it."""
+        output = self._viewer.control_panel._output_render
+        if self._overlay_due and "overlay" in output.options:
+            self._overlay_due = False
+            if output.value == "rgb":
+                output.value = "overlay"
+
+    def _follow_outputs(self, control_panel: Any) -> None:
+        """Show an overlay that is due as soon as the viewer knows it, which is after its first image."""
+        update = control_panel.update_output_options
+
+        def updated(names: list[str]) -> None:
+            update(names)
+            self._show_overlay()
+
+        control_panel.update_output_options = updated
 
     def _set_prompts(self, line: str) -> None:
         """Replace the text in the prompt box, which otherwise only the user edits."""

@@ -213,6 +213,8 @@ _EDGES = (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
 """Corners of a box along a path that contains all edges."""
 _MODIFIERS = (None, "shift", "alt")
 """Modifier keys with which a click is handled."""
+_MAX_HOLDUP = 0.5
+"""Seconds that a message waits for the one before it, at most."""
 _SCRIPT = """
 (() => {
   const labelled = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
@@ -295,6 +297,7 @@ class ViserServer:
 
         with guarded(), contextlib.redirect_stdout(io.StringIO()):  # hides viser's table of addresses
             self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        handle_in_order(self._server)
         self.host, self.port = host, self._server.get_port()
         self._refuse_tunnels()
         gui: Any = self._server.gui
@@ -469,6 +472,48 @@ class BrowserPage:
         events = [scene.on_click(modifier=key) for key in _MODIFIERS] if viser1 else [scene.on_pointer_event("click")]
         for register in events:
             register(lambda event: callback(event.ray_origin, event.ray_direction))
+
+
+def handle_in_order(server: Any) -> None:
+    """Make a server handle messages in the order in which they come.
+
+    viser 0.2.7 passes each message to one of 32 threads. On a busy machine, the press of a button therefore overtakes
+    the text typed before it, and one of two quick presses is lost. With this function, a message waits until the one
+    before it is handled, but only for a moment if that is slow.
+
+    Args:
+        server: viser's server.
+    """
+    owner = server._websock_server
+    executor: Any = (owner if hasattr(owner, "_thread_executor") else server)._thread_executor  # 0.2.7 and 1.x
+    submit, lock, last = executor.submit, threading.Lock(), [threading.Event()]
+    last[0].set()
+
+    def submit_in_order(work: Callable[..., Any], *arguments: Any) -> Any:
+        done = threading.Event()
+
+        def run(before: threading.Event) -> Any:
+            before.wait(_MAX_HOLDUP)
+            try:
+                return work(*arguments)
+            finally:
+                done.set()
+
+        with lock:
+            before, last[0] = last[0], done
+            return submit(run, before)
+
+    executor.submit = submit_in_order
+
+
+def send_in_order(server: Any) -> None:
+    """Make a server send all messages in order, as `BrowserPage` does for its own.
+
+    Args:
+        server: viser's server, 0.2.7.
+    """
+    _send_in_order(server._websock_server)
+    server.on_client_connect(lambda client: _send_in_order(client._websock_connection))
 
 
 def _send_in_order(connection: Any) -> None:

@@ -445,6 +445,7 @@ class Panel:
             raise InputError("Nothing is selected; there is nothing to put a box around.")
         low, high = chosen.amin(dim=0), chosen.amax(dim=0)
         centre, size = ((low + high) / 2).tolist(), (1.001 * (high - low) + 1e-9).tolist()
+        self.centre.value, self.size.value = tuple(centre), tuple(size)  # at once: Inside and Outside read them
         return SelectionBox(tuple(centre), tuple(size))
 
 
@@ -745,7 +746,8 @@ class Person:
                 self._page.become(token)
             memory = self._memory
             fresh = memory.view is None and len(memory.history.states) == 1
-            if memory.line:
+            typed = self._panel.prompts.value  # before the server has read the greeting: it stays
+            if memory.line and not typed:
                 self._panel.prompts.value = memory.line
             if memory.view is not None:
                 self._eye.go(memory.view)
@@ -757,7 +759,7 @@ class Person:
         memory.link = hello.link
         if link is not None:
             self._follow(link)
-        elif fresh and len(texts := list(self._run.stored())) > 0:
+        elif fresh and not typed and len(texts := list(self._run.stored())) > 0:
             self._panel.prompts.value = join_prompts(texts)
             self._tell(f"The run stores these prompts; press Ask. {note}".rstrip())
 

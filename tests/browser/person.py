@@ -90,7 +90,7 @@ def chromium() -> Iterator[Browser]:
     flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
         program = _behind_the_server(Path(folder) / "chromium")
-        browser = playwright.chromium.launch(executable_path=program, args=flags)
+        browser = playwright.chromium.launch(executable_path=program, args=flags, timeout=1000 * PATIENCE)
         yield browser
         browser.close()
 
@@ -113,7 +113,7 @@ def draw_in_software(page: Page, sharpness: float) -> None:
 
     def coarse(route: Route) -> None:
         try:
-            answer = route.fetch()
+            answer = route.fetch(timeout=1000 * PATIENCE)
             route.fulfill(response=answer, body=_SHARPNESS.sub(str(sharpness), answer.text()))
         except Error:  # the server is away, or the page has gone
             with suppress(Error):

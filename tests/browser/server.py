@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -14,9 +13,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.viewer.scenes import free_port
+
 OWN = "from normlift_ns.cli.view import main; main()"
 STOCK = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
-PATIENCE = 180.0
+PATIENCE = 600.0
 """Seconds after which a state that is waited for does not come any more, on a machine with much else to do."""
 
 
@@ -26,12 +27,11 @@ class Server:
     def __init__(
         self, program: str, config: Path, log: Path, *, cwd: Path | None = None, python: Path | str = sys.executable
     ) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = str(free.getsockname()[1])
+        port = str(free_port())
         place = ["--port", port]
         if "nerfstudio" in program:
             place = ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port]
+            place += ["--viewer.max-num-display-images", "0"]  # no training cameras in front of the scene
         self._words = [str(python), "-W", "ignore", "-c", program, "--load-config", str(config), *place]
         self._log, self._cwd, self._flags = log, cwd, ()
         self.process: subprocess.Popen[bytes] | None = None

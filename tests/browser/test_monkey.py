@@ -19,6 +19,7 @@ import pytest
 from tests.browser.person import needs_chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
 from tests.browser.viewer import Own, Tab
+from tests.viewer.scenes import until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -31,8 +32,9 @@ MOST_GROWTH = 50.0
 KILL, WARM = 0.3, 0.65
 """When the server is killed, and from when on its memory is watched, as shares of the time."""
 ASKED = (
-    "import ctypes, gc, signal; "
-    "signal.signal(signal.SIGUSR2, lambda *_: (gc.collect(), ctypes.CDLL(None).malloc_trim(0))); "
+    "import ctypes, gc, os, signal; "
+    "freed = lambda *_: (gc.collect(), ctypes.CDLL(None).malloc_trim(0), os.write(1, b'freed\\n')); "
+    "signal.signal(signal.SIGUSR2, freed); "
 )
 """A program that gives back memory that it has freed when it is asked."""
 PROMPTS = (
@@ -73,8 +75,9 @@ class Serving(Server):
     def megabytes(self) -> float:
         """Memory that is really used, without what the C library keeps for later."""
         assert self.process is not None
+        before = self.said().count("freed")
         self.process.send_signal(signal.SIGUSR2)
-        time.sleep(0.3)
+        until(lambda: self.said().count("freed") > before, self.said)
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) / 1024
 

@@ -104,8 +104,9 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(own: Server, b
         one.press(button)
         one.sees(lambda seen, hides=hides: (coloured(seen).sum() < 50) == hides, f"history comes back too: {button}")
 
+    photo = two.sees(lambda seen: hue_mask(seen, *YELLOW).sum() > 1000, "what is yellow")
     two.arm("More like this")
-    two.click(middle(hue_mask(two.shot(), *YELLOW)))
+    two.click(middle(hue_mask(photo, *YELLOW)))
     two.until(lambda: two.typed("Prompts") == "like click 1" and two.selected() not in (-1, teal), "what is like it")
     alike = two.selected()
     two.press("Save prompts in run")

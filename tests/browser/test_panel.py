@@ -35,7 +35,7 @@ def test_a_person_asks_and_sees_answers_objects_reasons_and_floaters(tab: Tab, t
 
     tab.asks("red", answered=1, key=True)
     overlay = tab.sees(lambda seen: iou(overlaid(seen), things["red"]) > 0.7, "an overlay of red")
-    assert tab.output() == "overlay"
+    tab.until(lambda: tab.output() == "overlay", "the answer is shown")
     some = tab.selected()
     for label, value, least in (("Threshold", "0.98", 0), ("Minimum reliability", "0.75", 1)):
         tab.type(label, value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,14 +60,14 @@ class Tab(Person):
 
     def fresh(self) -> None:
         """Takes back what was done before in any tab, but for what is stored."""
-        cameras = self.page.get_by_role("button", name=re.compile("(Hide|Show) Train Cams"))
-        cameras.wait_for()
-        if cameras.inner_text().strip().startswith("Hide"):
-            self.press("Hide Train Cams")
-            self.button("Show Train Cams").wait_for()
         self.press("Clear")
-        self.until(lambda: self.selected() == -1 and self.typed("Prompts") == "", "cleared")
+        self.until(lambda: "No query yet" in self.text() and self.typed("Prompts") == "", "cleared")
         self.show("rgb")
+
+    def arm(self, button: str) -> None:
+        super().arm(button)
+        canvas = self.page.locator("canvas[data-engine]")  # what makes it take clicks comes on another way
+        self.until(lambda: "cursor: pointer" in (canvas.get_attribute("style") or ""), "takes clicks")
 
     def choose(self, label: str, option: str) -> None:
         if self.typed(label) != option:
@@ -88,6 +87,7 @@ class Tab(Person):
 
     def show(self, output: str) -> None:
         self.tab("Control")
+        self.until(lambda: self.typed("Output type") != "not set", "a picture tells what there is")
         self.choose("Output type", output)
         self.tab("Search")
 

@@ -9,9 +9,7 @@ import html
 import io
 import re
 import shutil
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +36,7 @@ from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
 from tests.nerfstudio_plugin.conftest import set_up
 from tests.nerfstudio_plugin.stock_run import StockRun
+from tests.viewer.scenes import free_port, until
 
 NAMES = {"left": 0, "right": 1, "up": 2}
 
@@ -90,10 +89,8 @@ def viewed(stock_lifted: Path, nerfstudio: Any, tmp_path_factory: pytest.TempPat
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
         pipeline = set_up(stock_lifted)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    config, folder = ViewerConfig(websocket_host="127.0.0.1", websocket_port=port), tmp_path_factory.mktemp("viewer")
+    config = ViewerConfig(websocket_host="127.0.0.1", websocket_port=free_port())
+    folder = tmp_path_factory.mktemp("viewer")
     viewer = Viewer(config, folder / "log" / "viewer.log", folder, pipeline, train_lock=Lock())
     yield pipeline, viewer
     viewer.viser_server.stop()
@@ -169,14 +166,6 @@ def chosen(pipeline: Any) -> torch.Tensor:
     return display.values[:, display.num_prompts + 1] > 0
 
 
-def until(true: Callable[[], bool]) -> None:
-    """Waits for what other threads do."""
-    deadline = time.monotonic() + 60
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: Any, viewer: Any) -> None:
     from nerfstudio.viewer.utils import parse_object  # noqa: PLC0415
     from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement  # noqa: PLC0415
@@ -199,7 +188,9 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     """One walk; the picture follows, and the first answer switches to the overlay."""
     model, widgets, output = pipeline.model, panel._widgets, viewer.control_panel._output_render
     both = run_query(model.field, model.means, asking("left", "right")).selected
+    output.set_options(["not set"])  # as before the first picture
     ask(panel, " left , right;; ")
+    viewer.control_panel.update_output_options([*outputs(pipeline)])
     assert (panel.answer.texts, output.value) == (("left", "right"), "overlay")
     assert list(outputs(pipeline))[4:7] == ["relevancy_left", "relevancy_right", "reliability"]
     assert torch.equal(chosen(pipeline), both.any(dim=1))
@@ -210,11 +201,13 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     widgets.shown.value = "2: right"
     until(lambda: panel.state.shown == 1)
     assert torch.equal(chosen(pipeline), both[:, 1])
-    output.set_options([*outputs(pipeline)])
     output.value = "relevancy_right"
     ask(panel, "left")
     assert (panel.state.shown, widgets.shown.value) == (None, "all prompts")
     assert output.value == "overlay"  # relevancy_right is no output any more
+    output.value = "rgb"
+    ask(panel, "right")
+    assert output.value == "overlay"
     output.value = "depth"
     ask(panel, "left", "right")
     assert output.value == "depth"  # what the person chose stays
@@ -617,7 +610,7 @@ def test_a_browser_that_comes_or_goes_leaves_no_other_with_an_old_picture(panel:
     ask(panel, "left")
     drawn.clear()
     panel.on_action("Hide")
-    assert len(drawn) == 1
+    assert len(drawn) == 1 and there.state == "low_move"  # it draws again, whatever becomes of the action
 
 
 def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:

@@ -8,6 +8,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -115,13 +116,14 @@ def test_splats_are_swapped_and_not_sent_under_the_same_name(server, pages):
 
 
 def test_messages_keep_their_order_and_no_page_waits_for_another(server, pages):
+    kind = "GuiTextMessage" if ONE else "GuiAddTextMessage"
     with browsing(server, pages) as (browser, page), browsing(server, pages) as (other, another):
         with page.together():
             for i in range(200):  # more than viser has threads
                 with page.together():
                     page.gui.add_text(f"text {i}", "")
             another.gui.add_text("Prompts", "").on_update(lambda _: another.notice("heard"))
-            changes(other, received(other, "GuiTextMessage" if ONE else "GuiAddTextMessage"), "red")
+            changes(other, received(other, kind), "red")
             received(other, NOTICE)
         texts = []
         while len(texts) < 200:
@@ -132,6 +134,14 @@ def test_messages_keep_their_order_and_no_page_waits_for_another(server, pages):
             _ = 1 / 0
         page.notice("still there")
         received(browser, NOTICE)
+        heard, made, overtaken = [], [], Event()
+        for name, act in (("slow", lambda: overtaken.wait(0.1)), ("quick", overtaken.set)):
+            page.gui.add_text(name, "").on_update(lambda _, name=name, act=act: (act(), heard.append(name)))
+            made.append(received(browser, kind))
+        for one in made:
+            changes(browser, one, "red")
+        until(lambda: len(heard) == 2)
+        assert heard == ["slow", "quick"]
 
 
 def test_nonsense_in_a_widget_is_passed_over_and_clicks_come_until_nobody_listens(server, pages, capsys):
