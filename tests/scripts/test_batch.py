@@ -180,15 +180,17 @@ def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     wait_for(lambda: not alive(pid))
 
 
-def test_a_process_that_ends_has_time_to_clean_up(tmp_path):
+@pytest.mark.parametrize("seconds", [0.2, 9])
+def test_a_process_that_ends_has_time_to_clean_up_but_not_for_ever(seconds, tmp_path, monkeypatch):
     program = """if True:
         import signal, sys, time
-        def end(*_): time.sleep(0.2); open(sys.argv[1], "w").close(); sys.exit()
+        def end(*_): time.sleep(float(sys.argv[3])); open(sys.argv[1], "w").close(); sys.exit()
         signal.signal(signal.SIGTERM, end); open(sys.argv[2], "w").close(); time.sleep(60)"""
     ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
-    words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready)]
+    monkeypatch.setattr(batch, "_GRACE", batch._GRACE if seconds < 1 else 0.1)
+    words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready), str(seconds)]
     assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), every=0.01) is None
-    assert cleaned.exists()
+    assert cleaned.exists() == (seconds < 1)
 
 
 def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
