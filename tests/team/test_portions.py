@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import fields
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
-from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.distributed.communicator import EvidenceShard, TorchCommunicator, redistribute_evidence
 from normlift_ns.options import Storage
 from normlift_ns.pipeline import vote_distributed
 from normlift_ns.progress import StageTimer
@@ -117,3 +119,16 @@ def test_neighbours_of_some_are_those_of_all() -> None:
     for a, b in zip(nearest_neighbors(means, 9, of=some), every):
         assert torch.equal(a, b[some])
     assert len(nearest_neighbors(means, 9, of=some[:0]).index) == 0
+
+
+def test_process_0_reports_the_views_of_all() -> None:
+    done: Counter[str] = Counter()
+    store = SimpleNamespace(add=lambda stage, new: done.update({stage: new}) or done[stage])
+    told: list[tuple[str, int, int]] = []
+    team = [TorchCommunicator(rank=r, size=2, device=torch.device("cpu"), store=store) for r in (0, 1)]
+    reports = [one.counted(lambda *progress: told.append(progress)) for one in team]
+    for count in (1, 2, 4):
+        for report in reports[::-1]:
+            report("evidence", count, 9)
+            report("vote", count, 9)
+    assert told == [(stage, n, 9) for n, m in ((1, 2), (2, 4), (4, 8)) for stage, n in (("evidence", m), ("vote", n))]
