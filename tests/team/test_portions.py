@@ -31,6 +31,7 @@ N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
 def small_grains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(partition, "PARTITION_BLOCK", 16)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (32, 32))
+    monkeypatch.setattr("normlift_ns.distributed.communicator._RENUMBER_BLOCK", 32)
 
 
 def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
