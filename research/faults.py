@@ -347,7 +347,9 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
     for path in sorted(set(root.glob("tests/**/test_*.py")) - set(root.glob("tests/browser/*.py"))):
         text = path.read_text("utf8")
         score = 4.0 * (module in text) + 2.0 * any(re.search(rf"\b{re.escape(x)}\b", text) for x in names)
-        score += 3.0 * (path.stem.removeprefix("test_") in (stem, *names)) + 1.0 * (f"tests/{fault.package}/" in path.as_posix())
+        score += 3.0 * (path.stem.removeprefix("test_") in (stem, *names)) + 1.0 * (
+            f"tests/{fault.package}/" in path.as_posix()
+        )
         score += 0.5 * bool(re.search(rf"\b{re.escape(stem)}\b", text))
         if score > 0:
             scores[path.relative_to(root).as_posix()] = score
@@ -443,7 +445,7 @@ def table(faults: list[Fault]) -> str:
         real = [x for x in here if not x.equivalent]
         counts = [sum(any((x.found or {}).get(y) for y in labels) for x in real) for labels in COLUMNS.values()]
         if here:
-            row = [package, len(here), len(here) - len(real), *counts]
+            row = ["top level" if package == "." else package, len(here), len(here) - len(real), *counts]
             lines.append(f"| {' | '.join(map(str, row))} |")
     return "\n".join(lines)
 
