@@ -296,17 +296,47 @@ def passed(root: Path, fault: Fault) -> str:
         return subprocess.run(diff, cwd=root, capture_output=True, text=True, check=True).stdout
 
 
+def replanted(source: str, fault: Fault) -> str:
+    """The source with a fault, wherever its lines are now; of several places, the one with most of the lines around."""
+    lines = source.splitlines()
+    for hunk in re.split(r"(?m)^@@ .*\n", fault.patch)[1:]:
+        rows = [x for x in hunk.splitlines() if x[:1] in ("+", "-", " ")]
+        ends = [i for i, x in enumerate(rows) if x[0] != " "]
+        first, last = max(0, ends[0] - ("-" not in {x[0] for x in rows})), ends[-1] + 1
+        before, after = ([x[1:] for x in rows[first:last] if x[0] != other] for other in "+-")
+        around = [x[1:] for x in rows if x[0] != "+"]
+        places = [i for i in range(len(lines)) if lines[i : i + len(before)] == before]
+        if not places:
+            raise LookupError(f"{fault.name}: {fault.file} no longer has the line {before[0].strip()}")
+        same = {i: sum(x == y for x, y in zip(around, lines[max(0, i - first) :])) for i in places}
+        place = max(places, key=lambda i: (same[i], -abs(i - fault.line)))
+        lines[place : place + len(before)] = after
+    return "\n".join(lines) + "\n"
+
+
+def stands(root: Path, fault: Fault) -> bool:
+    """Whether a tree still has the lines of a fault."""
+    path = root / fault.file
+    try:
+        return path.exists() and replanted(path.read_text("utf8"), fault) != ""
+    except LookupError as error:
+        print(error, flush=True)
+        return False
+
+
 class planted:
-    """Applies the patches of faults to a tree, and takes them back."""
+    """Puts faults into a tree, and takes them back."""
 
     def __init__(self, root: Path, faults: list[Fault]) -> None:
-        self.root, self.files, self.patch = root, {x.file for x in faults}, "".join(x.patch for x in faults)
+        self.root, self.faults = root, faults
 
     def __enter__(self) -> None:
-        subprocess.run(["git", "apply", "-"], input=self.patch, text=True, cwd=self.root, check=True)
+        for fault in self.faults:
+            path = self.root / fault.file
+            path.write_text(replanted(path.read_text("utf8"), fault), "utf8")
 
     def __exit__(self, *_: object) -> None:
-        subprocess.run(["git", "checkout", "-q", "--", *self.files], cwd=self.root, check=True)
+        subprocess.run(["git", "checkout", "-q", "--", *{x.file for x in self.faults}], cwd=self.root, check=True)
 
 
 TIERS = ("test", "slow")
@@ -400,7 +430,7 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
             found[fault.name][label] = test
             keep()
 
-    missing = [x for x in faults if label not in found[x.name] and not x.equivalent]
+    missing = [x for x in faults if label not in found[x.name] and not x.equivalent and stands(trees[0], x)]
     with ThreadPoolExecutor(len(trees)) as pool:
         if not together:
             list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing))
