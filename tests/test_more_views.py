@@ -97,11 +97,13 @@ def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path:
     assert torch.equal(found.rows.column, expected.rows.column) and torch.equal(found.rows.weight, expected.rows.weight)
 
 
-def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba") -> torch.Tensor:
-    """Of one view of two regions, whose border is somewhere else for every shift."""
+def evidence_of(
+    shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba", cells: int = 2
+) -> torch.Tensor:
+    """Of one view of two regions, whose border is somewhere else for every shift, and cells without a pixel."""
     camera, done = orbit_camera(0.0), []
     labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
-    block = ViewBatch([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
+    block = ViewBatch([camera], [labels], [torch.arange(cells).int()[None]], [torch.eye(cells)])
     found = batch_evidence(
         random_scene(30, dtype=torch.float32), block, folder,
         RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, on_view=lambda: done.append(1),
@@ -123,10 +125,10 @@ def test_swapped_files_are_rasterized_again(worked: dict[str, int], tmp_path: Pa
     assert worked["rasterized"] == 4
 
 
-def test_other_rules_and_backends_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
-    for rules, backend in (("1.4", "numba"), ("1.6", "numba"), ("1.4", "torch")) * 2:
-        evidence_of(0, tmp_path, rules, backend)
-    assert worked["rasterized"] == 3
+def test_other_rules_backends_and_cells_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    for changed in (("1.4", "numba"), ("1.6", "numba"), ("1.4", "torch"), ("1.4", "numba", 3)) * 2:
+        evidence_of(0, tmp_path, *changed)
+    assert worked["rasterized"] == 4
 
 
 def test_damaged_files_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:

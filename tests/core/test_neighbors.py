@@ -90,6 +90,7 @@ def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
     means, told = lattice(), []
     whole = nearest_neighbors(means, 7)
     monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 5)
+    monkeypatch.setattr("normlift_ns.core.neighbors._MAX_RANKED", 50)
     found = nearest_neighbors(means, 7, progress=lambda *step: told.append(step))
     assert all(torch.equal(a, b) for a, b in zip(found, whole))
     places = len(means.unique(dim=0))

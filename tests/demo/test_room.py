@@ -8,7 +8,7 @@ import torch
 
 from normlift_ns import lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels
-from normlift_ns.demo.room import DemoRoom, demo_room
+from normlift_ns.demo.room import DemoRoom, demo_room, shade
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,19 @@ def test_same_arguments_same_room(small: DemoRoom):
     assert not torch.equal(small.scene.means, other.scene.means)
     with pytest.raises(ValueError, match=r"2000.*1999"):
         demo_room(1999)
+
+
+def test_a_ball_throws_its_shadow_on_the_floor_whatever_the_order_of_points():
+    center, rng = np.array([0.3, 0.4, 0.8]), np.random.default_rng(0)
+    scene = lambda p: np.minimum(p[:, 2], np.linalg.norm(p - center, axis=1) - 0.3)  # noqa: E731
+    floor = np.stack([*rng.uniform(-2, 2, (2, 3000)), np.zeros(3000)], axis=1)
+    out = np.eye(3)[rng.integers(0, 3, 200)] * rng.choice([-1, 1], (200, 1))
+    points, normals = np.concatenate([floor, center + 0.3 * out]), np.concatenate([floor * 0 + [0, 0, 1], out])
+    light, order = shade(scene, points, normals)[0].mean(axis=1), rng.permutation(len(points))
+    assert np.allclose(shade(scene, points[order], normals[order])[0].mean(axis=1), light[order])
+    to_lamp, to_center = np.array([-0.8, 0.9, 2.6]) - floor, center - floor
+    apart = np.linalg.norm(np.cross(to_center, to_lamp), axis=1) / np.linalg.norm(to_lamp, axis=1)
+    assert light[:3000][apart < 0.25].max() < 0.65 and light[:3000][apart > 1.2].min() > 0.9
 
 
 def test_contents(room: DemoRoom):

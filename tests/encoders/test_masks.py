@@ -1,14 +1,26 @@
 """Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats."""
 
+from collections.abc import Iterator
+
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from normlift_ns.segmentation import mask_filtering
 from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, masks_to_boxes, stack_masks
 from tests.encoders.tiny import needs_cuda
 from tests.examples import examples
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks() -> Iterator[None]:
+    """So that these masks are read in several parts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(mask_filtering._CHUNK, "cpu", 200)
+        yield
 
 
 def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:

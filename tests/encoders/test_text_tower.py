@@ -21,7 +21,8 @@ TEXTS = ["fox", "a red fox that sleeps under a very old tree", "ÄÖ 狐 🦊", 
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_vectors_are_those_of_open_clip(clip_weights, device):
+def test_vectors_are_those_of_open_clip(clip_weights, device, monkeypatch):
+    monkeypatch.setattr(open_clip_network, "_TEXT_BATCH_SIZE", 3)
     for file, template in (("tiny.pt", "{}"), ("tiny.pt", "a photo of a {}"), ("tiny.safetensors", "ensemble")):
         path = str(clip_weights / file)
         tower = load_text_tower(CLIP, path, template, device)

@@ -104,7 +104,8 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     return u
 
 
-def test_ideas_are_their_sums_over_pixels(lifted):
+def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
+    monkeypatch.setattr("normlift_ns.evaluation.baselines._BLOCK", 60)
     seen, methods = observations(lifted), (sfs, occam, vala, drsplat)
     assert {method.__name__ for method in methods} == set(BASELINES)
     for method in methods:
@@ -196,7 +197,8 @@ def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
     assert len(told) == 1 and "consensus" in told[0]
 
 
-def test_lengths_of_pixels_are_those_of_composited_features(lifted):
+def test_lengths_of_pixels_are_those_of_composited_features(lifted, monkeypatch):
+    monkeypatch.setattr("normlift_ns.evaluation.protocols._CHANNELS", 5)
     camera, weights, _ = observations(lifted)[1]
     norm = lifted.field.scalars.norm[:, None]
     for more, factor in (((), 1.0), ((norm,), norm)):

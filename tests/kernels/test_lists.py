@@ -68,7 +68,7 @@ def felt(grid, splat, camera, min_alpha):
     return set((row // grid.cell_height * grid.across + column // grid.cell_width).tolist())
 
 
-@pytest.mark.parametrize("kind", [pytest.param("random", marks=pytest.mark.extra), "hard"])
+@pytest.mark.parametrize("kind", ["random", "hard"])
 def test_only_cells_that_no_pixel_feels_are_left_out(kind):
     scene = random_scene(60, seed=4, dtype=torch.float32, size=0.6) if kind == "random" else hard_scene()
     cameras = orbit(1, width=70, height=41)
@@ -78,7 +78,7 @@ def test_only_cells_that_no_pixel_feels_are_left_out(kind):
     assert kept < all_pairs
     needed = {(cell, row) for row, splat in enumerate(seen.splats) for cell in felt(grid, splat, cameras[0], 1 / 255)}
     assert needed & all_pairs <= kept
-    assert len(kept - needed) < 0.15 * len(needed)
+    assert len(kept - needed) < 0.005 * len(needed)
 
 
 def wild_scene(seed: int) -> GaussianScene:

@@ -6,6 +6,7 @@ import torch
 from normlift_ns.core.neighbors import _on_cpu
 from normlift_ns.kernels import nearest
 from tests.scenes import generator
+from tests.team.threads import together
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # infinity - infinity
@@ -51,13 +52,15 @@ def test_what_it_cannot_order_is_reported():
         assert not certain.all() and not certain[:surely_not].any()
 
 
-def test_nodes_sorted_each_for_itself_are_the_same_tree(monkeypatch):
+def test_nodes_sorted_each_for_itself_or_in_several_processes_are_the_same_tree(monkeypatch):
     points = uneven(333).round(decimals=1)
     points[5:9] = -0.0
     trees = []
     for most in (0, 64, 10**9):
         monkeypatch.setattr(nearest, "_SORTED_IN_A_BLOCK", most)
         trees.append(nearest.build_kd_tree(points.to(DEVICE)))
+    for size in (2, 3):
+        trees += together(size, lambda team: nearest.build_kd_tree(points.to(DEVICE), team))
     assert all(torch.equal(a, b) for tree in trees[1:] for a, b in zip(tree, trees[0]))
 
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from hypothesis import strategies as st
 
-from normlift_ns.data.nerfstudio.config import CONFIG_TARGETS, check_config_values, read_trainer_config
+from normlift_ns.data.nerfstudio.config import CONFIG_TARGETS, check_config_values, dump_config, read_trainer_config
 from normlift_ns.data.nerfstudio.config_file import locate_run
 from normlift_ns.errors import InputError
 from tests.hostile import fuzz
@@ -181,6 +181,8 @@ def test_missing_keys_are_named_unless_an_older_version_lacks_them(tmp_path: Pat
     found = read(written(tmp_path, older))
     assert found.pipeline.model.use_bilateral_grid is False
     assert not hasattr(found, "from_another_version")
+    newer, count = re.subn(r"(?m)^( +)(sigma_d: .*\n|max_views: .*\n)", r"\1\2\1from_another_version: 3\n", texts[1])
+    assert count == 2 and "from_another_version" not in dump_config(read_trainer_config(written(tmp_path, newer)))
 
 
 def test_odd_yaml_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:

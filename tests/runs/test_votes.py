@@ -94,6 +94,10 @@ def test_photographs_that_are_gone_replaced_or_unknown_are_named(
     fewer = replace(run.field, manifest={**run.field.manifest, "views_lifted": names[:-1]})
     with pytest.raises(nl.InputError, match=r" 5 .* 6"):
         _ = RecordedVotes(run.scene, fewer, tmp_path).names
+    for option in ("beta", "unlabeled"):
+        wrong = replace(run.field, manifest={**run.field.manifest, "options": {option: [1]}})
+        with pytest.raises(nl.InputError, match=f"damaged: .*{option} is"):
+            RecordedVotes(run.scene, wrong, tmp_path).explain(run.ask("red").mask)
     moved = tmp_path / "room"
     shutil.copytree(trained.parents[4] / "room", moved)
     opened = nl.open_run(run.config, data=moved)

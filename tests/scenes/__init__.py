@@ -76,7 +76,8 @@ def random_evidence(
 
 
 def dense(rows: SparseRows, columns: int) -> Tensor:
-    """[N, columns] float64, on the device of the rows."""
+    """[N, columns] float64, on the device of the rows, whose columns have to ascend."""
+    assert bool(((rows.column.diff() > 0) | (rows.row_index().diff() > 0)).all())
     out = torch.zeros(len(rows), columns, dtype=torch.float64, device=rows.weight.device)
     out[rows.row_index(), rows.column.long()] = rows.weight.double()
     return out

@@ -181,15 +181,17 @@ def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     wait_for(lambda: not alive(pid))
 
 
-def test_a_process_that_ends_has_time_to_clean_up(tmp_path):
+@pytest.mark.parametrize("seconds", [0.2, 9])
+def test_a_process_that_ends_has_time_to_clean_up_but_not_for_ever(seconds, tmp_path, monkeypatch):
     program = """if True:
         import signal, sys, time
-        def end(*_): time.sleep(0.2); open(sys.argv[1], "w").close(); sys.exit()
+        def end(*_): time.sleep(float(sys.argv[3])); open(sys.argv[1], "w").close(); sys.exit()
         signal.signal(signal.SIGTERM, end); open(sys.argv[2], "w").close(); time.sleep(60)"""
     ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
-    words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready)]
+    monkeypatch.setattr(batch, "_GRACE", batch._GRACE if seconds < 1 else 0.1)
+    words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready), str(seconds)]
     assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), interval=0.01) is None
-    assert cleaned.exists()
+    assert cleaned.exists() == (seconds < 1)
 
 
 def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
@@ -264,22 +266,18 @@ def test_who_was_taken_for_dead_writes_nothing_and_takes_over_where_the_other_di
     assert made.begun() == {"c00": 1}
 
 
-@pytest.mark.parametrize("interrupted", [False, True])
-def test_a_program_that_is_not_wanted_any_more_is_ended(interrupted, tmp_path):
+def test_an_interrupt_ends_the_program(tmp_path):
     pid, end = tmp_path / "pid.txt", tmp_path / "end.txt"
     program = f"import os, pathlib as p, time; p.Path({str(pid)!r}).write_text(str(os.getpid())); time.sleep(20)"
 
     def beat() -> bool:
-        if interrupted and pid.exists():
+        if pid.exists():
             raise KeyboardInterrupt
-        return not pid.exists()
+        return True
 
     words = [sys.executable, "-S", "-c", f"{program}; p.Path({str(end)!r}).touch()"]
-    if interrupted:
-        with pytest.raises(KeyboardInterrupt):
-            run_logged(words, tmp_path / "log", beat, 0.05)
-    else:
-        assert run_logged(words, tmp_path / "log", beat, 0.05) is None
+    with pytest.raises(KeyboardInterrupt):
+        run_logged(words, tmp_path / "log", beat, 0.05)
     assert not end.exists() and not alive(int(pid.read_text() or "0"))
 
 

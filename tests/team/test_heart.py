@@ -21,6 +21,8 @@ from normlift_ns.distributed.launch import (
 )
 from normlift_ns.errors import InputError
 
+ENVIRONMENT = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
+
 
 class Store:
     """A store in a dictionary, as torch's is."""
@@ -176,12 +178,25 @@ def test_where_the_store_is_gone_process_0_has_reported_its_error(world: World) 
 
 
 def test_an_environment_that_cannot_be() -> None:
-    good = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
-    assert rank_and_world_size(good) == (1, 2)
-    assert rank_and_world_size(good | {"RANK": "0", "WORLD_SIZE": "1"}) is None
+    assert rank_and_world_size(ENVIRONMENT) == (1, 2)
+    assert rank_and_world_size(ENVIRONMENT | {"RANK": "0", "WORLD_SIZE": "1"}) is None
     for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
         with pytest.raises(InputError, match="torchrun"):
-            rank_and_world_size(good | change)
+            rank_and_world_size(ENVIRONMENT | change)
+
+
+def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    def connect(rank: int, size: int, backend: str, log: Any) -> Any:
+        raise ConnectionError(f"{rank} of {size} by {backend}")
+
+    monkeypatch.setattr(module, "_connect", connect)
+    for name, value in (ENVIRONMENT | {"LOCAL_RANK": "1", "TORCH_CPP_LOG_LEVEL": "ERROR"}).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConnectionError, match="1 of 2 by gloo"), module.distributed_context("cpu", print):
+        pass
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    with pytest.raises(InputError, match="GPU"), module.distributed_context("auto", print):
+        pass
 
 
 def test_what_people_are_told() -> None:

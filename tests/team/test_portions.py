@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import fields
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.partition import Partition
-from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.distributed.communicator import EvidenceShard, TorchCommunicator, redistribute_evidence
 from normlift_ns.distributed.lift import build_field_distributed, consensus_distributed, vote_distributed
 from normlift_ns.evidence_collection import ViewObservations
 from normlift_ns.options import Storage
@@ -31,6 +33,7 @@ N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
 def small_grains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(partition, "PARTITION_BLOCK", 16)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (32, 32))
+    monkeypatch.setattr("normlift_ns.distributed.communicator._RENUMBER_BLOCK", 32)
 
 
 def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
@@ -132,3 +135,16 @@ def test_neighbours_of_some_are_those_of_all() -> None:
     for a, b in zip(nearest_neighbors(means, 9, of=some), every):
         assert torch.equal(a, b[some])
     assert len(nearest_neighbors(means, 9, of=some[:0]).index) == 0
+
+
+def test_process_0_reports_the_views_of_all() -> None:
+    done: Counter[str] = Counter()
+    store = SimpleNamespace(add=lambda stage, new: done.update({stage: new}) or done[stage])
+    told: list[tuple[str, int, int]] = []
+    team = [TorchCommunicator(rank=r, size=2, device=torch.device("cpu"), store=store) for r in (0, 1)]
+    reports = [one.counted(lambda *progress: told.append(progress)) for one in team]
+    for count in (1, 2, 4):
+        for report in reports[::-1]:
+            report("evidence", count, 9)
+            report("vote", count, 9)
+    assert told == [(stage, n, 9) for n, m in ((1, 2), (2, 4), (4, 8)) for stage, n in (("evidence", m), ("vote", n))]
