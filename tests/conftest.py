@@ -25,6 +25,11 @@ from filelock import FileLock  # noqa: E402
 
 from tests.examples import register_profile  # noqa: E402
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 if TYPE_CHECKING:
     from normlift_ns.demo.room import DemoRoom
 
@@ -75,6 +80,11 @@ def _patch_triton_once() -> None:
         return scope
 
     interpreter._patch_lang = once
+
+
+def project() -> dict[str, Any]:
+    """The table `project` of pyproject.toml."""
+    return tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf8"))["project"]
 
 
 def import_nerfstudio() -> Any:

@@ -8,17 +8,12 @@ import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import pytest
 
 import normlift_ns
 from research import licences
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from tests.conftest import project
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "normlift_ns").rglob("*.py")}
@@ -29,10 +24,6 @@ def run(*command: object, cwd: Path, **kwargs) -> str:
     done = subprocess.run(words, check=False, capture_output=True, text=True, cwd=cwd, **kwargs)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
-
-
-def project() -> dict[str, Any]:
-    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]
 
 
 @pytest.fixture(scope="module")

@@ -365,8 +365,8 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("normlift_ns.cli.batch.run_logged", lambda *_: 0)
     made = Batch(tmp_path, ["0"] * 5)
     for task in range(3):
-        for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
-            monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+        for name, value in array(task + 4, 3, least=4).items():
+            monkeypatch.setenv(name, value)
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
         assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
     lines = read_jsonl(made.results, Outcome)

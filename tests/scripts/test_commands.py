@@ -20,11 +20,8 @@ from normlift_ns import evidence_collection, open_run, open_scene
 from normlift_ns.cli import evaluate, export, lift, query
 from normlift_ns.cli.demo import iou_per_class
 from normlift_ns.data.splat import SplatParameters
-from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
-from normlift_ns.encoders.langsplat import write_langsplat
 from normlift_ns.query.question import load_query
-from normlift_ns.segmentation.regions import Grid
 from normlift_ns.segmentation.sam import MaskRules, SamMasks
 from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
 from tests.scripts.conftest import QUICK, SMALL, run_entry, said
@@ -117,19 +114,6 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
 
-def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, capsys):
-    run = tmp_path / "outputs" / "room" / "normlift" / "one"
-    shutil.copytree(lifted.parent, run)
-    given = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room")
-    path = run / "normlift" / "field.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
-    assert run_entry(monkeypatch, export.entrypoint, *given, "--output-dir", tmp_path / "out") == 1
-    shown = said(capsys)
-    assert "is damaged" in shown and path.name in shown and "ns-normlift" in shown
-    assert not (tmp_path / "out").exists()
-
-
 def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
     clock = SimpleNamespace(now=lambda: datetime(2024, 5, 1, 12))
     monkeypatch.setattr("normlift_ns.io.run_dir.datetime", clock)
@@ -177,18 +161,6 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
-
-
-def test_label_maps_of_another_size_are_refused_or_resampled(little, tmp_path, monkeypatch, capsys):
-    folder = tmp_path / "labels"
-    folder.mkdir()
-    for path in (little.parents[4] / "room" / "instance").iterdir():
-        Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
-    flags = ("--load-config", little, *QUICK, *TWO, "--regions-dir", folder, "--output-dir", tmp_path / "out")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    shown = said(capsys)
-    assert "80" in shown and "96" in shown and "--regions-resample" in shown
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
 
 
 def test_another_level_of_label_files_rasterizes_nothing(little, tmp_path, monkeypatch, capsys):
@@ -288,7 +260,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 
 
 @pytest.mark.slow
-def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch, capsys):
+def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
     output = ("--load-config", little, "--k", "12", "--output-dir", tmp_path / "out")
     exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
@@ -302,7 +274,6 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     vectors = ("--text-vectors", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    theirs = tmp_path / "out" / "room" / "normlift" / "theirs" / "config.yml"
     first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
@@ -310,41 +281,6 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     assert torch.equal(first.directions(), second.directions())
     assert second.manifest["features"]["level"] == "l"
     assert second.manifest["encoder"]["text_vectors"] == str(tmp_path / "texts.npz")
-
-    asking = ("--load-config", theirs, "--text", "red", "--json", tmp_path / "a.json")
-    (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
-    capsys.readouterr()
-    assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
-    assert "--text-vectors" in said(capsys)
-    assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
-    document = json.loads((tmp_path / "a.json").read_text())
-    assert document["negatives"] == []  # the file has no vectors of LERF's words
-    assert document["queries"][0]["peak"] > 0.9
-
-    np.savez(tmp_path / "texts.npz", red=np.ones(5))
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True") == 1
-    shown = said(capsys)
-    assert "--queries" in shown and "5" in shown and "343" in shown
-
-
-def test_images_without_features_are_listed_and_left_out(little, tmp_path, monkeypatch, capsys):
-    source = RegionFeatures(Grid(9), ColorEncoder())
-    for view in open_scene(little).train:
-        write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
-    (tmp_path / "features" / "0003_f.npy").unlink()
-    np.savez(tmp_path / "texts.npz", red=ColorEncoder().text(["red"])[0].numpy())
-    flags = ("--load-config", little, "--features", "langsplat", "--features-dir", tmp_path / "features")
-    flags += ("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t")
-    flags += ("--check", "False", "--refine", "False")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "1 of 6 images" in said(capsys)
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
-    shown = capsys.readouterr()
-    assert "1 images without features" in shown.out
-    assert "Warning: 1 of 6 images" in shown.err and "images/0003.png" in shown.err
-    field = field_of(tmp_path / "out", "t")
-    assert field.manifest["statistics"]["views"] == 5
-    assert int(field.scalars.view_count.max()) <= 5
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 import types
 import warnings
@@ -19,14 +18,10 @@ import tyro
 import normlift_ns
 from normlift_ns.cli import common, start
 from research.reference import COMMANDS
+from tests.conftest import project
 from tests.scripts.conftest import run_entry
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-SCRIPTS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf8"))["project"]["scripts"]
+SCRIPTS = project()["scripts"]
 KINDS = {int: "INT", float: "FLOAT", Path: "PATH", str: "STR", bool: "True False", type(None): "None"}
 
 
@@ -122,18 +117,3 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
                 getattr(start, function)()
         assert (stop.value.code, begun[2:]) == (130, [f"normlift_ns.cli.{function}"])
         assert capsys.readouterr() == ("", "Interrupted.\n")
-
-
-def test_a_process_prints_help_of_80_columns_and_its_version():
-    environment = os.environ | {"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"}
-    program = "import sys; sys.argv[0] = 'ns-normlift-query'; from normlift_ns.cli.start import query; query()"
-    printed = []
-    for flag in ("--help", "--version"):
-        words = [sys.executable, "-c", program, flag]
-        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
-        assert (done.returncode, done.stderr) == (0, "")
-        printed.append(done.stdout)
-    boxes = [line for line in printed[0].splitlines() if line.startswith(("│", "╭", "╰"))]
-    assert "usage: ns-normlift-query" in printed[0] and {len(line) for line in boxes} == {80}
-    assert set(options(COMMANDS["ns-normlift-query"])) <= set(re.findall(r"--[a-z][a-z0-9-]*", printed[0]))
-    assert printed[1] == f"normlift_ns {normlift_ns.__version__}\n"

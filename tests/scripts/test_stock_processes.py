@@ -159,14 +159,6 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
 
 
-def test_ns_render_draws_every_output(little_lifted: Path, tmp_path: Path) -> None:
-    from nerfstudio.scripts.render import DatasetRender  # noqa: PLC0415
-
-    DatasetRender(little_lifted, output_path=tmp_path, split="test", image_format="png").main()
-    stock = {"gt-rgb", "rgb", "depth", "accumulation", "background"}
-    assert {path.name for path in (tmp_path / "test").iterdir()} == stock | set(NAMES)
-
-
 def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from nerfstudio.scripts.render import RenderCameraPath, RenderInterpolated  # noqa: PLC0415
 
