@@ -6,8 +6,6 @@ import gzip
 import json
 import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
 import time
@@ -27,6 +25,7 @@ from normlift_ns.cli import query
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.query.question import load_query
+from tests.browser.server import STOCK, Server
 from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import run_entry
 
@@ -94,37 +93,15 @@ def test_ns_viewer_answers(stranger, tmp_path):
 
 def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
     """The page that ns-viewer serves, if it still runs two seconds later."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(config), *map(str, flags)]
-    with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=cwd, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
+    viewer = Server(STOCK, config, log, cwd=cwd)
     try:
-        page = first_page(f"http://127.0.0.1:{port}/", viewer)
+        viewer.start(CUDA_VISIBLE_DEVICES="")
+        page = urllib.request.urlopen(viewer.address, timeout=60).read()
         time.sleep(2)
-        assert viewer.poll() is None, log.read_text()
+        assert viewer.alive(), viewer.said()
         return page
     finally:
-        viewer.send_signal(signal.SIGINT)
-        try:
-            viewer.wait(timeout=20)
-        except subprocess.TimeoutExpired:
-            viewer.kill()
-            viewer.wait()
-
-
-def first_page(address: str, viewer: subprocess.Popen[bytes]) -> bytes:
-    """What a server answers at last; b"" if it stopped or the time is over."""
-    end = time.monotonic() + SECONDS
-    while viewer.poll() is None and time.monotonic() < end:
-        try:
-            with urllib.request.urlopen(address, timeout=5) as answer:
-                return answer.read()
-        except (urllib.error.URLError, OSError):
-            time.sleep(0.5)
-    return b""
+        viewer.stop()
 
 
 @pytest.fixture(autouse=True)
