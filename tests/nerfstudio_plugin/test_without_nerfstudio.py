@@ -287,7 +287,15 @@ def test_data_sets_of_blender(tmp_path: Path) -> None:
             (folder / f"transforms_{split}.json").write_text(json.dumps(meta))
         parser = config_classes.BlenderDataParserConfig(data=folder, alpha_color=color, scale_factor=0.6)
         how = {"data": folder, "dataparser": parser, "camera_res_scale_factor": 0.5 if number % 3 == 0 else 1.0}
-        assert_equal(config_classes.FullImageDatamanagerConfig(**how), folder)
+        datamanager = config_classes.FullImageDatamanagerConfig(**how)
+        assert_equal(datamanager, folder)
+    (folder / "transforms_test.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"transforms_test\.json"):
+        parse_dataset(datamanager)
+    for value in (None, 0, 4, -1):
+        (folder / "transforms_train.json").write_text(json.dumps({**meta, "camera_angle_x": value}))
+        with pytest.raises(InputError, match=r"transforms_train\.json: camera_angle_x is"):
+            parse_dataset(datamanager)
 
 
 def test_optimized_poses_are_nerfstudios() -> None:

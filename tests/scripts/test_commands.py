@@ -83,13 +83,14 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
 
 
 def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
-    for output in ("--json", "--output-path", "--render-dir"):
+    for output in ("--objects-dir", "--json", "--output-path", "--render-dir"):
         folder = tmp_path / output
         folder.mkdir()
-        pictures = output == "--render-dir"
-        existing = folder / ("0003_1_sky_blue.png" if pictures else "mine")
+        pictures, objects = output == "--render-dir", output == "--objects-dir"
+        existing = folder / ("0003_1_sky_blue.png" if pictures else "objects.json" if objects else "mine")
         existing.write_text("mine")
-        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, folder if pictures else existing)
+        place = folder if objects or pictures else existing
+        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place, *["--objects"] * objects)
         with monkeypatch.context() as patch:
             patch.setattr("normlift_ns.query.arrays.open_quick", None)  # refused before anything is opened
             for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
@@ -100,7 +101,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
         views = ("--render-views", "0003") if pictures else ()
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
         assert existing.stat().st_size > 100
-        assert len(list(folder.iterdir())) == (2 if pictures else 1)
+        assert len(list(folder.iterdir())) == (2 if pictures else 4 if objects else 1)
     named = ("--load-config", lifted, "--text", "yellow", "--render-dir", folder, "--render-views", "0003")
     assert run_entry(monkeypatch, query.entrypoint, *named) == 0  # of another text
     assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
@@ -123,18 +124,6 @@ def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, m
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
     assert sorted(path.name for path in (tmp_path / "room" / "normlift").iterdir()) == [".cache", *names]
     assert [len(field_of(tmp_path, name)) > 0 for name in names] == [True, True]
-
-
-def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
-    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
-    monkeypatch.setattr("normlift_ns.encoders.color.ColorEncoder.encode", None)
-    given = (*QUICK, "--region-count", "300", "--refine", "False")
-    flags = ("--load-config", own, *given, "--timestamp", "two", "--beta", "2.0")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (field_of(own.parents[3], t) for t in ("t", "two"))
-    assert torch.equal(first.scalars.norm, second.scalars.norm)
-    assert (second.scalars.reliability <= first.scalars.reliability).all()
-    assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
 
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
@@ -161,27 +150,6 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
-
-
-def test_another_level_of_label_files_rasterizes_nothing(little, tmp_path, monkeypatch, capsys):
-    for path in (little.parents[4] / "room" / "instance").iterdir():
-        classes = np.asarray(Image.open(path)).astype(int)
-        np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
-    given = ("--max-views", "4", "--regions-dir", tmp_path, "--output-dir", tmp_path / "out")
-    flags = ("--load-config", little, *QUICK, *given)
-    for level in ("0", "1"):
-        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
-        monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
-    fields = [field_of(tmp_path / "out", level) for level in ("0", "1")]
-    weights = [field.scalars.weight for field in fields]
-    assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
-    classes, whole = (field.scalars.c_intra for field in fields)
-    assert torch.allclose(whole[whole > 0], torch.ones(()), atol=1e-6)  # one region per view agrees with itself
-    assert float(classes[classes > 0].min()) < 0.9
-    capsys.readouterr()
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
-    shown = said(capsys)
-    assert "2 levels" in shown and "0..1" in shown and "--level" in shown
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from normlift_ns.distributed.launch import (
     HEARTBEAT_TIMEOUT,
     Heartbeat,
     PeerFailure,
-    describe_failure,
     rank_and_world_size,
 )
 from normlift_ns.errors import InputError
@@ -182,8 +181,3 @@ def test_an_environment_that_cannot_be() -> None:
     for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
         with pytest.raises(InputError, match="torchrun"):
             rank_and_world_size(good | change)
-
-
-def test_what_people_are_told() -> None:
-    text = describe_failure(PeerFailure(1, False, "there, process 7"))
-    assert "Process 1 (there, process 7)" in text
