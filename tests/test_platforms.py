@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -18,32 +17,6 @@ from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
-LACKING = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton", "nerfstudio", "gsplat")
-NEED_THEM = (
-    *("kernels", "rasterization.triton", "rasterization.gsplat", "nerfstudio_plugin", "method_configs", "plugin"),
-    "demo.capture",
-)
-PROGRAM = """
-import signal, sys
-from importlib import import_module
-sys.modules.update(dict.fromkeys(sys.argv[1].split()))
-for name in {"SIGKILL", "SIGHUP", "SIGALRM", "SIGUSR1"} & set(dir(signal)):
-    delattr(signal, name)  # Windows has none of them
-for name in sys.argv[2:]:
-    import_module(name)
-"""
-
-
-@(pytest.mark.slow if sys.platform == "linux" else pytest.mark.filterwarnings("default"))
-def test_nothing_of_unix_or_of_nerfstudio_is_imported_when_modules_load():
-    """On Linux test_imports.py reads that in the files, much faster."""
-    paths = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "normlift_ns").rglob("*.py"))
-    names = sorted(".".join(path.parts).removesuffix(".__init__") for path in paths)
-    modules = [name for name in names if not name.startswith(tuple(f"normlift_ns.{x}" for x in NEED_THEM))]
-    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, " ".join(LACKING), *modules]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
-    assert (done.returncode, len(modules) > 100) == (0, True), done.stderr
 
 
 def test_the_short_list_is_that_of_the_page_and_of_the_project():

@@ -4,21 +4,16 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
-from normlift_ns.demo.room import DemoRoom
 
 
-@pytest.fixture(scope="module")
-def folder(small: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture") / "room"
+def test_images_and_masks_are_the_views_and_labels_name_their_values(tmp_path: Path):
+    from tests.plain_room import plain_room  # noqa: PLC0415
+
+    small, folder = plain_room(2000), tmp_path / "room"
     write_capture(small, folder, views=2, held_out=2, width=60, height=44)
-    return folder
-
-
-def test_images_and_masks_are_the_views_and_labels_name_their_values(folder: Path, small: DemoRoom):
     cameras = [*demo_cameras(2, 60, 44), *held_out_cameras(2, 60, 44)]
     for kind, mode, view in (("images", "RGB", view_image), ("instance", "L", view_labels)):
         assert sorted(path.name for path in (folder / kind).iterdir()) == [f"{i:04d}.png" for i in range(4)]
