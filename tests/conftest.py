@@ -25,6 +25,11 @@ from filelock import FileLock  # noqa: E402
 
 from tests.examples import register_profile  # noqa: E402
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 if TYPE_CHECKING:
     from normlift_ns.demo.room import DemoRoom
 
@@ -75,6 +80,11 @@ def _patch_triton_once() -> None:
         return scope
 
     interpreter._patch_lang = once
+
+
+def project() -> dict[str, Any]:
+    """The table `project` of pyproject.toml."""
+    return tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf8"))["project"]
 
 
 def import_nerfstudio() -> Any:
@@ -165,32 +175,42 @@ def room() -> DemoRoom:
     return plain_room(6000)
 
 
-@pytest.fixture(scope="session")
-def trained(room: DemoRoom, made_once: Any) -> Path:
-    """config.yml of a stock splatfacto run in the room."""
+def make_trained(made_once: Any, name: str, room: DemoRoom, **how: int) -> Path:
+    """config.yml of a stock splatfacto run in a room, whose capture is made as `how` says."""
 
     def make(folder: Path) -> None:
         import_nerfstudio()
         from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
 
-        write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
+        write_capture(room, folder / "room", held_out=2, **how)
         write_splatfacto_run(room, folder / "room", folder / "outputs")
 
-    return next(made_once("trained", make).glob("outputs/*/splatfacto/*/config.yml"))
+    return next(made_once(name, make).glob("outputs/*/splatfacto/*/config.yml"))
 
 
-@pytest.fixture(scope="session")
-def lifted(trained: Path, made_once: Any) -> Path:
-    """config.yml of a lifted run of the room, with the stored queries red and yellow."""
+def make_lifted(made_once: Any, trained: Path, timestamp: str, *flags: str) -> Path:
+    """config.yml of a lifted run with the stored queries red and yellow."""
 
     def make(folder: Path) -> None:
         import_nerfstudio()
         from normlift_ns.cli import lift  # noqa: PLC0415
         from tests.scripts.conftest import QUICK, run_entry  # noqa: PLC0415
 
+        given = ("--load-config", trained, *QUICK, *flags, "--timestamp", timestamp)
         with pytest.MonkeyPatch.context() as patch:
-            flags = ("--load-config", trained, *QUICK, "--timestamp", "one", "--queries", "red", "yellow")
-            assert run_entry(patch, lift.entrypoint, *flags) == 0
+            assert run_entry(patch, lift.entrypoint, *given, "--queries", "red", "yellow") == 0
 
-    made_once("lifted", make)
-    return trained.parents[2] / "normlift" / "one" / "config.yml"
+    made_once(f"lifted-{timestamp}", make)
+    return trained.parents[2] / "normlift" / timestamp / "config.yml"
+
+
+@pytest.fixture(scope="session")
+def trained(room: DemoRoom, made_once: Any) -> Path:
+    """config.yml of a stock splatfacto run in the room."""
+    return make_trained(made_once, "trained", room, views=12, width=160, height=120)
+
+
+@pytest.fixture(scope="session")
+def lifted(trained: Path, made_once: Any) -> Path:
+    """config.yml of a lifted run of the room."""
+    return make_lifted(made_once, trained, "one")

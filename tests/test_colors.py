@@ -7,30 +7,10 @@ import torch
 
 from normlift_ns.rendering.colors import COLORMAPS, apply_colormap, colormap_rgb, named_color, prompt_colors
 
-DEUTERANOPE = torch.tensor([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
-"""Linear RGB as people without green cones see it (Machado, Oliveira and Fernandes, 2009)."""
-
-
-def lightness(colors: torch.Tensor) -> torch.Tensor:
-    """CIE L* of sRGB."""
-    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    y = linear @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=linear.dtype)
-    return torch.where(y > 0.008856, 116 * y ** (1 / 3) - 16, 903.3 * y)
-
 
 def test_colours_are_those_of_matplotlib() -> None:
     ends = torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]])
-    torch.testing.assert_close(colormap_rgb("viridis")[[0, 255]], ends, atol=1e-3, rtol=0)
-
-
-def test_the_default_maps_become_lighter_evenly_for_every_eye() -> None:
-    for name in ("viridis", "cividis"):
-        for eye in (torch.eye(3), DEUTERANOPE):
-            steps = lightness((colormap_rgb(name).double() @ eye.double().T).clamp(0, 1)).diff()
-            assert float(steps.min()) > 0
-            assert float(steps.std() / steps.mean()) < 0.35
-    assert COLORMAPS[0] == "viridis"
-    assert float(lightness(colormap_rgb("turbo").double()).diff().min()) < 0  # the measure finds what is uneven
+    torch.testing.assert_close(colormap_rgb(COLORMAPS[0])[[0, 255]], ends, atol=1e-3, rtol=0)  # viridis
 
 
 def test_opacity_grows_with_relevancy() -> None:

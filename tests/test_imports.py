@@ -1,6 +1,7 @@
 """Imports go one way and in no circle; the package imports nothing heavy; nerfstudio is known to few."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -96,7 +97,9 @@ def imports(path: Path, modules: set[str]) -> Iterator[tuple[str, bool]]:
             if not isinstance(child, ast.expr):
                 yield from walk(child, now and not later)
 
-    yield from walk(ast.parse(path.read_text("utf8")), True)
+    text = path.read_text("utf8")
+    assert not re.search(r"^\S.*\bsignal\.SIG(KILL|HUP|ALRM|USR)", text, re.MULTILINE), f"{path}: not on Windows"
+    yield from walk(ast.parse(text), True)
 
 
 def test_imports_go_downwards_in_no_circle_and_only_the_plugin_knows_nerfstudio():
@@ -135,6 +138,9 @@ normlift_ns.__version__
 check("version", HEAVY)
 from normlift_ns.cli import batch, check as _, demo, evaluate, export, lift, query, view
 check("scripts", HEAVY)
+from normlift_ns.encoders.weights import has_local_clip_weights
+has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
+check("weights", HEAVY | {"transformers", "skimage"})
 missing = ["--load-config", "nowhere/config.yml"]
 mistakes = [
     (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "colour", "--sigma-d", "nan"]),

@@ -113,7 +113,7 @@ def test_images_that_share_a_label_map_or_exported_files_are_refused(tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
-def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Path) -> None:
+def test_images_that_share_an_instance_mask_and_labels_of_nothing_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text('{"1": "a"}')
     np.save(tmp_path / "0000.npy", FULL)
     made = scene("a/0000.png", held_out=("b/0000.png",))
@@ -123,11 +123,6 @@ def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Pat
     with pytest.raises(InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
         mask_truth(scene("0000.png"), tmp_path, MaskOptions(names=tmp_path / "labels.json"))
     info = {"width": WIDTH, "height": HEIGHT}
-    egg = {"category": "egg", "segmentation": [[1, 1], [5, 1], [5, 5]]}
-    (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": [egg]}))
-    run = EvaluatedRun(scene("a/0000.png", held_out=("b/0000.png",)), None, None, True)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"0000\.json .*a/0000\.png and b/0000\.png"):
-        run_lerf([run], [tmp_path], LerfOptions())
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
     run = EvaluatedRun(scene("a/0000.png"), None, ColorEncoder(), True)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="have no objects"):

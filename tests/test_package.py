@@ -8,17 +8,12 @@ import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import pytest
 
 import normlift_ns
 from research import licences
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from tests.conftest import project
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "normlift_ns").rglob("*.py")}
@@ -29,10 +24,6 @@ def run(*command: object, cwd: Path, **kwargs) -> str:
     done = subprocess.run(words, check=False, capture_output=True, text=True, cwd=cwd, **kwargs)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
-
-
-def project() -> dict[str, Any]:
-    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]
 
 
 @pytest.fixture(scope="module")
@@ -126,17 +117,6 @@ def test_the_wheel_works_in_a_clean_environment(built, tmp_path):
     run(python, "-W", "ignore", "-c", code, cwd=tmp_path)
 
 
-def test_another_checkout_is_taken_whole(tmp_path):
-    """With a second checkout on PYTHONPATH every module comes from there, that of the entry points too."""
-    package = tmp_path / "normlift_ns"
-    for name in ("", "method_configs"):
-        (package / name).mkdir()
-        (package / name / "__init__.py").write_text(f"where = {str(tmp_path)!r}\n")
-    code = "import normlift_ns, normlift_ns.method_configs as m; print(m.where, normlift_ns.where)"
-    found = run(sys.executable, "-c", code, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)})
-    assert found.split() == [str(tmp_path)] * 2
-
-
 def test_the_folder_of_method_configs_is_a_link_for_readers():
     """On a Windows checkout it is a text file, so nothing may import it or name it."""
     link = ROOT / "method_configs"
@@ -146,16 +126,6 @@ def test_the_folder_of_method_configs_is_a_link_for_readers():
     for path in [*ROOT.glob("normlift_ns/**/*.py"), *ROOT.glob("research/*.py"), *ROOT.glob("tests/**/*.py")]:
         text = path.read_text()
         assert "\nimport method_configs" not in text and "\nfrom method_configs" not in text, path
-
-
-@pytest.mark.slow
-def test_the_type_checker_resolves_method_configs(tmp_path):
-    checker = Path(sys.executable).with_name("basedpyright")
-    code = "from normlift_ns.method_configs.normlift import normlift_method as m\nreveal_type(m)\n"
-    (tmp_path / "use.py").write_text(code)
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"include": ["use.py"], "extraPaths": [str(ROOT)]}))
-    shown = run(checker, "--pythonpath", sys.executable, cwd=tmp_path)
-    assert 'is "MethodSpecification"' in shown
 
 
 def test_every_dependency_and_its_licence_are_listed():

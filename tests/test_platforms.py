@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -18,32 +17,6 @@ from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
-LACKING = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton", "nerfstudio", "gsplat")
-NEED_THEM = (
-    *("kernels", "rasterization.triton", "rasterization.gsplat", "nerfstudio_plugin", "method_configs", "plugin"),
-    "demo.capture",
-)
-PROGRAM = """
-import signal, sys
-from importlib import import_module
-sys.modules.update(dict.fromkeys(sys.argv[1].split()))
-for name in {"SIGKILL", "SIGHUP", "SIGALRM", "SIGUSR1"} & set(dir(signal)):
-    delattr(signal, name)  # Windows has none of them
-for name in sys.argv[2:]:
-    import_module(name)
-"""
-
-
-@(pytest.mark.slow if sys.platform == "linux" else pytest.mark.filterwarnings("default"))
-def test_nothing_of_unix_or_of_nerfstudio_is_imported_when_modules_load():
-    """On Linux test_imports.py reads that in the files, much faster."""
-    paths = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "normlift_ns").rglob("*.py"))
-    names = sorted(".".join(path.parts).removesuffix(".__init__") for path in paths)
-    modules = [name for name in names if not name.startswith(tuple(f"normlift_ns.{x}" for x in NEED_THEM))]
-    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, " ".join(LACKING), *modules]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
-    assert (done.returncode, len(modules) > 100) == (0, True), done.stderr
 
 
 def test_the_short_list_is_that_of_the_page_and_of_the_project():
@@ -84,22 +57,6 @@ def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path)
     typed(tmp_path, python.with_name(ask[0]), *ask[1:], "--json", "answers.json")
     assert json.loads((tmp_path / "answers.json").read_text())
     typed(tmp_path, python.with_name("ns-normlift-export"), *ask[1:3], "--output-dir", "exported")
-
-
-def test_make_and_the_metadata_name_the_versions_of_python_and_torch(capsys):
-    found = re.search(r"-c '(import sys; v = .*)'\n", (ROOT / "Makefile").read_text("utf8"))
-    assert found is not None
-    for version, fits in (((3, 9), False), ((3, 10), True), ((3, 12), True), ((3, 13), False)):
-        check = found[1].replace("sys.version_info[:2]", repr(version)).replace("$(MAKECMDGOALS)", "demo")
-        with pytest.raises(SystemExit) as stop:
-            exec(check, {})
-        assert (stop.value.code == 0) == fits, version
-        if not fits:
-            assert f"{version[0]}.{version[1]}" in str(stop.value.code) and "3.10 to 3.12" in str(stop.value.code)
-    project = (ROOT / "pyproject.toml").read_text("utf8")
-    assert 'requires-python = ">=3.10,<3.13"' in project
-    assert '"torch>=2.1"' in project and '"torchvision>=0.16"' in project
-    assert '"setuptools>=77"' in project  # the license is an SPDX expression
 
 
 @pytest.mark.slow

@@ -180,21 +180,6 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
         run_repl(run, {}, keep_history=True)  # no place for it
 
 
-def test_ways_to_ask_that_do_not_fit(lifted, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
-    for flags, words in (
-        ((), ("no prompts",)),
-        (("--text", "a", "--stdin"), ("--text", "--stdin")),
-        (("--stdin", "--interactive", "True"), ("--stdin", "--interactive")),
-        (("--stdin", "--json", "a.json"), ("--json", "--text", "--stdin")),
-        (("--interactive", "--save"), ("--save", "--text", "--interactive")),
-        (("--interactive",), ("--interactive", "terminal")),
-    ):
-        assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, *flags) == 1
-        shown = said(capsys)
-        assert all(word in shown for word in words), shown
-
-
 def test_a_run_with_another_checkpoint_is_opened_whole(lifted, tmp_path):
     """Its own files do not tell then which one the scene is."""
     copy = shutil.copytree(lifted.parent, tmp_path / "run")

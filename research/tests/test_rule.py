@@ -1,14 +1,11 @@
 """The rule for defaults, on made tables that hit every clause."""
 
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from research.candidates import CANDIDATES, FIRST, Candidate
-from research.damage import LADDER, STEPS
-from research.rule import CHOICE, CONFIRMATION, LIMITS, Cell, cells_of, damage_of, decide, verdict
+from research.rule import CHOICE, LIMITS, Cell, cells_of, decide, verdict
 
 NAMES = ("none", "one", "two")
 CELLS = [cell for scene in CHOICE for cell in cells_of(scene)]
@@ -30,26 +27,6 @@ def some(count, loss, gain=3.0, cells=CELLS, chosen=lambda cell: True):
     """A gain everywhere, and a loss in so many of the chosen cells."""
     struck = [cell for cell in cells if chosen(cell)][:count]
     return lambda cell: -loss if cell in struck else gain
-
-
-def test_the_grid_is_the_one_that_was_written_down():
-    assert CHOICE == ("tabletop", "demo") and CONFIRMATION == ("second", "third")
-    assert len(CELLS) == 2 * 299 and len(ROOM) == 299 and len(set(CELLS)) == len(CELLS)
-    assert Counter(cell.kind for cell in ROOM) == {"masks": 212, "superpixels": 29, "grid": 29, "patches": 29}
-    assert Counter(cell.views for cell in ROOM) == {"all": 96, "6": 96, "3": 96, "4": 11}
-    assert sum(cell.undamaged for cell in ROOM) == 11
-    assert {cell.damage for cell in ROOM} == set(STEPS) and len(LADDER) == 13 and len(STEPS) == 15
-    assert damage_of(Cell("demo", "masks", "clip", "mild", "3")).views == 3
-    assert damage_of(Cell("demo", "masks", "clip", "few views", "4")) == LADDER["few views"]
-    assert damage_of(Cell("demo", "masks", "clip", "hard", "all")) == LADDER["hard"]
-
-
-def test_candidates_have_names_of_their_own_and_the_simplest_come_first():
-    names = [one.name for one in CANDIDATES]
-    assert len(set(names)) == len(names) and names[0] == "none"
-    assert {"paper", "plain_knn", "linear", "norm_only", "support_only", "posterior", "consensus"} <= set(names)
-    assert FIRST["paper"] == Candidate("paper", None, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
-    assert Candidate("posterior", 3.0, sigma_d=2.0, prior=8.0).name == "consensus_posterior power 3 prior 8"
 
 
 def test_the_best_mean_of_the_eligible_wins():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import tempfile
 from pathlib import Path
 
@@ -45,17 +44,6 @@ def test_mistakes_of_the_user_are_told_as_they_are(state):
         message, code = describe_error(raised(error))
         assert code == 1 and all(fact in message for fact in facts), message
     assert not state.exists()
-
-
-@pytest.mark.parametrize("error", [ValueError("wrong"), KeyError("x"), RecursionError("deep"), AssertionError()])
-def test_ours_are_written_to_a_file_of_the_user_alone(error, state):
-    message, code = describe_error(raised(error))
-    (log,) = state.iterdir()
-    assert code == 70
-    assert type(error).__name__ in message and str(log) in message
-    assert str(os.getpid()) in log.name
-    assert "Traceback" in log.read_text() and "in raised" in log.read_text()
-    assert stat.S_IMODE(log.stat().st_mode) == 0o600
 
 
 def test_without_a_state_folder_the_temporary_one_is_taken(monkeypatch, tmp_path):

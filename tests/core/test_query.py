@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
+from normlift_ns import relevancy
 from normlift_ns.analysis.objects import best_prompt
 from normlift_ns.options import RelevancyRule
 from tests.scenes import generator
@@ -49,11 +49,6 @@ def test_forms_that_compare_need_negatives():
 def test_unknown_rule():
     with pytest.raises(ValueError, match=r"rule .*cosine, lerf, margin.*dot"):
         relevancy(POSITIVE, NEGATIVE, rule="dot")
-
-
-def test_published_word_lists():
-    assert BACKGROUND_WORDS[4:] == CANONICAL_NEGATIVES
-    assert len(BACKGROUND_WORDS) == 8
 
 
 def test_strongest_is_the_selected_prompt_of_largest_relevancy():

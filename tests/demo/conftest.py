@@ -14,11 +14,3 @@ def room() -> DemoRoom:
     from normlift_ns.demo.room import demo_room  # noqa: PLC0415
 
     return demo_room(6000)
-
-
-@pytest.fixture(scope="session")
-def small() -> DemoRoom:
-    """A room that is built in a moment."""
-    from tests.plain_room import plain_room  # noqa: PLC0415
-
-    return plain_room(2000)

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from normlift_ns.cli.preflight import check_source_options
+from normlift_ns.data.open_splat import SPLAT_READERS
 from normlift_ns.encoders.build import make_encoder, make_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
@@ -25,14 +26,11 @@ from normlift_ns.encoders.registry import (
     find_encoder_kind,
 )
 from normlift_ns.errors import InputError
+from normlift_ns.exports import EXPORTERS
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES
+from tests.conftest import project
 from tests.encoders.tiny import refused
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 ROOT = Path(__file__).parents[2]
 OURS = ["colour", "metaclip2", "open_clip", "siglip", "siglip2"]
@@ -63,9 +61,8 @@ def points(**encoders: str) -> str:
 
 def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     """So that they are found without metadata too, as in a source tree on PYTHONPATH."""
-    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"]
-    for registry in (ENCODERS, MASK_SOURCES):
-        assert registered[registry.group] == registry.built_in
+    for registry in (ENCODERS, MASK_SOURCES, EXPORTERS, SPLAT_READERS):
+        assert project()["entry-points"][registry.group] == registry.built_in
         assert sorted(registry.built_in) == registry.names()
         assert all(registry.load(name) is not None for name in registry.names())
     assert ENCODERS.names() == OURS

@@ -3,7 +3,6 @@
 import json
 import os
 import pickle
-import shutil
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -120,7 +119,7 @@ def test_templates_and_their_ensemble(clip, open_clip):
     assert ours != others
 
 
-def test_what_changes_features_changes_the_identity(clip, tmp_path):
+def test_what_changes_features_changes_the_identity(clip):
     """A file of weights counts by its content, of which a pickle and safetensors hold the same."""
     unread = replace(clip)
     assert unread.encode(IMAGE, torch.full((1, 48, 64), -1, dtype=torch.int32)).shape == (0, 24)
@@ -131,10 +130,6 @@ def test_what_changes_features_changes_the_identity(clip, tmp_path):
     white = replace(clip, fill="white")
     assert not torch.allclose(white.encode(IMAGE, MAPS), features, atol=1e-3)
     assert white.identity != clip.identity == json.loads(json.dumps(clip.identity))
-    copy = shutil.copy(clip.pretrained, tmp_path / "copy.pt")
-    assert replace(clip, pretrained=str(copy)).identity == clip.identity
-    copy.write_bytes(copy.read_bytes() + b"x")
-    assert replace(clip, pretrained=str(copy)).identity != clip.identity
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -124,16 +124,3 @@ def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
     assert (list(own.get_xdata()), list(own.get_ydata())) == ([0], [0.4])
     assert list(result.get_ydata()) == [0.45, 0.45]
     assert {x.get_text() for x in of_beta.get_legend().get_texts()} == {"default", "this run", "result"}
-
-
-def test_every_scene_has_its_signals_drawn():
-    from normlift_ns.evaluation.studies import signals_figure  # noqa: PLC0415
-
-    one = {"zero.share": 0.5, "histogram.0.00": 0.2, "histogram.0.50": 0.3}
-    rows = [{"scene": "a$", **one, "reliability.bin1": 0.1, "reliability.bin2": 0.9}, {"scene": "b", **one}]
-    figure = signals_figure(rows)
-    assert len(figure.axes) == 4
-    assert [axes.get_title() for axes in figure.axes[::2]] == ["a$", "b"]
-    assert list(figure.axes[0].lines[0].get_ydata()) == [10, 90]
-    assert len(figure.axes[2].lines) == 0
-    assert [bar.get_height() for bar in figure.axes[3].patches] == [20, 30, 50]

@@ -63,13 +63,12 @@ class StockRun:
         return pipeline
 
 
-def write_dataset(folder: Path, *, masks: bool = False, channels: int = 3, halved: bool = False) -> None:
+def write_dataset(folder: Path, *, masks: bool = False, channels: int = 3) -> None:
     """Writes transforms.json, ten images from a circle around the origin, and sparse_pc.ply.
 
     Args:
         masks: with a mask per image that is 0 in its left quarter.
         channels: 3: JPEG, 4: PNG with an alpha channel that is 0 in the right quarter.
-        halved: also with images of half the size in images_2/, as ns-process-data makes them.
     """
     (folder / "images").mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -81,11 +80,7 @@ def write_dataset(folder: Path, *, masks: bool = False, channels: int = 3, halve
         if channels == 4:
             picture = np.dstack([picture, np.full((HEIGHT, WIDTH), 255, np.uint8)])
             picture[:, 3 * WIDTH // 4 :, 3] = 0
-        image = Image.fromarray(picture)
-        image.save(folder / "images" / f"{i:03d}.{suffix}")
-        if halved:
-            (folder / "images_2").mkdir(exist_ok=True)
-            image.resize((WIDTH // 2, HEIGHT // 2)).save(folder / "images_2" / f"{i:03d}.{suffix}")
+        Image.fromarray(picture).save(folder / "images" / f"{i:03d}.{suffix}")
         frames.append({"file_path": f"images/{i:03d}.{suffix}", "transform_matrix": pose(i).tolist()})
         if masks:
             mask = np.full((HEIGHT, WIDTH), 255, np.uint8)

@@ -137,33 +137,6 @@ def test_masks_are_undistorted_with_their_images_and_named_with_them(tmp_path: P
     assert 0 < int(opened(run.config).train[4].mask.sum()) < 3 * HEIGHT
 
 
-@pytest.mark.parametrize("how", ["dataparser", "datamanager"])
-def test_downscaled_images_are_used_as_in_training(tmp_path: Path, how: str) -> None:
-    write_dataset(tmp_path / "halved", halved=True)
-
-    def configure(config) -> None:
-        if how == "dataparser":
-            config.pipeline.datamanager.dataparser.downscale_factor = 2
-        else:
-            config.pipeline.datamanager.camera_res_scale_factor = 0.5
-
-    train = _assert_like_the_training(train_splatfacto(tmp_path, Path("halved"), configure=configure)).train
-    assert train.names[0] == ("images_2/000.jpg" if how == "dataparser" else "images/000.jpg")
-    camera = train.cameras[0]
-    assert (camera.width, camera.height) == (23, 17) and FOCAL / 2 < float(camera.K[0, 0]) < FOCAL
-
-
-def test_a_run_without_held_out_views_whose_images_have_alpha(tmp_path: Path) -> None:
-    def configure(config) -> None:
-        config.pipeline.datamanager.dataparser.train_split_fraction = 1.0
-
-    write_dataset(tmp_path / "cutout", channels=4)
-    run = opened(train_splatfacto(tmp_path, Path("cutout"), configure=configure).config)
-    assert run.train[0].image.shape == (35, 47, 3)
-    assert run.train[0].image[:, 37:].unique(dim=0).tolist() == [[[38, 42, 55]] * 10]  # the viewer's background
-    assert (len(run.train), list(run.held_out), run.held_out.cameras) == (10, [], [])
-
-
 def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None:
     run = opened(copied)
     file = run.train.files[3]

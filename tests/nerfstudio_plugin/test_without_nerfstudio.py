@@ -25,7 +25,7 @@ from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.cameras import apply_pose_adjustments, normalize_poses
 from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
-from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
+from normlift_ns.data.nerfstudio.dataparsers import check_dataset, parse_dataset
 from normlift_ns.data.nerfstudio.load import TrainedViews, _reading
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
@@ -300,6 +300,13 @@ def test_data_sets_of_blender(tmp_path: Path) -> None:
         parser = config_classes.BlenderDataParserConfig(data=folder, alpha_color=color, scale_factor=0.6)
         how = {"data": folder, "dataparser": parser, "camera_res_scale_factor": 0.5 if number % 3 == 0 else 1.0}
         assert_equal(config_classes.FullImageDatamanagerConfig(**how), folder)
+    for value in (None, 0, 4, -1):
+        (folder / "transforms_train.json").write_text(json.dumps({**meta, "camera_angle_x": value}))
+        with pytest.raises(InputError, match=r"transforms_train\.json: camera_angle_x is"):
+            check_dataset(parser)
+    (folder / "transforms_train.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"transforms_train\.json"):
+        check_dataset(parser)
 
 
 def test_optimized_poses_are_nerfstudios() -> None:

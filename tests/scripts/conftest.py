@@ -15,7 +15,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from normlift_ns.cli.common import run_command
-from tests.conftest import import_nerfstudio
+from tests.conftest import make_lifted, make_trained
 
 if TYPE_CHECKING:
     from normlift_ns.demo.room import DemoRoom
@@ -104,31 +104,13 @@ def little_room() -> DemoRoom:
 @pytest.fixture(scope="session")
 def little(little_room: DemoRoom, made_once: Any) -> Path:
     """config.yml of a trained run with few Gaussians and 6 small photographs, for tests that lift or evaluate."""
-
-    def make(folder: Path) -> None:
-        import_nerfstudio()
-        from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
-
-        write_capture(little_room, folder / "room", views=6, held_out=2, width=96, height=72)
-        write_splatfacto_run(little_room, folder / "room", folder / "outputs")
-
-    return next(made_once("little", make).glob("outputs/*/splatfacto/*/config.yml"))
+    return make_trained(made_once, "little", little_room, views=6, width=96, height=72)
 
 
 @pytest.fixture(scope="session")
 def little_lifted(little: Path, made_once: Any) -> Path:
     """config.yml of a lifted run of it."""
-
-    def make(folder: Path) -> None:
-        import_nerfstudio()
-        from normlift_ns.cli import lift  # noqa: PLC0415
-
-        with pytest.MonkeyPatch.context() as patch:
-            flags = ("--load-config", little, *QUICK, "--region-count", "300", "--timestamp", "t")
-            assert run_entry(patch, lift.entrypoint, *flags, "--queries", "red", "yellow") == 0
-
-    made_once("little_lifted", make)
-    return little.parents[2] / "normlift" / "t" / "config.yml"
+    return make_lifted(made_once, little, "t", "--region-count", "300")
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import sys
@@ -39,17 +38,10 @@ from normlift_ns.io.file_lock import ClaimState, read_claim_states, read_jsonl, 
 from tests.processes import FORK, killed_at
 from tests.scripts import stand_in
 from tests.scripts.conftest import SMALL, run_entry, said, wait_for
+from tests.scripts.test_early import CONFIG
 
 STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 PATIENCE = 1.5
-ROOT = Path(__file__).parents[2]
-CONFIG = """!!python/object:nerfstudio.engine.trainer.TrainerConfig
-experiment_name: {}
-method_name: splatfacto
-timestamp: run
-output_dir: !!python/object/apply:pathlib.PosixPath
-- outputs
-"""
 
 
 class Batch:
@@ -61,7 +53,7 @@ class Batch:
         self.configs = [self.outputs / name / "splatfacto" / "run" / "config.yml" for name in names]
         for name, config, text in zip(names, self.configs, what):
             config.parent.mkdir(parents=True)
-            config.write_text(CONFIG.format(name))
+            config.write_text(CONFIG.replace("room", name))
             config.with_name("what.txt").write_text(text)
         self.list.write_text("# captures\n\n" + "".join(f"{config}\n" for config in self.configs))
 
@@ -363,8 +355,8 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("normlift_ns.cli.batch.run_logged", lambda *_: 0)
     made = Batch(tmp_path, ["0"] * 5)
     for task in range(3):
-        for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
-            monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+        for name, value in array(task + 4, 3, least=4).items():
+            monkeypatch.setenv(name, value)
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
         assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
     lines = read_jsonl(made.results, Outcome)
@@ -459,36 +451,3 @@ def test_what_the_environment_says_and_cannot_say():
         with pytest.raises(InputError) as told:
             make_shard("auto", environment)
         assert [fact for fact in facts if fact not in str(told.value)] == [], told.value
-
-
-RAY = f"""#!{sys.executable}
-from normlift_ns.cli import batch, start
-batch.lift_captures.__kwdefaults__["program"] = {STAND_IN!r}
-start.batch()
-"""
-
-
-@pytest.mark.slow
-def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
-    """Of docs/scale.md, with processors in place of GPUs."""
-    ray = pytest.importorskip("ray", reason="ray is not installed; it is no dependency: pip install ray")
-    made = Batch(tmp_path, ["0.05"] * 12)
-    (recipe,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scale.md").read_text("utf8"), flags=re.DOTALL)
-    for before, after in (("num_gpus", "num_cpus"), ('"GPU"', '"CPU"'), ("os.getcwd()", repr(str(tmp_path)))):
-        assert recipe.count(before) == 1
-        recipe = recipe.replace(before, after)
-    command = tmp_path / "bin" / "ns-normlift-batch"
-    command.parent.mkdir()
-    command.write_text(RAY)
-    command.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{command.parent}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # it would leave a token in the home folder
-    try:
-        exec(compile(recipe, "docs/scale.md", "exec"), {"__name__": "recipe"})
-    finally:
-        ray.shutdown()
-    assert "0" in capsys.readouterr().out.splitlines()  # among what the workers say
-    options = ("--regions", "sam")
-    made.check_lifted_once(*options)
-    assert set(made.states(*options)) == {"done"} and sum(made.begun().values()) == 12

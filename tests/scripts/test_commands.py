@@ -20,11 +20,8 @@ from normlift_ns import evidence_collection, open_run, open_scene
 from normlift_ns.cli import evaluate, export, lift, query
 from normlift_ns.cli.demo import iou_per_class
 from normlift_ns.data.splat import SplatParameters
-from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
-from normlift_ns.encoders.langsplat import write_langsplat
 from normlift_ns.query.question import load_query
-from normlift_ns.segmentation.regions import Grid
 from normlift_ns.segmentation.sam import MaskRules, SamMasks
 from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
 from tests.scripts.conftest import QUICK, SMALL, run_entry, said
@@ -86,13 +83,14 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
 
 
 def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
-    for output in ("--json", "--output-path", "--render-dir"):
+    for output in ("--objects-dir", "--json", "--output-path", "--render-dir"):
         folder = tmp_path / output
         folder.mkdir()
-        pictures = output == "--render-dir"
-        existing = folder / ("0003_1_sky_blue.png" if pictures else "mine")
+        pictures, objects = output == "--render-dir", output == "--objects-dir"
+        existing = folder / ("0003_1_sky_blue.png" if pictures else "objects.json" if objects else "mine")
         existing.write_text("mine")
-        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, folder if pictures else existing)
+        place = folder if objects or pictures else existing
+        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place, *["--objects"] * objects)
         with monkeypatch.context() as patch:
             patch.setattr("normlift_ns.query.arrays.open_quick", None)  # refused before anything is opened
             for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
@@ -103,7 +101,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
         views = ("--render-views", "0003") if pictures else ()
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
         assert existing.stat().st_size > 100
-        assert len(list(folder.iterdir())) == (2 if pictures else 1)
+        assert len(list(folder.iterdir())) == (2 if pictures else 4 if objects else 1)
     named = ("--load-config", lifted, "--text", "yellow", "--render-dir", folder, "--render-views", "0003")
     assert run_entry(monkeypatch, query.entrypoint, *named) == 0  # of another text
     assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
@@ -117,19 +115,6 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
 
-def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, capsys):
-    run = tmp_path / "outputs" / "room" / "normlift" / "one"
-    shutil.copytree(lifted.parent, run)
-    given = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room")
-    path = run / "normlift" / "field.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
-    assert run_entry(monkeypatch, export.entrypoint, *given, "--output-dir", tmp_path / "out") == 1
-    shown = said(capsys)
-    assert "is damaged" in shown and path.name in shown and "ns-normlift" in shown
-    assert not (tmp_path / "out").exists()
-
-
 def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
     clock = SimpleNamespace(now=lambda: datetime(2024, 5, 1, 12))
     monkeypatch.setattr("normlift_ns.io.run_dir.datetime", clock)
@@ -139,18 +124,6 @@ def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, m
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
     assert sorted(path.name for path in (tmp_path / "room" / "normlift").iterdir()) == [".cache", *names]
     assert [len(field_of(tmp_path, name)) > 0 for name in names] == [True, True]
-
-
-def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
-    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
-    monkeypatch.setattr("normlift_ns.encoders.color.ColorEncoder.encode", None)
-    given = (*QUICK, "--region-count", "300", "--refine", "False")
-    flags = ("--load-config", own, *given, "--timestamp", "two", "--beta", "2.0")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (field_of(own.parents[3], t) for t in ("t", "two"))
-    assert torch.equal(first.scalars.norm, second.scalars.norm)
-    assert (second.scalars.reliability <= first.scalars.reliability).all()
-    assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
 
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
@@ -177,39 +150,6 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
-
-
-def test_label_maps_of_another_size_are_refused_or_resampled(little, tmp_path, monkeypatch, capsys):
-    folder = tmp_path / "labels"
-    folder.mkdir()
-    for path in (little.parents[4] / "room" / "instance").iterdir():
-        Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
-    flags = ("--load-config", little, *QUICK, *TWO, "--regions-dir", folder, "--output-dir", tmp_path / "out")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    shown = said(capsys)
-    assert "80" in shown and "96" in shown and "--regions-resample" in shown
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
-
-
-def test_another_level_of_label_files_rasterizes_nothing(little, tmp_path, monkeypatch, capsys):
-    for path in (little.parents[4] / "room" / "instance").iterdir():
-        classes = np.asarray(Image.open(path)).astype(int)
-        np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
-    given = ("--max-views", "4", "--regions-dir", tmp_path, "--output-dir", tmp_path / "out")
-    flags = ("--load-config", little, *QUICK, *given)
-    for level in ("0", "1"):
-        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
-        monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
-    fields = [field_of(tmp_path / "out", level) for level in ("0", "1")]
-    weights = [field.scalars.weight for field in fields]
-    assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
-    classes, whole = (field.scalars.c_intra for field in fields)
-    assert torch.allclose(whole[whole > 0], torch.ones(()), atol=1e-6)  # one region per view agrees with itself
-    assert float(classes[classes > 0].min()) < 0.9
-    capsys.readouterr()
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
-    shown = said(capsys)
-    assert "2 levels" in shown and "0..1" in shown and "--level" in shown
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +228,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 
 
 @pytest.mark.slow
-def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch, capsys):
+def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
     output = ("--load-config", little, "--k", "12", "--output-dir", tmp_path / "out")
     exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
@@ -302,7 +242,6 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     vectors = ("--text-vectors", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    theirs = tmp_path / "out" / "room" / "normlift" / "theirs" / "config.yml"
     first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
@@ -310,41 +249,6 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     assert torch.equal(first.directions(), second.directions())
     assert second.manifest["features"]["level"] == "l"
     assert second.manifest["encoder"]["text_vectors"] == str(tmp_path / "texts.npz")
-
-    asking = ("--load-config", theirs, "--text", "red", "--json", tmp_path / "a.json")
-    (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
-    capsys.readouterr()
-    assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
-    assert "--text-vectors" in said(capsys)
-    assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
-    document = json.loads((tmp_path / "a.json").read_text())
-    assert document["negatives"] == []  # the file has no vectors of LERF's words
-    assert document["queries"][0]["peak"] > 0.9
-
-    np.savez(tmp_path / "texts.npz", red=np.ones(5))
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True") == 1
-    shown = said(capsys)
-    assert "--queries" in shown and "5" in shown and "343" in shown
-
-
-def test_images_without_features_are_listed_and_left_out(little, tmp_path, monkeypatch, capsys):
-    source = RegionFeatures(Grid(9), ColorEncoder())
-    for view in open_scene(little).train:
-        write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
-    (tmp_path / "features" / "0003_f.npy").unlink()
-    np.savez(tmp_path / "texts.npz", red=ColorEncoder().text(["red"])[0].numpy())
-    flags = ("--load-config", little, "--features", "langsplat", "--features-dir", tmp_path / "features")
-    flags += ("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t")
-    flags += ("--check", "False", "--refine", "False")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "1 of 6 images" in said(capsys)
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
-    shown = capsys.readouterr()
-    assert "1 images without features" in shown.out
-    assert "Warning: 1 of 6 images" in shown.err and "images/0003.png" in shown.err
-    field = field_of(tmp_path / "out", "t")
-    assert field.manifest["statistics"]["views"] == 5
-    assert int(field.scalars.view_count.max()) <= 5
 
 
 @pytest.mark.slow

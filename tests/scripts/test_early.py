@@ -115,7 +115,11 @@ QUERY = [
     ("--text a --segment-views 3", "--segment-views", "--segment sam3"),
     ("--stdin --why", "--why", "--text", "--stdin"),
     ("--text a --stdin", "--text and --stdin"),
-    ("--interactive", "--interactive", "--stdin"),
+    ("--interactive", "--interactive", "terminal"),
+    ("", "no prompts"),
+    ("--stdin --interactive True", "--stdin", "--interactive"),
+    ("--stdin --json a.json", "--json", "--text", "--stdin"),
+    ("--interactive --save", "--save", "--text", "--interactive"),
 ]
 EXPORT = [
     ("--part selection", "--part selection", "--text"),

@@ -13,12 +13,10 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-import normlift_ns as nl
 from normlift_ns.cli import evaluate
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.evaluation import studies
 from normlift_ns.evaluation.baselines import BASELINES
-from normlift_ns.evaluation.protocols import read_names
 from normlift_ns.evaluation.scannet import NYU40
 from normlift_ns.evaluation.studies import Variant
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES, RefineConfig
@@ -125,18 +123,6 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     assert [rows[name]["what"] for name in BASELINES] == list(BASELINES.values())
     assert len({(row["miou_3d"], row["miou_2d"]) for row in rows.values()}) == 6
     assert min(row["miou_3d"] for row in rows.values()) > 0.2
-
-
-def test_baselines_of_features_of_ones_own_are_refused(little_lifted, capture, tmp_path, monkeypatch, capsys):
-    scene = nl.open_scene(little_lifted)
-    halves = [((torch.arange(c.width) * 2 // c.width).expand(c.height, -1), torch.eye(2)) for c in scene.train.cameras]
-    texts = dict.fromkeys(read_names(capture / "labels.json").classes, torch.tensor([1.0, 1.0]))
-    how = nl.LiftOptions(refine=False, consensus=False)
-    run = nl.lift_run(scene, features=halves, texts=texts, lift=how, output_dir=tmp_path, timestamp="own")
-    flags = ("--protocol", "masks", "--load-config", run.config, "--labels", capture / "instance")
-    flags += ("--output-path", tmp_path / "own.json", "--study", "baselines")
-    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
-    assert "how its regions and features were made" in said(capsys)
 
 
 def test_scannet_with_stand_in_names(scored, little_room, tmp_path):

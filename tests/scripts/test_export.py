@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,9 +18,6 @@ from normlift_ns.cli import export
 from normlift_ns.exports import answer_instances
 from normlift_ns.rendering.figures import view_mask
 from tests.scripts.conftest import run_entry, said
-
-if TYPE_CHECKING:
-    pass
 
 EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "class_id", "instance_id"]
 

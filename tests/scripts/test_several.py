@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,7 +15,9 @@ import pytest
 import torch
 
 from tests.captures import SHARED, needs_shared
+from tests.conftest import make_trained
 from tests.scripts.conftest import wait_for
+from tests.viewer.scenes import free_port
 
 pytestmark = pytest.mark.slow
 
@@ -27,15 +28,11 @@ TABLETOP = SHARED / "captures" / "outputs" / "tabletop" / "splatfacto" / "run" /
 
 
 @pytest.fixture(scope="module")
-def trained(nerfstudio: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(made_once: Any) -> Path:
     """A room of three grains of Gaussians."""
-    from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
     from tests.plain_room import plain_room  # noqa: PLC0415
 
-    folder = tmp_path_factory.mktemp("several")
-    room = plain_room(20_000)
-    write_capture(room, folder / "room", views=9, held_out=1, width=96, height=72)
-    return write_splatfacto_run(room, folder / "room", folder / "outputs")
+    return make_trained(made_once, "several", plain_room(20_000), views=9, width=96, height=72)
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +122,7 @@ def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained
 
 def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trained, tmp_path):
     """As on several machines: variables alone."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    team = environment() | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "3"}
+    team = environment() | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "3"}
     command = words(trained, tmp_path / "three", 1)
     logs = [tmp_path / f"{r}.log" for r in range(3)]
     processes = []

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,13 +17,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from plyfile import PlyData
 
 from normlift_ns import open_run, open_scene, render
 from normlift_ns.cli import query
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.query.question import load_query
+from tests.browser.server import STOCK, Server
 from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import run_entry
 
@@ -74,57 +71,21 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
 
 
 @pytest.mark.slow
-def test_ns_export_and_ns_eval_where_no_run_existed(stranger, ns_export, tmp_path):
-    """In this process."""
-    from nerfstudio.scripts.eval import ComputePSNR  # noqa: PLC0415
-
-    ns_export.ExportGaussianSplat(load_config=stranger, output_dir=tmp_path).main()
-    open_run(stranger).export(tmp_path / "ours.ply")
-    theirs, ours = (PlyData.read(tmp_path / name)["vertex"] for name in ("splat.ply", "ours.ply"))
-    for name in (p.name for p in theirs.properties):
-        assert np.array_equal(theirs[name], ours[name]), name
-    ComputePSNR(stranger, output_path=tmp_path / "eval.json").main()
-    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 25
-
-
-@pytest.mark.slow
 def test_ns_viewer_answers(stranger, tmp_path):
     assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
 
 
 def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
     """The page that ns-viewer serves, if it still runs two seconds later."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(config), *map(str, flags)]
-    with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=cwd, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
+    viewer = Server(STOCK, config, log, cwd=cwd)
     try:
-        page = first_page(f"http://127.0.0.1:{port}/", viewer)
+        viewer.start(CUDA_VISIBLE_DEVICES="")
+        page = urllib.request.urlopen(viewer.address, timeout=60).read()
         time.sleep(2)
-        assert viewer.poll() is None, log.read_text()
+        assert viewer.alive(), viewer.said()
         return page
     finally:
-        viewer.send_signal(signal.SIGINT)
-        try:
-            viewer.wait(timeout=20)
-        except subprocess.TimeoutExpired:
-            viewer.kill()
-            viewer.wait()
-
-
-def first_page(address: str, viewer: subprocess.Popen[bytes]) -> bytes:
-    """What a server answers at last; b"" if it stopped or the time is over."""
-    end = time.monotonic() + SECONDS
-    while viewer.poll() is None and time.monotonic() < end:
-        try:
-            with urllib.request.urlopen(address, timeout=5) as answer:
-                return answer.read()
-        except (urllib.error.URLError, OSError):
-            time.sleep(0.5)
-    return b""
+        viewer.stop()
 
 
 @pytest.fixture(autouse=True)
@@ -157,43 +118,6 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
         assert (np.ptp(overlay[found], axis=1) > 20).mean() > 0.95  # the least relevant are faint
         assert (np.ptp(overlay[expected[..., 1].numpy() < 0.01], axis=1) < 8).mean() > 0.99
     assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
-
-
-def test_ns_render_draws_every_output(little_lifted: Path, tmp_path: Path) -> None:
-    from nerfstudio.scripts.render import DatasetRender  # noqa: PLC0415
-
-    DatasetRender(little_lifted, output_path=tmp_path, split="test", image_format="png").main()
-    stock = {"gt-rgb", "rgb", "depth", "accumulation", "background"}
-    assert {path.name for path in (tmp_path / "test").iterdir()} == stock | set(NAMES)
-
-
-def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from nerfstudio.scripts.render import RenderCameraPath, RenderInterpolated  # noqa: PLC0415
-
-    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)  # for videos only
-    pose = np.vstack([open_scene(lifted).train._poses[0].numpy(), [0, 0, 0, 1]])
-    camera = {"camera_to_world": pose.flatten().tolist(), "fov": 60, "aspect": 1}
-    path = {"camera_type": "perspective", "render_height": 40, "render_width": 60, "camera_path": [camera] * 2}
-    (tmp_path / "path.json").write_text(json.dumps({**path, "seconds": 1, "fps": 2}))
-    options = {"rendered_output_names": ["overlay", "relevancy_0"], "output_format": "images", "image_format": "png"}
-    of_a: Any = {"camera_path_filename": tmp_path / "path.json", "output_path": tmp_path / "a" / "x.mp4", **options}
-    of_b: Any = {"pose_source": "eval", "interpolation_steps": 2, "output_path": tmp_path / "b" / "x.mp4", **options}
-    RenderCameraPath(lifted, **of_a).main()
-    RenderInterpolated(lifted, **of_b).main()
-    for folder, size in (("a", (120, 40)), ("b", (320, 120))):
-        pictures = sorted((tmp_path / folder / "x").iterdir())
-        assert len(pictures) == 2
-        assert Image.open(pictures[0]).size == size
-
-
-def test_ns_eval(lifted: Path, tmp_path: Path) -> None:
-    from nerfstudio.scripts.eval import ComputePSNR  # noqa: PLC0415
-
-    with pytest.warns(UserWarning, match="LPIPS"):
-        ComputePSNR(lifted, output_path=tmp_path / "eval.json", render_output_path=tmp_path / "pictures").main()
-    document = json.loads((tmp_path / "eval.json").read_text())
-    assert document["method_name"] == "normlift" and document["results"]["psnr"] > 25
-    assert (tmp_path / "pictures").exists()
 
 
 def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
-from normlift_ns.rendering.colors import prompt_rgb_tuples
 from normlift_ns.session.prompts import (
     MAX_PROMPTS,
     Prompt,
@@ -100,9 +99,3 @@ def test_saving_keeps_what_is_saved():
     for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
         with pytest.raises(InputError, match=f"2 prompts .*cosine.*{other.rule}"):
             merge_queries(one, other)
-
-
-def test_a_prompt_has_the_colour_that_it_names():
-    assert prompt_rgb_tuples(["a dark green leaf"])[0] == pytest.approx((3 / 255, 53 / 255, 0), abs=1 / 255)
-    colours = prompt_rgb_tuples(["fox", "bear", "wolf", "yellow"])
-    assert min(np.abs(np.subtract(a, b)).max() for i, a in enumerate(colours) for b in colours[:i]) > 0.2

@@ -16,7 +16,6 @@ from normlift_ns.distributed.launch import (
     HEARTBEAT_TIMEOUT,
     Heartbeat,
     PeerFailure,
-    describe_failure,
     rank_and_world_size,
 )
 from normlift_ns.errors import InputError
@@ -197,8 +196,3 @@ def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pyt
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     with pytest.raises(InputError, match="GPU"), module.distributed_context("auto", print):
         pass
-
-
-def test_what_people_are_told() -> None:
-    text = describe_failure(PeerFailure(1, False, "there, process 7"))
-    assert "Process 1 (there, process 7)" in text

@@ -81,14 +81,3 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
     for stands_out, alone in ((True, True), (False, False), (None, True)):  # None: nobody can tell
         finding.stands_out = stands_out
         assert (FigureHeader.of(finding).title == "x") is alone
-
-
-def test_three_views_stand_in_one_row_and_more_in_a_square() -> None:
-    image, none = torch.full((60, 40, 3), 90, dtype=torch.uint8), torch.zeros(60, 40, dtype=torch.bool)
-    one, three, five = (
-        contact_sheet(SHEET, FigureHeader("x", "y"), [("view", image, none)] * count).size for count in (1, 3, 5)
-    )
-    assert one[1] == three[1]
-    assert three[0] - one[0] > 500
-    assert five[0] == three[0]
-    assert five[1] - three[1] > 400
