@@ -16,8 +16,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from normlift_ns.data.nerfstudio import config as plain
-from normlift_ns.data.nerfstudio.config import dump_config
-from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.data.nerfstudio.config import dump_config, locate_run
 from normlift_ns.data.nerfstudio.load import SplitViews, camera_type_error
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER

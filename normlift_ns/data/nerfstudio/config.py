@@ -1,17 +1,19 @@
-"""Safe reading of config.yml: allowed classes, checks of values, and the files of the run."""
+"""Safe reading of a nerfstudio run's config.yml: its YAML, allowed classes, checks of values, and the run's files."""
 
 from __future__ import annotations
 
+import os
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
 from normlift_ns.data.nerfstudio.config_classes import (
+    CLASS_TARGETS,
     CONFIG_CLASS_NAMES,
     CONFIG_CLASSES,
     EventName,
@@ -20,41 +22,250 @@ from normlift_ns.data.nerfstudio.config_classes import (
     SchedulerConfig,
     SplatfactoModelConfig,
     SupportedDataParserConfig,
-    Target,
     TrainerConfig,
-    intern_target,
-)
-from normlift_ns.data.nerfstudio.config_file import (
-    OBJECT_TAG,
-    RunLocation,
-    compose_config,
-    config_string,
-    describe_yaml_error,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 
+# The YAML of a config.yml, and the current paths of its run's files; reading them constructs no objects.
+
+
+OBJECT_TAG = "tag:yaml.org,2002:python/object"
+_MAX_BYTES = 2**18
+"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
+_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+
+
+def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
+    """Raise FileNotFoundError unless the path is that of a file.
+
+    Args:
+        path: path of a config.yml.
+        wrote: command that wrote it, for the message.
+    """
+    if not path.is_file():
+        hint = f"; {path / 'config.yml'} exists, give that path" if (path / "config.yml").is_file() else ""
+        method = "splatfacto" if wrote == "ns-train" else "normlift"
+        raise FileNotFoundError(
+            f"No config at {path}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
+        )
+
+
+def compose_config(path: Path) -> yaml.MappingNode:
+    """Return the YAML of a nerfstudio config, which names a method.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError, ValueError: if the file cannot be read, or is not a nerfstudio config.
+    """
+    check_config_exists(path)
+    size = path.stat().st_size
+    if size > _MAX_BYTES:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it has {size:,} bytes, more than {_MAX_BYTES:,}. {_EXPECTED}"
+        )
+    try:
+        root = yaml.compose(path.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except OSError as error:
+        raise OSError(f"{path} cannot be read: {error.strerror}. {_EXPECTED}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it is not valid YAML ({describe_yaml_error(error)}). {_EXPECTED}"
+        ) from error
+    is_object = isinstance(root, yaml.MappingNode) and root.tag.startswith(f"{OBJECT_TAG}:")
+    if not is_object or config_string(root, "method_name") is None:
+        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
+    return root
+
+
+def describe_yaml_error(error: Exception) -> str:
+    """Summarize a YAML error in one line: problem and line number."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, yaml.MarkedYAMLError):
+        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
+        return f"{error.problem}{line}"
+    return " ".join(str(error).split())
+
+
+def config_string(node: yaml.Node | None, *keys: str) -> str | None:
+    """Return the text at a path of keys in nested mappings; None if there is none."""
+    value = _value(node, *keys)
+    return value.value if isinstance(value, yaml.ScalarNode) else None
+
+
+def _value(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
+    for key in keys:
+        entries = node.value if isinstance(node, yaml.MappingNode) else ()
+        node = next((value for name, value in entries if isinstance(name, yaml.ScalarNode) and name.value == key), None)
+    return node
+
+
+def _stored_path(node: yaml.Node | None, *keys: str) -> Path | None:
+    """Return a path that nerfstudio wrote as a list of its parts."""
+    value = _value(node, *keys)
+    if not isinstance(value, yaml.SequenceNode) or not value.tag.endswith("Path"):
+        return None
+    parts = [part.value for part in value.value if isinstance(part, yaml.ScalarNode)]
+    return Path(*parts) if 0 < len(parts) == len(value.value) else None
+
+
+@dataclass(frozen=True)
+class ConfigPaths:
+    """Names and paths of a trained or lifted run; None if the config does not store them as nerfstudio does."""
+
+    experiment: str | None
+    output_dir: Path | None
+    """Folder that contains the experiment folder."""
+    data: tuple[Path, ...]
+    """Possible paths of the dataset; empty if the config has none."""
+
+
+def read_config_paths(path: Path) -> ConfigPaths:
+    """Read names and paths from a config.yml, in the time that its YAML takes.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as in `compose_config`.
+    """
+    root = compose_config(path)
+    names = [config_string(root, key) for key in ("experiment_name", "method_name", "timestamp")]
+    data = _stored_path(root, "pipeline", "datamanager", "data")
+    data = data or _stored_path(root, "pipeline", "datamanager", "dataparser", "data")
+    configured = _stored_path(root, "output_dir")
+    inferred = _infer_output_dir(_absolute(path).parent, names)
+    if configured is None:
+        return ConfigPaths(names[0], inferred, ())
+    output_dir = inferred or fallback_output_dir(configured)
+    candidates = () if data is None else _dataset_candidates(data, output_dir, _training_dir(inferred, configured))
+    return ConfigPaths(names[0], output_dir, tuple(candidates))
+
+
+@dataclass(frozen=True)
+class RunLocation:
+    """Current absolute paths of a run's files."""
+
+    run_dir: Path
+    """Folder of config.yml."""
+    output_dir: Path
+    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
+    root: Path | None
+    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
+    because output_dir is absolute or the run was moved."""
+    data: Path
+    """The dataset: a folder or a .json file."""
+    data_moved: bool
+    """Whether `data` differs from the path in the config, read relative to `root`."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the dataset."""
+        return self.data.parent if self.data.suffix == ".json" else self.data
+
+    def relative_to_root(self, path: Path) -> Path:
+        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
+        return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
+
+
+def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
+    """Locate the files of a run from the path of its config.yml, whatever the current directory.
+
+    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
+    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
+
+    Args:
+        config: contents of config.yml.
+        config_path: path of config.yml.
+        data: current path of the dataset, relative to the current directory; None: the path in the config.
+    Raises:
+        FileNotFoundError: if there is no dataset; the message names every path tried.
+    """
+    run_dir = _absolute(config_path).parent
+    inferred = _infer_output_dir(run_dir, (str(config.experiment_name), str(config.method_name), config.timestamp))
+    output_dir = inferred or fallback_output_dir(config.output_dir)
+    root = _training_dir(inferred, config.output_dir)
+    if data is not None:
+        if not data.exists():
+            raise FileNotFoundError(
+                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
+                "transforms.json that the run was trained with."
+            )
+        return RunLocation(run_dir, output_dir, root, _absolute(data), data_moved=True)
+    stored = dataset_in_config(config)
+    tried = _dataset_candidates(stored, output_dir, root)
+    for path in tried:
+        if path.exists():
+            moved = root is None or path != _absolute(root / stored)
+            return RunLocation(run_dir, output_dir, root, path, data_moved=moved)
+    raise FileNotFoundError(
+        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
+        "If it was moved, give its path with --data."
+    )
+
+
+def _infer_output_dir(run_dir: Path, names: Sequence[str | None]) -> Path | None:
+    """Return the folder above experiment/method/timestamp; None if the run does not lie in folders of these names."""
+    known = [name for name in names if name is not None]
+    return _strip_tail(run_dir, Path(*known)) if len(known) == len(names) else None
+
+
+def _training_dir(inferred: Path | None, output_dir: Path) -> Path | None:
+    """Return the working directory of the training from the folder of the runs, and output_dir in the config."""
+    return None if inferred is None else _strip_tail(inferred, Path(os.path.normpath(output_dir)))
+
+
+def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> list[Path]:
+    """Return the possible paths of a dataset: in the working directory of the training, and in the current one."""
+    roots = output_dir.parents if root is None else (root,)
+    return list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
+
+
+def _strip_tail(path: Path, tail: Path) -> Path | None:
+    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
+    count = len(path.parts) - len(tail.parts)
+    return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
+
+
+def dataset_in_config(config: Any) -> Path:
+    """Return the path of the dataset in the config."""
+    datamanager = config.pipeline.datamanager
+    return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
+
+
+def fallback_output_dir(output_dir: Path) -> Path:
+    """Return the output folder for a moved run: inside the current directory, whatever its config names."""
+    return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))
+
+
+# Construction of the objects in a config.yml, from allowed classes only, and writing them.
+
+
 _NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"
 
 
-def _default_target(cls: type) -> str | None:
-    """Return the class that a configuration class names as its `_target`."""
-    target = {field.name: field for field in fields(cls)}.get("_target")
-    if target is None:
-        return None
-    factory: Any = target.default_factory
-    return factory().name
-
-
-def _target_name(name: str, cls: type) -> str | None:
-    target = _default_target(cls)
-    return name.removesuffix("Config") if target and name.startswith("normlift_ns.plugin.") else target
-
-
-CONFIG_TARGETS: dict[str, str | None] = {name: _target_name(name, cls) for name, cls in CONFIG_CLASSES.items()}
+CONFIG_TARGETS: dict[str, str | None] = {
+    name: name.removesuffix("Config")
+    if name.startswith("normlift_ns.plugin.") and cls in CLASS_TARGETS
+    else CLASS_TARGETS.get(cls)
+    for name, cls in CONFIG_CLASSES.items()
+}
 """Names of the configuration classes, and of the classes that they instantiate."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
+_TARGET = "_target"
+"""Field with the class or function that a configuration class instantiates. It follows from the class, so it is checked
+when a config is read, and added when one is written."""
 _PATHS = {f"pathlib.{name}" for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath", "Path")}
+
+
+@dataclass(frozen=True)
+class _Name:
+    """Name of a class or function in a config, which is neither imported nor called."""
+
+    name: str
 
 
 class ConfigLoader(yaml.SafeLoader):
@@ -93,14 +304,10 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     yield config
     values = loader.construct_mapping(node, deep=True)
     known = {field.name: field for field in fields(cls)}
-    if "_target" in known and target is not None:
-        stored = values.get("_target", Target(target))
-        if stored != Target(target) or not isinstance(stored, Target):
-            stored_name = stored.name.rpartition(".")[2] if isinstance(stored, Target) else type(stored).__name__
-            raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
-        values["_target"] = intern_target(
-            _default_target(cls) or target
-        )  # the current name instead of that of version 0.1
+    stored = values.pop(_TARGET, None if target is None else _Name(target))
+    if target is not None and not (isinstance(stored, _Name) and stored.name == target):
+        stored_name = stored.name.rpartition(".")[2] if isinstance(stored, _Name) else type(stored).__name__
+        raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # translates the field names of version 0.1
         values = dict(vars(config))
@@ -126,7 +333,7 @@ def _construct_call(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
 def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     if name not in _TARGETS:
         raise _error(f"{name} is not part of a configuration", node)
-    return intern_target(name)
+    return _Name(name)
 
 
 def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
@@ -144,16 +351,20 @@ class _ConfigDumper(yaml.Dumper):
 
 
 def _represent_object(dumper: _ConfigDumper, config: Any) -> yaml.Node:
-    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", vars(config))
+    target = CLASS_TARGETS.get(type(config))
+    values = vars(config) if target is None else {_TARGET: _NAMES[target], **vars(config)}
+    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", values)
 
 
 def _represent_event(dumper: _ConfigDumper, event: EventName) -> yaml.Node:
     return dumper.represent_sequence(f"{OBJECT_TAG}/apply:{CONFIG_CLASS_NAMES[EventName]}", [event.value])
 
 
+_NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
+"""One object per name, which a dump references like a single class."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent_event if _cls is EventName else _represent_object)
-_ConfigDumper.add_representer(Target, lambda dumper, target: dumper.represent_scalar(_NAME_TAG + target.name, ""))
+_ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
 
 
 def dump_config(config: Any) -> str:
@@ -170,9 +381,6 @@ _PARTS = {
     "pipeline.datamanager.dataparser": tuple(cls.__name__ for cls in get_args(SupportedDataParserConfig)),
     "pipeline.model": ("SplatfactoModelConfig", "NormLiftModelConfig"),
 }
-_UNCHECKED = ("_target", "vis")
-"""Fields that are not checked here. The loader compares `_target`; `vis` only matters for training, and programs set it
-to values that the flag does not accept."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
 
@@ -287,7 +495,7 @@ def _dataclass_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[
         return
     hints = get_type_hints(type(value))
     for field in fields(value):
-        if field.name not in _UNCHECKED:
+        if field.name != "vis":  # only matters for training; programs set it to values that the flag does not accept
             full_name = f"{name}.{field.name}" if name else field.name
             yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
 

@@ -23,19 +23,15 @@ from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkp
 from normlift_ns.data.frames import Frame, Intrinsics, check_mask, image_warnings, read_image_header
 from normlift_ns.data.images import blend_background, to_camera
 from normlift_ns.data.nerfstudio.cameras import DatasetSplit, apply_pose_adjustments
-from normlift_ns.data.nerfstudio.config import read_trainer_config, with_absolute_paths
+from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
 from normlift_ns.data.nerfstudio.config_classes import (
-    ASSUMED_STEP,
     NAMED_COLORS,
     BlenderDataParserConfig,
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
     SplatfactoModelConfig,
     TrainerConfig,
-    active_sh_degree,
-    background_color,
 )
-from normlift_ns.data.nerfstudio.config_file import RunLocation, locate_run
 from normlift_ns.data.nerfstudio.dataparsers import check_dataset, parse_dataset
 from normlift_ns.data.transforms import read_dataparser_transforms, relative_name
 from normlift_ns.errors import InputError
@@ -337,6 +333,25 @@ def _fisheye(lens: _Lens) -> tuple[Any, Any, Any]:
 
 
 _TRANSFORM_TOLERANCE = 1e-3
+_ASSUMED_STEP = 30000
+"""Step that splatfacto assumes for a loaded checkpoint, whatever its actual step."""
+_VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+
+
+def _background_color(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
+    """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
+    name = config.background_color
+    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(NAMED_COLORS[name])
+
+
+def active_sh_degree(config: Any, step: int) -> int | None:
+    """Return the degree of the spherical harmonics at a training step; None: colors do not depend on the view.
+
+    Args:
+        config: splatfacto's model config, nerfstudio's own or its mirror.
+        step: training step.
+    """
+    return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None
 
 
 @dataclass(frozen=True)
@@ -386,7 +401,7 @@ class NerfstudioScene:
     @property
     def background(self) -> Float[Tensor, " 3"]:
         """Background color, RGB in 0..1."""
-        return background_color(self.model_config)
+        return _background_color(self.model_config)
 
     @property
     def parameters(self) -> dict[str, Tensor]:
@@ -411,7 +426,7 @@ class NerfstudioScene:
 
     def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
         """Return each Gaussian's RGB color, >= 0, as seen from the camera."""
-        degree = active_sh_degree(self.model_config, ASSUMED_STEP)
+        degree = active_sh_degree(self.model_config, _ASSUMED_STEP)
         return view_colors(self.gaussians.means, self.coefficients, camera, degree)
 
     @property
@@ -456,7 +471,7 @@ def load_nerfstudio_scene(
     _check_images([*dataset.train.files, *(dataset.train.masks or ())], location)
     remarks = _check_transform(dataset.transform, dataset.scale, location)
     poses = _training_poses(dataset.train, model, checkpoint)
-    color = background_color(model)
+    color = _background_color(model)
     if dataset.train.camera_type == "FISHEYE624":
         train, held_out = make_nerfstudio_views(config, location.folder, poses, color)
     else:
