@@ -68,7 +68,7 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
     """
     views, settings = _sample_views(scene), settings or RasterSettings()
     render = partial(_render, scene, scene.gaussians.to(device), settings)
-    visible = max(_visible_fraction(scene, small.view.camera) for small in views)
+    visible = max(float(in_frustum(scene.gaussians.means, small.view.camera).float().mean()) for small in views)
     psnrs = {small.view.name: _psnr(small.view, render(small, 1.0)) for small in views}
     mean, worst = sum(psnrs.values()) / len(psnrs), min(psnrs, key=lambda name: psnrs[name])
     constant = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
@@ -179,16 +179,12 @@ def _render(
     scene: Scene, gaussians: GaussianScene, settings: RasterSettings, small: _SmallView, factor: float
 ) -> UInt8[Tensor, "h w 3"]:
     """Render the scene so that it looks like a downscaled render at full size."""
-    camera = _scale_focal(small.view.camera, factor)
+    camera = small.view.camera
+    camera = replace(camera, K=camera.K * torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]]))
     as_trained = small.divisor < _MAX_DIVISOR_AS_TRAINED
     small_settings = replace(settings, eps2d=settings.eps2d / small.divisor**2 if as_trained else _SMALL_EPS2D)
     mode = scene.rasterize_mode if as_trained else "antialiased"
     return render_image(scene, camera, settings=small_settings, mode=mode, gaussians=gaussians)
-
-
-def _scale_focal(camera: Camera, factor: float) -> Camera:
-    scale = torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
-    return Camera(camera.K * scale, camera.world_to_camera, camera.width, camera.height)
 
 
 def _psnr(view: View, render: UInt8[Tensor, "h w 3"]) -> float:
@@ -202,10 +198,6 @@ def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
     pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
     color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
     return color.round().to(torch.uint8).expand_as(view.image)
-
-
-def _visible_fraction(scene: Scene, camera: Camera) -> float:
-    return float(in_frustum(scene.gaussians.means, camera).float().mean())
 
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:

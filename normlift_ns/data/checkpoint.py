@@ -17,7 +17,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.splat import (
+    GAUSSIAN_PARAMETERS,
+    SplatFile,
+    SplatParameters,
+    splat_from_parameters,
+    validate_splat,
+)
 from normlift_ns.errors import InputError
 
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
@@ -91,7 +97,6 @@ def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[.
 # Safe reading of nerfstudio checkpoints, which runs no code from the file.
 
 
-GAUSSIAN_PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 _PREFIX = "gauss_params."
 _MAX_STEP = 10**9
 
@@ -103,6 +108,8 @@ class Checkpoint(NamedTuple):
     step: int
     model: dict[str, Tensor]
     """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, …, without optimizers and LPIPS."""
+    splat: SplatParameters
+    """The gauss_params."""
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
@@ -160,7 +167,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             "Train the capture with: ns-train splatfacto --data ..."
         )
     splat = splat_from_parameters({name: model[_PREFIX + name] for name in GAUSSIAN_PARAMETERS}, path)
-    return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()})
+    return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()}, splat)
 
 
 def validate_step(step: Any, path: Path) -> int:

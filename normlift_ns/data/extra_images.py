@@ -15,12 +15,11 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View, Views
-from normlift_ns.data.cameras import CameraFile, read_camera_file
 from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import SplatScene
-from normlift_ns.data.transforms import read_transforms, relative_name
+from normlift_ns.data.open_splat import SplatScene, read_camera_file
+from normlift_ns.data.transforms import CameraFile, read_transforms, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 

@@ -18,17 +18,34 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
-from normlift_ns.data.cameras import CameraFile, read_camera_file
-from normlift_ns.data.checkpoint import (
-    GAUSSIAN_PARAMETERS,
-    find_checkpoint,
-    read_checkpoint,
+from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
+from normlift_ns.data.colmap import (
+    colmap_intrinsics,
+    colmap_pose,
+    find_colmap_model,
+    read_colmap_model,
+    read_colmap_points,
 )
-from normlift_ns.data.colmap import read_colmap_points
-from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
+from normlift_ns.data.frames import (
+    Frame,
+    WorldTransform,
+    check_frames,
+    find_images,
+    find_masks,
+    rescale_intrinsics,
+    transform_frames,
+)
 from normlift_ns.data.images import ImageViews, held_out_names
-from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
-from normlift_ns.data.transforms import gsplat_normalization, read_json_file, read_transforms, write_transforms
+from normlift_ns.data.splat import GAUSSIAN_PARAMETERS, SplatFile, SplatParameters, validate_splat
+from normlift_ns.data.transforms import (
+    CameraFile,
+    gsplat_normalization,
+    read_json_file,
+    read_transforms,
+    read_world_transform,
+    relative_name,
+    write_transforms,
+)
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import Background, RasterizeMode, SplatOptions
@@ -37,6 +54,61 @@ from normlift_ns.registry import Registry
 
 BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 _MIN_POINTS, _PARALLEL = 4, 1e-6
+
+
+# Camera files: COLMAP projects and transforms.json.
+
+
+def read_camera_file(options: SplatOptions, advice: str = "give the folder of the images with --images") -> CameraFile:
+    """Read the camera file that the options name, and check that its images exist.
+
+    Args:
+        options: locations of cameras, images and masks.
+        advice: what to do about missing images, for error messages.
+    Raises:
+        FileNotFoundError: if a file, folder, image or mask is missing.
+        ValueError: if the options name no camera file or two, or the file cannot be read.
+    """
+    count = (options.colmap is not None) + (options.transforms is not None)
+    if count != 1:
+        raise InputError(
+            f"A splat needs one camera file, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            "with --colmap, or a transforms.json with --transforms."
+        )
+    for name, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and not folder.is_dir():
+            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give an existing folder.")
+    if options.colmap is None:
+        cameras = read_transforms(
+            Path(options.transforms or "").absolute(), options.images, options.masks, advice=advice
+        )
+    else:
+        cameras = _colmap(options, options.colmap, advice)
+    check_frames(cameras.frames, cameras.source)
+    return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
+
+
+def _colmap(options: SplatOptions, folder: Path, advice: str) -> CameraFile:
+    folder = folder.absolute()
+    model = find_colmap_model(folder)
+    cameras, images = read_colmap_model(model)
+    registered = sorted(images, key=lambda image: image.name)  # as training tools sort them
+    intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
+    images_dir = (options.images or folder / "images").absolute()
+    if not images_dir.is_dir():
+        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
+    names = [image.name for image in registered]
+    files = find_images(names, images_dir, model, advice, allow_copies=True)
+    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(names, options.masks)
+    base = folder if images_dir.is_relative_to(folder) else images_dir.parent
+    frames = [
+        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
+        for image, file, mask in zip(registered, files, masks)
+    ]
+    return CameraFile(frames, frozenset(), model, folder, base)
+
+
+# Splats with their images.
 
 
 @dataclass(frozen=True)
@@ -248,8 +320,9 @@ def _candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFil
     There are several if only the images can tell. A PLY file may come from gsplat's trainer too, so its normalized
     world is the alternative if that of the cameras does not fit.
     """
-    if cameras.to_splat is not None:
-        return [("", cameras.to_splat)]
+    if options.world_transform is not None:
+        world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
+        return [("", world)]
     same = [("", WorldTransform(np.eye(4)[:3], 1.0))]
     if not options.gsplat_normalize or not (file.by_gsplat or options.colmap):
         return same
@@ -404,7 +477,6 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     except msgspec.ValidationError as error:
         raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
-    parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
     if data is not None and not data.is_dir():
         raise FileNotFoundError(
             f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
@@ -422,7 +494,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         for is_held_out in (False, True)
     )
     return SplatScene(
-        splat_from_parameters(parameters, checkpoint.path),
+        checkpoint.splat,
         train,
         held_out,
         saved.name,

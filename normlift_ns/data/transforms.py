@@ -7,23 +7,32 @@ import json
 import math
 import tokenize
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from normlift_ns.data.frames import Frame, Intrinsics, WorldTransform, find_images, find_masks, read_image_header
+from normlift_ns.data.frames import (
+    PERSPECTIVE_MODELS,
+    Frame,
+    Intrinsics,
+    WorldTransform,
+    find_images,
+    find_masks,
+    read_image_header,
+)
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
 _MAX_VALUE = 1e30
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _MAX_JSON_BYTES = 2**27
 """Largest JSON file that is read; ten thousand frames take a tenth of that."""
 
@@ -68,6 +77,19 @@ class TransformsEntries(CameraEntry, kw_only=True):
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
+
+    def value(self, frame: FrameEntry, name: str) -> Any:
+        """Return a parameter of a camera. As in nerfstudio, values for all frames take precedence over its own."""
+        shared = getattr(self, name)
+        return getattr(frame, name) if shared is None else shared
+
+    def applied_rows(self, folder: Path) -> list[list[float]] | None:
+        """Return the transform of the poses before they were stored, if any.
+
+        As in nerfstudio, files of an old ns-process-data in a folder imply one without naming it.
+        """
+        is_legacy = self.applied_transform is None and (folder / "colmap/sparse/0").exists()
+        return _LEGACY_FLIP if is_legacy else self.applied_transform
 
 
 def read_json_file(path: Path, expected: str) -> Any:
@@ -138,7 +160,7 @@ def _check_numbers(entry: CameraEntry, source: str) -> None:
         if not 0 < focal < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
     parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
-    for name, value in (*_given(entry, "cx", "cy", *_DISTORTION), *parameters):
+    for name, value in (*_given(entry, "cx", "cy", *DISTORTION), *parameters):
         if not abs(value) < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {value:g}, expected a number that float32 can hold.")
 
@@ -152,20 +174,24 @@ def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:
 
 
 _MIN_DETERMINANT = 1e-6
-_PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
-@dataclass(frozen=True)
-class TransformsFile:
-    """Contents of a transforms.json."""
+class CameraFile(NamedTuple):
+    """Contents of a transforms.json or a COLMAP reconstruction."""
 
     frames: list[Frame]
-    """Frames sorted by file, as in nerfstudio."""
+    """All images, sorted by file, with cameras in the file's world."""
     held_out: frozenset[str]
-    """Names of the frames that the file excludes from the training; most files exclude none."""
-    applied_transform: Float[np.ndarray, "4 4"]
+    """Names of the images that the file excludes from the training; most files exclude none."""
+    source: Path
+    """The file, or the folder of the COLMAP reconstruction."""
+    folder: Path
+    """Folder of the dataset."""
+    names_root: Path
+    """Folder that image names are relative to."""
+    applied_transform: Float[np.ndarray, "4 4"] | None = None
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
-    applied_scale: float
+    applied_scale: float = 1.0
     """Scale of that transform."""
 
 
@@ -176,7 +202,7 @@ def read_transforms(
     *,
     base: Path | None = None,
     advice: str = "give the folder of the images with --images",
-) -> TransformsFile:
+) -> CameraFile:
     """Read the frames of a transforms.json; images are located, but only opened if the file does not give their size.
 
     Args:
@@ -192,18 +218,22 @@ def read_transforms(
     path = path / "transforms.json" if path.is_dir() else path
     entries = read_transforms_entries(path)
     root = path.parent if base is None else base
+    names_root = (root if images is None or base is not None else images.parent).absolute()
     names = [relative_name(Path(frame.file_path), root) for frame in entries.frames]
     files = find_images(names, images or root, path, advice, allow_copies=images is not None)
     if base is None:
-        names = [relative_name(file, (root if images is None else images.parent).absolute()) for file in files]
+        names = [relative_name(file, names_root) for file in files]
     frames = [
         Frame(file, name, np.array(entry.transform_matrix[:3]), _intrinsics(entries, entry, file, path), mask)
         for entry, file, name, mask in zip(entries.frames, files, names, _masks(entries, root, images, masks, path))
     ]
     held_out = _held_out(entries, root, path)
-    return TransformsFile(
+    return CameraFile(
         sorted(frames, key=lambda frame: frame.file),
         frozenset(name for name, is_held_out in zip(names, held_out) if is_held_out),
+        path.absolute(),
+        path.absolute().parent,
+        names_root,
         _applied_transform(entries, path),
         entries.applied_scale,
     )
@@ -264,17 +294,13 @@ def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
 
 
 def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:
-    """Return the intrinsics of a frame. As in nerfstudio, values for all frames take precedence over its own."""
-
-    def value(name: str) -> Any:
-        shared = getattr(entries, name)
-        return getattr(frame, name) if shared is None else shared
-
+    """Return the intrinsics of a frame."""
+    value = partial(entries.value, frame)
     model = value("camera_model") or "OPENCV"
     model = "OPENCV_FISHEYE" if value("is_fisheye") else model
-    if model not in _PERSPECTIVE_MODELS:
+    if model not in PERSPECTIVE_MODELS:
         raise InputError(
-            f"{path}: the camera_model is {model}; supported models are {', '.join(_PERSPECTIVE_MODELS)}. Undistort "
+            f"{path}: the camera_model is {model}; supported models are {', '.join(PERSPECTIVE_MODELS)}. Undistort "
             "the images, train the scene on those, and give their cameras."
         )
     size = (value("w"), value("h"))
@@ -305,8 +331,8 @@ def _focal(focal: float | None, angle: float | None, side: float) -> float | Non
 
 def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, ...]:
     """Return k1, k2, k3, p1, p2: the values for all frames if there are any, otherwise the frame's own."""
-    source = entries if len(_given(entries, *_DISTORTION, "distortion_params")) > 0 else frame
-    values = [getattr(source, name) or 0.0 for name in _DISTORTION]
+    source = entries if len(_given(entries, *DISTORTION, "distortion_params")) > 0 else frame
+    values = [getattr(source, name) or 0.0 for name in DISTORTION]
     if source.distortion_params is not None:
         values = [*source.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values
@@ -319,10 +345,7 @@ def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tu
 
 
 def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarray, "4 4"]:
-    """Return the applied transform. As in nerfstudio, files of an old ns-process-data imply one without naming it."""
-    rows = entries.applied_transform
-    if rows is None and (path.parent / "colmap/sparse/0").exists():
-        rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+    rows = entries.applied_rows(path.parent)
     matrix = np.eye(4)
     if rows is not None:
         if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():

@@ -22,11 +22,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.nerfstudio import config_classes
-from normlift_ns.data.nerfstudio.cameras import apply_pose_adjustments
 from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
-from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
-from normlift_ns.data.nerfstudio.load import TrainedViews, _reading
+from normlift_ns.data.nerfstudio.dataparsers import apply_pose_adjustments, parse_dataset
+from normlift_ns.data.nerfstudio.load import TrainedViews
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.run_writer import _lifted_config
@@ -130,7 +129,7 @@ def assert_equal(datamanager: config_classes.FullImageDatamanagerConfig, folder:
         assert torch.equal(split.poses, dataset.cameras.camera_to_worlds)
         if len(split) > 0:
             assert split.camera_type == CameraType(int(dataset.cameras.camera_type[0])).name
-        ours = TrainedViews(split, folder, split.poses, GREY, _reading(datamanager))
+        ours = TrainedViews(split, folder, split.poses, GREY, datamanager)
         theirs = DatasetViews(dataset, folder, dataset.cameras.camera_to_worlds, GREY)
         remarks = attempt(ours.check_files)
         assert (ours.names, remarks) == (theirs.names, attempt(theirs.check_files))

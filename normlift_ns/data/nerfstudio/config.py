@@ -7,6 +7,7 @@ import types
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -17,10 +18,8 @@ from normlift_ns.data.nerfstudio.config_classes import (
     CONFIG_CLASS_NAMES,
     CONFIG_CLASSES,
     EventName,
-    FullImageDatamanagerConfig,
     OptimizerConfig,
     SchedulerConfig,
-    SplatfactoModelConfig,
     SupportedDataParserConfig,
     TrainerConfig,
 )
@@ -133,12 +132,10 @@ def read_config_paths(path: Path) -> ConfigPaths:
     data = _stored_path(root, "pipeline", "datamanager", "data")
     data = data or _stored_path(root, "pipeline", "datamanager", "dataparser", "data")
     configured = _stored_path(root, "output_dir")
-    inferred = _infer_output_dir(_absolute(path).parent, names)
     if configured is None:
-        return ConfigPaths(names[0], inferred, ())
-    output_dir = inferred or fallback_output_dir(configured)
-    candidates = () if data is None else _dataset_candidates(data, output_dir, _training_dir(inferred, configured))
-    return ConfigPaths(names[0], output_dir, tuple(candidates))
+        return ConfigPaths(names[0], None, ())
+    output_dir, root = _folders(_absolute(path).parent, names, configured)
+    return ConfigPaths(names[0], output_dir, () if data is None else tuple(_dataset_candidates(data, output_dir, root)))
 
 
 @dataclass(frozen=True)
@@ -181,9 +178,8 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
         FileNotFoundError: if there is no dataset; the message names every path tried.
     """
     run_dir = _absolute(config_path).parent
-    inferred = _infer_output_dir(run_dir, (str(config.experiment_name), str(config.method_name), config.timestamp))
-    output_dir = inferred or fallback_output_dir(config.output_dir)
-    root = _training_dir(inferred, config.output_dir)
+    names = (str(config.experiment_name), str(config.method_name), config.timestamp)
+    output_dir, root = _folders(run_dir, names, config.output_dir)
     if data is not None:
         if not data.exists():
             raise FileNotFoundError(
@@ -203,15 +199,20 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
     )
 
 
-def _infer_output_dir(run_dir: Path, names: Sequence[str | None]) -> Path | None:
-    """Return the folder above experiment/method/timestamp; None if the run does not lie in folders of these names."""
-    known = [name for name in names if name is not None]
-    return _strip_tail(run_dir, Path(*known)) if len(known) == len(names) else None
+def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tuple[Path, Path | None]:
+    """Return the folder above experiment/method/timestamp, and the working directory of the training if it is known.
 
-
-def _training_dir(inferred: Path | None, output_dir: Path) -> Path | None:
-    """Return the working directory of the training from the folder of the runs, and output_dir in the config."""
-    return None if inferred is None else _strip_tail(inferred, Path(os.path.normpath(output_dir)))
+    Args:
+        run_dir: folder of config.yml.
+        names: experiment, method and timestamp.
+        output_dir: the folder in the config, which is relative to the working directory.
+    """
+    inferred = _strip_tail(run_dir, Path(*filter(None, names))) if all(names) else None
+    if inferred is not None:
+        return inferred, _strip_tail(inferred, Path(os.path.normpath(output_dir)))
+    # a moved run: inside the current directory, whatever its config names
+    is_elsewhere = output_dir.is_absolute() or ".." in output_dir.parts
+    return _absolute(Path("outputs") if is_elsewhere else output_dir), None
 
 
 def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> list[Path]:
@@ -230,11 +231,6 @@ def dataset_in_config(config: Any) -> Path:
     """Return the path of the dataset in the config."""
     datamanager = config.pipeline.datamanager
     return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
-
-
-def fallback_output_dir(output_dir: Path) -> Path:
-    """Return the output folder for a moved run: inside the current directory, whatever its config names."""
-    return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
 
 
 def _absolute(path: Path) -> Path:
@@ -381,6 +377,16 @@ _PARTS = {
     "pipeline.datamanager.dataparser": tuple(cls.__name__ for cls in get_args(SupportedDataParserConfig)),
     "pipeline.model": ("SplatfactoModelConfig", "NormLiftModelConfig"),
 }
+_RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "pipeline.model.sh_degree": (lambda x: 0 <= x <= 4, "0 to 4"),
+    "pipeline.model.sh_degree_interval": (lambda x: x >= 1, "at least 1"),
+    "pipeline.datamanager.camera_res_scale_factor": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
+    "pipeline.datamanager.dataparser.scale_factor": (lambda x: x > 0, "above 0"),
+    "pipeline.datamanager.dataparser.downscale_factor": (lambda x: x is None or 1 <= x <= 2**10, "1 to 1024, or null"),
+    "pipeline.datamanager.dataparser.train_split_fraction": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
+    "pipeline.datamanager.dataparser.eval_interval": (lambda x: x >= 1, "at least 1"),
+}
+"""Ranges of the numbers that a lift depends on, each with its description; not every data parser has all of them."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
 
@@ -399,9 +405,11 @@ def check_config_values(config: Any, path: Path) -> None:
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     _check_names(config, path)
     pipeline: Any = config.pipeline
-    for name, value, in_range, expected in _ranges(pipeline.model, pipeline.datamanager):
-        if not in_range:
-            raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
+    for name, (in_range, expected) in _RANGES.items():
+        part, _, field = name.rpartition(".")
+        values = vars(attrgetter(part)(config))
+        if field in values and not in_range(values[field]):
+            raise InputError(f"{path}: {name} is {_format(values[field])}, expected {expected}. {_REMEDY}")
     if hasattr(pipeline, "lift"):
         check_lift_options(pipeline.lift, f"{path}: pipeline.lift")
 
@@ -413,10 +421,7 @@ def check_components(config: Any, path: Path) -> None:
         ValueError: if one of them is an instance of another class; the message names both classes.
     """
     for name, classes in _PARTS.items():
-        part: Any = config
-        for step in name.split("."):
-            part = getattr(part, step)
-        cls = type(part)
+        cls = type(attrgetter(name)(config))
         if (
             cls.__name__ not in classes
             or CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}") not in CONFIG_TARGETS
@@ -441,78 +446,57 @@ def _format(value: Any) -> str:
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
     """Yield values that violate their type hints: field name, value, and what was expected."""
+    parts, origin = get_args(hint), get_origin(hint)
     if depth > _MAX_DEPTH:
         yield name, value, "no more than a few levels"
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
-    elif get_origin(hint) in _GENERIC_CHECKS:
-        yield from _GENERIC_CHECKS[get_origin(hint)](value, hint, name, depth)
+    elif origin in (Union, types.UnionType):
+        classes = [part for part in parts if is_dataclass(part) and type(value) is part]
+        errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
+        if all(errors):
+            yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
+    elif origin is Literal:
+        if not any(type(value) is type(part) and value == part for part in parts):
+            yield name, value, " or ".join(map(repr, parts))
+    elif not _fits(value, hint):
+        yield name, value, _describe(hint)
+    else:
+        for key, item, item_hint in _items(value, hint):
+            yield from _type_errors(item, item_hint, f"{name}{key}".removeprefix("."), depth + 1)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value matches a type hint, apart from the items in it."""
+    parts, origin = get_args(hint), get_origin(hint)
+    if origin is tuple:
+        return isinstance(value, tuple | list) and (parts[-1] is Ellipsis or len(value) == len(parts))
+    if origin is dict:
+        return isinstance(value, dict) and all(isinstance(key, str) for key in value)
+    return _SCALARS[hint][0](value) if hint in _SCALARS else not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _items(value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the items of a value, each with its part of the name and its type hint."""
+    parts, origin = get_args(hint), get_origin(hint)
+    if origin is tuple:
+        hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        yield from ((f"[{i}]", item, item_hint) for i, (item, item_hint) in enumerate(zip(value, hints)))
+    elif origin is dict:
+        yield from ((f".{key[:40]}", item, parts[1]) for key, item in value.items())
     elif is_dataclass(hint):
-        yield from _dataclass_errors(value, hint, name, depth)
-    elif hint in _SCALARS:
-        is_valid, expected = _SCALARS[hint]
-        if not is_valid(value):
-            yield name, value, expected
-    elif isinstance(hint, type) and not isinstance(value, hint):
-        yield name, value, _describe(hint)
+        hints = get_type_hints(type(value))
+        for name in (field.name for field in fields(value)):
+            if name != "vis":  # only matters for training; programs set it to values that the flag does not accept
+                yield f".{name}", getattr(value, name), hints[name]
 
 
-def _union_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
-    classes = [part for part in parts if is_dataclass(part) and type(value) is part]
-    errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
-    if all(errors):
-        yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
-
-
-def _literal_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
-    if not any(type(value) is type(part) and value == part for part in parts):
-        yield name, value, " or ".join(map(repr, parts))
-
-
-def _tuple_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
-    is_open = parts[-1] is Ellipsis
-    if not isinstance(value, tuple | list) or not (is_open or len(value) == len(parts)):
-        yield name, value, _describe(hint)
-        return
-    for i, (item, item_hint) in enumerate(zip(value, parts[:1] * len(value) if is_open else parts)):
-        yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
-
-
-def _dict_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        yield name, value, _describe(hint)
-        return
-    for key, item in value.items():
-        yield from _type_errors(item, get_args(hint)[1], f"{name}.{key[:40]}", depth + 1)
-
-
-def _dataclass_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    if not isinstance(value, hint):
-        yield name, value, _describe(hint)
-        return
-    hints = get_type_hints(type(value))
-    for field in fields(value):
-        if field.name != "vis":  # only matters for training; programs set it to values that the flag does not accept
-            full_name = f"{name}.{field.name}" if name else field.name
-            yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
-
-
-_GENERIC_CHECKS: dict[Any, Callable[[Any, Any, str, int], Iterator[tuple[str, Any, str]]]] = {
-    Union: _union_errors,
-    types.UnionType: _union_errors,
-    Literal: _literal_errors,
-    tuple: _tuple_errors,
-    dict: _dict_errors,
-}
-"""Checks of values by the origin of their type hint."""
 _SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     float: (lambda x: type(x) is not bool and isinstance(x, int | float) and abs(x) <= 1e300, "a finite number"),
     int: (lambda x: type(x) is int and abs(x) <= _MAX_INT, "a whole number"),
     str: (lambda x: isinstance(x, str) and "\0" not in x, "text"),
     Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
+    type(None): (lambda x: x is None, "null"),
 }
 """Checks of values by their type hint, each with what it expects."""
 
@@ -527,8 +511,9 @@ def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
 
 
 def _describe(hint: Any) -> str:
-    names = {float: "a number", int: "a whole number", str: "text", Path: "a path", type(None): "null"}
-    return names.get(hint) or getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
+    if hint in _SCALARS:
+        return _SCALARS[hint][1]
+    return getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
 
 
 def _check_names(config: TrainerConfig, path: Path) -> None:
@@ -552,28 +537,6 @@ def _check_names(config: TrainerConfig, path: Path) -> None:
             raise InputError(
                 f"{path}: {name} is {_format(value)}, expected a relative path in the folder of the run. {_REMEDY}"
             )
-
-
-def _ranges(
-    model: SplatfactoModelConfig, datamanager: FullImageDatamanagerConfig
-) -> Iterator[tuple[str, Any, bool, str]]:
-    """Yield the numbers that a lift depends on: name, value, whether it is in range, and the range."""
-    yield "pipeline.model.sh_degree", model.sh_degree, 0 <= model.sh_degree <= 4, "0 to 4"
-    interval = model.sh_degree_interval
-    yield "pipeline.model.sh_degree_interval", interval, interval >= 1, "at least 1"
-    scale = datamanager.camera_res_scale_factor
-    yield "pipeline.datamanager.camera_res_scale_factor", scale, 0 < scale <= 1, "above 0 and at most 1"
-    parser: Any = datamanager.dataparser
-    limits = {
-        "scale_factor": (lambda value: value > 0, "above 0"),
-        "downscale_factor": (lambda value: value is None or 1 <= value <= 2**10, "1 to 1024, or null"),
-        "train_split_fraction": (lambda value: 0 < value <= 1, "above 0 and at most 1"),
-        "eval_interval": (lambda value: value >= 1, "at least 1"),
-    }
-    for name, (in_range, expected) in limits.items():
-        value = getattr(parser, name, None)
-        if hasattr(parser, name):
-            yield f"pipeline.datamanager.dataparser.{name}", value, in_range(value), expected
 
 
 def check_lift_options(options: LiftOptions, name: str) -> None:
