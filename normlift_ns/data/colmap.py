@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from normlift_ns.data.frames import PERSPECTIVE_MODELS, Intrinsics
+from normlift_ns.data.frames import PERSPECTIVE_MODELS, Frame, Intrinsics, find_images, find_masks
+from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
 
 CAMERA_MODELS = {
@@ -157,6 +158,35 @@ def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
 
     matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
     return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
+
+
+def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice: str) -> CameraFile:
+    """Read the cameras of a COLMAP project, and locate its images.
+
+    Args:
+        folder: absolute path of the project.
+        images, masks: folders of the images and masks; None: images/ in the project, and no masks.
+        advice: what to do about missing images, for error messages.
+    Raises:
+        FileNotFoundError: if the reconstruction, an image or a mask is missing.
+        ValueError: as in `read_colmap_model` and `colmap_intrinsics`.
+    """
+    model = find_colmap_model(folder)
+    cameras, registered = read_colmap_model(model)
+    registered.sort(key=lambda image: image.name)  # as training tools sort them
+    intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
+    images_dir = (images or folder / "images").absolute()
+    if not images_dir.is_dir():
+        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
+    names = [image.name for image in registered]
+    files = find_images(names, images_dir, model, advice, allow_copies=True)
+    mask_files = [None] * len(files) if masks is None else find_masks(names, masks)
+    base = folder if images_dir.is_relative_to(folder) else images_dir.parent
+    frames = [
+        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
+        for image, file, mask in zip(registered, files, mask_files)
+    ]
+    return CameraFile(frames, frozenset(), model, folder, base)
 
 
 def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:

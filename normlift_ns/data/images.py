@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -194,9 +194,6 @@ class SplitViews(ABC):
     def __len__(self) -> int:
         return len(self.files)
 
-    def __iter__(self) -> Iterator[View]:
-        return (self[i] for i in range(len(self)))
-
     def __getitem__(self, index: int) -> View:
         """Read and undistort one image.
 
@@ -214,9 +211,13 @@ class SplitViews(ABC):
         image = blend_background(image, self._background)
         return View(self.cameras[index], image, mask, self.names[index], original_size)
 
-    @cached_property
+    @property
     def cameras(self) -> list[Camera]:
         """Cameras of the undistorted images; no image is read."""
+        return self._cameras
+
+    @cached_property
+    def _cameras(self) -> list[Camera]:
         return [self._camera(i) for i in range(len(self))]
 
     def _camera(self, index: int) -> Camera:

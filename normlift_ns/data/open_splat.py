@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -19,22 +18,8 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
-from normlift_ns.data.colmap import (
-    colmap_intrinsics,
-    colmap_pose,
-    find_colmap_model,
-    read_colmap_model,
-    read_colmap_points,
-)
-from normlift_ns.data.frames import (
-    Frame,
-    WorldTransform,
-    check_frames,
-    find_images,
-    find_masks,
-    rescale_intrinsics,
-    transform_frames,
-)
+from normlift_ns.data.colmap import read_colmap, read_colmap_points
+from normlift_ns.data.frames import Frame, WorldTransform, check_frames, rescale_intrinsics, transform_frames
 from normlift_ns.data.images import ImageViews, held_out_names
 from normlift_ns.data.splat import GAUSSIAN_PARAMETERS, SplatFile, SplatParameters, validate_splat
 from normlift_ns.data.transforms import (
@@ -43,7 +28,6 @@ from normlift_ns.data.transforms import (
     read_json_file,
     read_transforms,
     read_world_transform,
-    relative_name,
     write_transforms,
 )
 from normlift_ns.errors import InputError, summarize_error
@@ -83,29 +67,9 @@ def read_camera_file(options: SplatOptions, advice: str = "give the folder of th
             Path(options.transforms or "").absolute(), options.images, options.masks, advice=advice
         )
     else:
-        cameras = _colmap(options, options.colmap, advice)
+        cameras = read_colmap(options.colmap.absolute(), options.images, options.masks, advice=advice)
     check_frames(cameras.frames, cameras.source)
     return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
-
-
-def _colmap(options: SplatOptions, folder: Path, advice: str) -> CameraFile:
-    folder = folder.absolute()
-    model = find_colmap_model(folder)
-    cameras, images = read_colmap_model(model)
-    registered = sorted(images, key=lambda image: image.name)  # as training tools sort them
-    intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
-    images_dir = (options.images or folder / "images").absolute()
-    if not images_dir.is_dir():
-        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
-    names = [image.name for image in registered]
-    files = find_images(names, images_dir, model, advice, allow_copies=True)
-    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(names, options.masks)
-    base = folder if images_dir.is_relative_to(folder) else images_dir.parent
-    frames = [
-        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
-        for image, file, mask in zip(registered, files, masks)
-    ]
-    return CameraFile(frames, frozenset(), model, folder, base)
 
 
 # Splats with their images.
@@ -190,8 +154,33 @@ def open_splat(
     held_out = _held_out(options, cameras)
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
-    worlds = _candidate_worlds(file, options, cameras)
-    return _first_aligned(partial(_scene, path, options, cameras, file, held_out), worlds, say)
+
+    def scene_in(world: WorldTransform) -> SplatScene:
+        placed = transform_frames(cameras.frames, world)
+        if file.pose_adjust is not None:
+            placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
+        train, rest = _views(placed, held_out if options.views == "train" else frozenset(), options.background)
+        return SplatScene(
+            file.splat,
+            train,
+            rest,
+            cameras.folder.name or "splat",
+            path,
+            file.step,
+            Path("outputs").absolute(),
+            cameras.names_root,
+            {
+                "source_splat": str(path),
+                "source_cameras": str(cameras.source),
+                "source_step": file.step,
+                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+            },
+            options.rasterize_mode or file.rasterize_mode or "classic",
+            options.background,
+            train.check_files(),
+        )
+
+    return _first_aligned(scene_in, _candidate_worlds(file, options, cameras), say)
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
@@ -205,41 +194,13 @@ def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
     return held_out
 
 
-def _scene(
-    path: Path,
-    options: SplatOptions,
-    cameras: CameraFile,
-    file: SplatFile,
-    held_out: frozenset[str],
-    world: WorldTransform,
-) -> SplatScene:
-    """Return the scene with its cameras mapped to a world."""
-    placed = transform_frames(cameras.frames, world)
-    if file.pose_adjust is not None:
-        placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
-    background = BACKGROUND_COLORS[options.background]
-    train = ImageViews([x for x in placed if options.views == "all" or x.name not in held_out], background)
-    rest = ImageViews([x for x in placed if options.views == "train" and x.name in held_out], background)
-    identity = {
-        "source_splat": str(path),
-        "source_cameras": str(cameras.source),
-        "source_step": file.step,
-        "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
-    }
-    return SplatScene(
-        file.splat,
-        train,
-        rest,
-        cameras.folder.name or "splat",
-        path,
-        file.step,
-        Path("outputs").absolute(),
-        cameras.names_root,
-        identity,
-        options.rasterize_mode or file.rasterize_mode or "classic",
-        options.background,
-        train.check_files(),
+def _views(frames: Sequence[Frame], held_out: frozenset[str], background: Background) -> tuple[ImageViews, ImageViews]:
+    """Return the training images and those that were held out."""
+    train, rest = (
+        ImageViews([frame for frame in frames if (frame.name in held_out) == is_rest], BACKGROUND_COLORS[background])
+        for is_rest in (False, True)
     )
+    return train, rest
 
 
 SPLAT_READERS = Registry(
@@ -488,11 +449,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         advice="give their folder with --data",
     )
     check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
-    background = BACKGROUND_COLORS[saved.background]
-    train, held_out = (
-        ImageViews([frame for frame in cameras.frames if (frame.name in cameras.held_out) == is_held_out], background)
-        for is_held_out in (False, True)
-    )
+    train, held_out = _views(cameras.frames, cameras.held_out, saved.background)
     return SplatScene(
         checkpoint.splat,
         train,

@@ -85,7 +85,10 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     """
     if len(splat) == 0:
         raise InputError(f"{file} holds no Gaussians. Export the scene again.")
-    for name, values in _activated_values(splat):
+    activated = splat.activated  # logits and logarithms themselves may be infinite
+    geometry = {"means": splat.means, "rotations": splat.quats, "scales": activated.scales}
+    colors = (("opacities", activated.opacities), ("colors", splat.features_dc), ("colors", splat.features_rest))
+    for name, values in (*geometry.items(), *colors):
         blocks = values.reshape(len(splat), -1).split(_BLOCK_ROWS)
         invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
         if len(invalid) > 0:
@@ -112,16 +115,6 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
             f"{float(splat.scales.max()):.3g}: read as logarithms, they make the median Gaussian {width:.3g} wide in "
             f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
         )
-
-
-def _activated_values(splat: SplatParameters) -> Iterator[tuple[str, Tensor]]:
-    """Yield the values that must be finite; logits and logarithms themselves may be infinite."""
-    yield "means", splat.means
-    yield "rotations", splat.quats
-    yield "scales", splat.activated.scales
-    yield "opacities", splat.activated.opacities
-    yield "colors", splat.features_dc
-    yield "colors", splat.features_rest
 
 
 def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> SplatParameters:

@@ -78,6 +78,11 @@ class TransformsEntries(CameraEntry, kw_only=True):
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
 
+    @property
+    def lists(self) -> dict[str, list[str] | None]:
+        """The lists of files by split."""
+        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}
+
     def value(self, frame: FrameEntry, name: str) -> Any:
         """Return a parameter of a camera. As in nerfstudio, values for all frames take precedence over its own."""
         shared = getattr(self, name)
@@ -140,13 +145,17 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
         names = (frame.file_path, frame.mask_path or "-")
         if any(name.strip() == "" or "\0" in name for name in names):
             raise InputError(f"{path}: the file_path or mask_path {names} is not a valid file name.")
-        rows = frame.transform_matrix
-        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not (np.abs(rows) < _MAX_VALUE).all():
+        if not _is_matrix(frame.transform_matrix):
             raise InputError(
                 f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4 finite numbers. Expected a "
                 "camera-to-world matrix."
             )
     return entries
+
+
+def _is_matrix(rows: list[list[float]], bound: float = _MAX_VALUE) -> bool:
+    """Return whether these are 3 or 4 rows of 4 numbers below a bound."""
+    return len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and bool((np.abs(rows) < bound).all())
 
 
 def _check_numbers(entry: CameraEntry, source: str) -> None:
@@ -241,9 +250,8 @@ def read_transforms(
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
     """Return whether the file excludes each frame from the training. Like nerfstudio, reject lists of other files."""
-    lists = {"train": entries.train_filenames, "val": entries.val_filenames, "test": entries.test_filenames}
     files = [root / frame.file_path for frame in entries.frames]
-    for split, names in lists.items():
+    for split, names in entries.lists.items():
         unknown = [name for name in names or () if root / name not in files]
         if unknown:
             raise InputError(
@@ -329,7 +337,7 @@ def _focal(focal: float | None, angle: float | None, side: float) -> float | Non
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 
-def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, ...]:
+def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, float, float, float, float]:
     """Return k1, k2, k3, p1, p2: the values for all frames if there are any, otherwise the frame's own."""
     source = entries if len(_given(entries, *DISTORTION, "distortion_params")) > 0 else frame
     values = [getattr(source, name) or 0.0 for name in DISTORTION]
@@ -348,7 +356,7 @@ def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarr
     rows = entries.applied_rows(path.parent)
     matrix = np.eye(4)
     if rows is not None:
-        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():
+        if not _is_matrix(rows, math.inf):
             raise InputError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _MIN_DETERMINANT or not 0 < entries.applied_scale < math.inf:
@@ -382,7 +390,7 @@ def _entry(frame: Frame) -> dict[str, Any]:
 
 _TOLERANCE = 1e-3
 """Largest deviation of a matrix from a similarity, because files round."""
-_MAX_ENTRY, _MAX_MATRIX_BYTES = 1e30, 2**16
+_MAX_MATRIX_BYTES = 2**16
 _EXPECTED_DATAPARSER = "the dataparser_transforms.json that ns-train wrote; copy it again from the run"
 _EXPECTED_MATRIX = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
 
@@ -410,8 +418,7 @@ def _to_world(values: Any, path: Path) -> WorldTransform:
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not hold a transform ({error}). Expected {_EXPECTED_DATAPARSER}.") from error
     rows = stored.transform
-    is_valid = len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and (np.abs(rows) < _MAX_ENTRY).all()
-    if not is_valid or not 0 < stored.scale < _MAX_ENTRY:
+    if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
         raise InputError(
             f"{path} does not hold a transform: {len(rows)} rows and scale {stored.scale:g}. Expected 3 rows of 4 "
             f"finite numbers and a positive scale: {_EXPECTED_DATAPARSER}."
@@ -483,7 +490,7 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     Raises:
         ValueError: if the matrix does not consist of a rotation, a scale and a translation.
     """
-    if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_ENTRY).all():
+    if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_VALUE).all():
         raise InputError(
             f"{source} has the shape {matrix.shape}, or its numbers are not finite. Expected {_EXPECTED_MATRIX}."
         )

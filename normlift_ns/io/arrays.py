@@ -89,7 +89,7 @@ def save_arrays(
     if all(isinstance(array, np.ndarray) for array in arrays.values()):
         from safetensors.numpy import save_file  # noqa: PLC0415 (one of the two)
 
-        content = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        content: dict[str, Any] = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     else:
         from safetensors.torch import save_file  # noqa: PLC0415 (as in `_bytes`)
 

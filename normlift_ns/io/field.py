@@ -119,16 +119,12 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
                 f"{len(rows.offsets) - 1} Gaussians have region weights, but {len(unlabeled.offsets) - 1} have weights "
                 "of unlabeled pixels"
             )
-        _check_views(region_view, views)
+        low, high = (int(region_view.min()), int(region_view.max())) if region_view.size > 0 else (0, -1)
+        if low < 0 or high >= views or bool((region_view[1:] < region_view[:-1]).any()):
+            raise InputError(f"region_view is in {low}..{high}, expected rising values in 0..{views - 1}")
         return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); {remedy}") from error
-
-
-def _check_views(region_view: Int32[np.ndarray, " s"], views: int) -> None:
-    low, high = (int(region_view.min()), int(region_view.max())) if region_view.size > 0 else (0, -1)
-    if low < 0 or high >= views or bool((region_view[1:] < region_view[:-1]).any()):
-        raise InputError(f"region_view is in {low}..{high}, expected rising values in 0..{views - 1}")
 
 
 def read_field(folder: Path) -> FieldArrays:

@@ -7,6 +7,7 @@ import types
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -24,7 +25,7 @@ from normlift_ns.data.nerfstudio.config_classes import (
     TrainerConfig,
 )
 from normlift_ns.errors import InputError
-from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 
 # The YAML of a config.yml, and the current paths of its run's files; reading them constructs no objects.
 
@@ -401,15 +402,11 @@ def check_config_values(config: Any, path: Path) -> None:
     if type(config) is not TrainerConfig:
         raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")
     check_components(config, path)
-    for name, value, expected in _type_errors(config, TrainerConfig, "", 0):
+    for name, value, expected in chain(
+        _type_errors(config, TrainerConfig, "", 0), _name_errors(config), _range_errors(config)
+    ):
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
-    _check_names(config, path)
     pipeline: Any = config.pipeline
-    for name, (in_range, expected) in _RANGES.items():
-        part, _, field = name.rpartition(".")
-        values = vars(attrgetter(part)(config))
-        if field in values and not in_range(values[field]):
-            raise InputError(f"{path}: {name} is {_format(values[field])}, expected {expected}. {_REMEDY}")
     if hasattr(pipeline, "lift"):
         check_lift_options(pipeline.lift, f"{path}: pipeline.lift")
 
@@ -435,13 +432,9 @@ def check_components(config: Any, path: Path) -> None:
 
 def _format(value: Any) -> str:
     """Format any value briefly."""
-    if value is None or isinstance(value, str | bool | int | float | Path):
-        try:
-            text = "null" if value is None else repr(str(value) if isinstance(value, Path) else value)
-        except ValueError:  # an integer of thousands of digits
-            text = "a huge number"
-        return text if len(text) <= 60 else f"{text[:60]}…"
-    return f"a {type(value).__name__}"
+    if isinstance(value, str | bool | int | float | Path):
+        return short_repr(str(value) if isinstance(value, Path) else value)
+    return "null" if value is None else f"a {type(value).__name__}"
 
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
@@ -516,8 +509,8 @@ def _describe(hint: Any) -> str:
     return getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
 
 
-def _check_names(config: TrainerConfig, path: Path) -> None:
-    """Raise if a name or path would lead out of the run's folders."""
+def _name_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
+    """Yield names and paths that would lead out of the run's folders."""
     for name in ("experiment_name", "method_name", "timestamp"):
         value = getattr(config, name)
         if (
@@ -526,17 +519,20 @@ def _check_names(config: TrainerConfig, path: Path) -> None:
             or {"/", "\\", "\0", "\n"} & set(value)
             or len(value) > 255
         ):
-            raise InputError(f"{path}: {name} is {_format(value)}, expected the name of one folder. {_REMEDY}")
-    relative = {
-        "viewer.relative_log_filename": Path(config.viewer.relative_log_filename),
-        "logging.relative_log_dir": config.logging.relative_log_dir,
-        "relative_model_dir": config.relative_model_dir,
-    }
-    for name, value in relative.items():
+            yield name, value, "the name of one folder"
+    for name in ("viewer.relative_log_filename", "logging.relative_log_dir", "relative_model_dir"):
+        value = Path(attrgetter(name)(config))
         if value.is_absolute() or ".." in value.parts:
-            raise InputError(
-                f"{path}: {name} is {_format(value)}, expected a relative path in the folder of the run. {_REMEDY}"
-            )
+            yield name, value, "a relative path in the folder of the run"
+
+
+def _range_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
+    """Yield numbers that a lift depends on and that are out of range."""
+    for name, (in_range, expected) in _RANGES.items():
+        part, _, field = name.rpartition(".")
+        values = vars(attrgetter(part)(config))
+        if field in values and not in_range(values[field]):
+            yield name, values[field], expected
 
 
 def check_lift_options(options: LiftOptions, name: str) -> None:

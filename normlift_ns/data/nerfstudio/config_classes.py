@@ -7,7 +7,7 @@ imports the class that it configures, its `_target`; of that the mirrors know on
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -325,12 +325,6 @@ class NormLiftModelConfig(SplatfactoModelConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
 
     semantics: Path | None = None
-
-    @staticmethod
-    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
-        """Return a config of the same model with a semantic field; all fields of the config are copied."""
-        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig)}
-        return NormLiftModelConfig(**values, semantics=semantics)
 
 
 @_mirror("nerfstudio.pipelines.base_pipeline", "VanillaPipeline")

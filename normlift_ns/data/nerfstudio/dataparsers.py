@@ -133,10 +133,15 @@ def _rotation_between(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> Float[T
     if torch.sum(torch.abs(axis)) < _PARALLEL_TOLERANCE:
         other = torch.tensor([1.0, 0, 0]) if abs(a[0]) < _PARALLEL_TOLERANCE else torch.tensor([0, 1.0, 0])
         axis = torch.linalg.cross(a, other)
-    x, y, z = axis / torch.linalg.norm(axis)
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    skew = _skew(axis / torch.linalg.norm(axis))
     angle = torch.acos(torch.clip(torch.dot(a, b), -1, 1))
     return torch.eye(3) + torch.sin(angle) * skew + (1 - torch.cos(angle)) * (skew @ skew)
+
+
+def _skew(axis: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
+    """Return the matrix of the cross product with a vector."""
+    x, y, z = axis
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def _focus_point(poses: Float[Tensor, "v 4 4"], focus: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
@@ -172,10 +177,7 @@ def _exp_so3xr3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
     angle = torch.clamp((axis_angle * axis_angle).sum(1), 1e-4).sqrt()
     inverse = 1.0 / angle
     first, second = inverse * angle.sin(), inverse * inverse * (1.0 - angle.cos())
-    skew = torch.zeros(1, 3, 3)
-    skew[:, 0, 1], skew[:, 0, 2] = -axis_angle[:, 2], axis_angle[:, 1]
-    skew[:, 1, 0], skew[:, 1, 2] = axis_angle[:, 2], -axis_angle[:, 0]
-    skew[:, 2, 0], skew[:, 2, 1] = -axis_angle[:, 1], axis_angle[:, 0]
+    skew = _skew(axis_angle[0])[None]
     transform = torch.zeros(1, 3, 4)
     transform[:, :3, :3] = (
         first[:, None, None] * skew + second[:, None, None] * torch.bmm(skew, skew) + torch.eye(3)[None]
@@ -359,9 +361,7 @@ def parse_dataset(datamanager: FullImageDatamanagerConfig) -> ParsedDataset:
             "that the run was trained with; give its path with --data."
         ) from error
     scale = datamanager.camera_res_scale_factor
-    return ParsedDataset(
-        dataset.train.resized(scale), dataset.held_out.resized(scale), dataset.transform, dataset.scale
-    )
+    return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))
 
 
 def _entries(path: Path, data: Path) -> TransformsEntries:
@@ -421,8 +421,7 @@ def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
     if len(masks) not in (0, len(files)):
         raise InputError(f"{path} lists masks for {len(masks)} of {len(files)} images; expected one for each, or none")
-    lists = {"train": meta.train_filenames, "val": meta.val_filenames, "test": meta.test_filenames}
-    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in lists.items()}
+    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
     split_indices = split_by_lists(resolved, files) or split_by_mode(files, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
