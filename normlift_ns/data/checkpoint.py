@@ -118,8 +118,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     Raises:
         FileNotFoundError: if there is no checkpoint, or none of that step; the message lists the steps that exist.
     """
-    steps = {path: _step_of(path) for path in sorted(folder.glob("step-*.ckpt"))}
-    checkpoints = {number: path for path, number in steps.items() if number is not None}
+    found = sorted(folder.glob("step-*.ckpt"))
+    checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
             f"No checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes every "

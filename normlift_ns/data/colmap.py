@@ -222,7 +222,8 @@ def _read(
         if path.suffix == ".bin":
             data = _ByteReader(path.read_bytes())
             entries = list(parse_binary(data))
-            data.check_end()
+            if data.offset != len(data.data):
+                raise InputError(f"{len(data.data) - data.offset:,} bytes too many")
             return entries
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
         return list(parse_text([line for line in lines if not line.startswith("#")]))
@@ -258,10 +259,6 @@ class _ByteReader:
         if number > len(self.data) // 8:
             raise InputError(f"it declares {number:,} entries, but has {len(self.data):,} bytes")
         return number
-
-    def check_end(self) -> None:
-        if self.offset != len(self.data):
-            raise InputError(f"{len(self.data) - self.offset:,} bytes too many")
 
 
 def _cameras_binary(data: _ByteReader) -> Iterator[ColmapCamera]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -123,12 +123,18 @@ _NERFSTUDIO_MODES = {"RGB", "RGBA", "L", "CMYK"}
 """Pillow modes that nerfstudio can train on, CMYK with wrong colors."""
 
 
-def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """Return width and height as nerfstudio scales them."""
+def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
     return int(size[0] * scale), int(size[1] * scale)
 
 
-class SplitViews(ABC):
+@contextmanager
+def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
+    """Open an image, resized by nerfstudio's camera_res_scale_factor."""
+    with Image.open(file) as opened:
+        yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
+
+
+class SplitViews:
     """Lazy `Views` of V images on disk: indexing reads and undistorts one image.
 
     Args:
@@ -161,13 +167,27 @@ class SplitViews(ABC):
         self._masks, self._sizes, self._poses = masks or [None] * len(self.files), sizes, poses
         self._background, self._scale = background, scale
 
-    @abstractmethod
-    def _load(self, index: int) -> tuple[Any, Any]:
-        """Read an image [H, W, C] and its mask or None, at the size of the camera."""
+    def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
+        """Read an image at the size of the camera; not called in subclasses with their own `_load`."""
+        raise NotImplementedError
 
     def _lens(self, index: int) -> Intrinsics:
         """Return the intrinsics of an image; not called in subclasses with their own `_undistort` and `_pinhole`."""
         raise NotImplementedError
+
+    def _load(self, index: int) -> tuple[Any, Any]:
+        """Read an image [H, W, C] and its mask or None, at the size of the camera."""
+        image, file = self._pixels(self.files[index]), self._masks[index]
+        if file is None:
+            return image, None
+        with open_scaled(file, self._scale, Image.Resampling.NEAREST) as opened:
+            mask = np.array(opened).astype(bool)
+        if mask.shape != image.shape[:2]:
+            raise InputError(
+                f"the mask has shape {mask.shape}, expected {image.shape[:2]}: one channel of the same size as its "
+                "image; save it in grayscale"
+            )
+        return image, mask
 
     def _check_header(self, index: int, header: ImageHeader) -> None:
         """Raise if nerfstudio would misread an image, or it or its mask does not have the expected size."""
@@ -177,7 +197,7 @@ class SplitViews(ABC):
                 f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
                 "RGBA or grayscale; convert the images, and train again."
             )
-        self._check_size(index, header.size if self._scale == 1 else scaled_size(header.size, self._scale))
+        self._check_size(index, header.size if self._scale == 1 else _scaled_size(header.size, self._scale))
         if mask is not None:
             check_mask(mask, file, header.size)
 
@@ -297,24 +317,12 @@ class ImageViews(SplitViews):
         if problem := _mode_problem(header.mode):
             raise InputError(f"{self.files[index]} cannot be read: {problem}.")
 
-    def _load(self, index: int) -> tuple[UInt8[np.ndarray, "h w c"], Bool[np.ndarray, "h w"] | None]:
-        with Image.open(self.files[index]) as image:
+    def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
+        with Image.open(file) as image:
             if problem := _mode_problem(image.mode):
                 raise InputError(problem)
             mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
-            pixels = np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
-        file = self._masks[index]
-        if file is None:
-            return pixels, None
-        with Image.open(file) as image:
-            mask = np.array(image)
-        size = tuple(self._sizes[index][::-1])
-        if mask.shape != size:
-            raise InputError(
-                f"the mask has shape {mask.shape}, expected {size}: one channel of the same size as its image; save "
-                "it in grayscale"
-            )
-        return pixels, mask != 0
+            return np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
 
 
 def _mode_problem(mode: str) -> str | None:

@@ -21,7 +21,7 @@ from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
 from normlift_ns.data.colmap import read_colmap, read_colmap_points
 from normlift_ns.data.frames import Frame, WorldTransform, check_frames, rescale_intrinsics, transform_frames
 from normlift_ns.data.images import ImageViews, held_out_names
-from normlift_ns.data.splat import GAUSSIAN_PARAMETERS, SplatFile, SplatParameters, validate_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
 from normlift_ns.data.transforms import (
     CameraFile,
     gsplat_normalization,
@@ -411,7 +411,7 @@ def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
         parameters["features_rest"] = torch.zeros(len(scene.splat), 3, 3)
     return {
         "step": scene.step,
-        "pipeline": {f"_model.gauss_params.{name}": parameters[name] for name in GAUSSIAN_PARAMETERS},
+        "pipeline": {f"_model.gauss_params.{name}": tensor for name, tensor in parameters.items()},
     }
 
 

@@ -26,21 +26,21 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number allowed in a file."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
-Array = Any
+_Array = Any
 """A NumPy array or a tensor."""
 
 
 class ArrayFile(NamedTuple):
     """Content of a file."""
 
-    arrays: dict[str, Array]
+    arrays: dict[str, _Array]
     metadata: dict[str, str]
     """Metadata, without the digest."""
     digest: str | None
     """None for files of version 0.1."""
 
 
-def array_digest(arrays: Mapping[str, Array], facts: Mapping[str, str], key: str = "") -> str:
+def array_digest(arrays: Mapping[str, _Array], facts: Mapping[str, str], key: str = "") -> str:
     """Return the digest of metadata, a key, and the names, types, shapes and values of arrays or tensors.
 
     >>> import torch
@@ -58,7 +58,7 @@ def array_digest(arrays: Mapping[str, Array], facts: Mapping[str, str], key: str
     return f"xxh3_128:{state.hexdigest()}"
 
 
-def _bytes(array: Array) -> memoryview | bytes:
+def _bytes(array: _Array) -> memoryview | bytes:
     if isinstance(array, np.ndarray):
         return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
     import torch  # noqa: PLC0415 (a query without torch loads this module)
@@ -70,7 +70,7 @@ def _bytes(array: Array) -> memoryview | bytes:
 
 def save_arrays(
     path: Path,
-    arrays: Mapping[str, Array],
+    arrays: Mapping[str, _Array],
     facts: Mapping[str, str] | None = None,
     *,
     key: str = "",

@@ -226,10 +226,9 @@ def append_jsonl(path: Path, line: Any) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    with os.fdopen(descriptor, "wb", buffering=0) as file:
+    with path.open("ab", buffering=0) as file:
         file.write(msgspec.json.encode(line) + b"\n")
-        os.fsync(descriptor)
+        os.fsync(file.fileno())
 
 
 def read_jsonl(folder: Path, kind: type[_Line]) -> list[_Line]:

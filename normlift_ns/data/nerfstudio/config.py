@@ -333,14 +333,10 @@ def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     return _Name(name)
 
 
-def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
-    return tuple(loader.construct_sequence(node, deep=True))
-
-
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}:", _construct_object)
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}/apply:", _construct_call)
 ConfigLoader.add_multi_constructor(_NAME_TAG, _construct_name)
-ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)
+ConfigLoader.add_constructor(_TUPLE_TAG, lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
 
 
 class _ConfigDumper(yaml.Dumper):
@@ -419,10 +415,8 @@ def check_components(config: Any, path: Path) -> None:
     """
     for name, classes in _PARTS.items():
         cls = type(attrgetter(name)(config))
-        if (
-            cls.__name__ not in classes
-            or CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}") not in CONFIG_TARGETS
-        ):
+        full_name = CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}")
+        if cls.__name__ not in classes or full_name not in CONFIG_TARGETS:
             raise InputError(
                 f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
                 f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
@@ -445,10 +439,7 @@ def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
     elif origin in (Union, types.UnionType):
-        classes = [part for part in parts if is_dataclass(part) and type(value) is part]
-        errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
-        if all(errors):
-            yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
+        yield from _union_errors(value, parts, name, depth)
     elif origin is Literal:
         if not any(type(value) is type(part) and value == part for part in parts):
             yield name, value, " or ".join(map(repr, parts))
@@ -457,6 +448,13 @@ def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple
     else:
         for key, item, item_hint in _items(value, hint):
             yield from _type_errors(item, item_hint, f"{name}{key}".removeprefix("."), depth + 1)
+
+
+def _union_errors(value: Any, parts: tuple[Any, ...], name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    classes = [part for part in parts if is_dataclass(part) and type(value) is part]
+    errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
+    if all(errors):
+        yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -269,48 +269,40 @@ class ParsedDataset:
     """Map from the poses in the capture to the scene's world: scale * (transform @ point)."""
 
 
-def split_by_mode(files: Sequence[Path], parser: PosedDataParserConfig) -> tuple[Any, Any]:
-    """Return the indices of the training and the evaluation images by the parser's eval_mode.
+def split_files(files: Sequence[Path], lists: Mapping[str, Any], parser: PosedDataParserConfig) -> tuple[Any, Any]:
+    """Return the indices of the training and the evaluation images: by the dataset's lists, or else by eval_mode.
 
     Raises:
-        ValueError: if eval_mode is filename and a file name does not tell its split.
+        ValueError: if only one of the train and test lists exists, a listed file is missing, or eval_mode is filename
+            and a file name does not tell its split.
     """
+    if any(names is not None for names in lists.values()):
+        return _listed_files(files, lists["train"], "train"), _listed_files(files, lists["test"], "test")
     indices = np.arange(len(files))
     if parser.eval_mode == "fraction":
         count = math.ceil(len(files) * parser.train_split_fraction)
         trained = np.linspace(0, len(files) - 1, count, dtype=int)
         return trained, np.setdiff1d(indices, trained)
-    if parser.eval_mode == "interval":
-        is_eval = indices % parser.eval_interval == 0
-        return indices[~is_eval], indices[is_eval]
     if parser.eval_mode == "all":
         return indices, indices
-    for file in files:
-        if "train" not in file.name and "eval" not in file.name:
-            raise InputError(f"eval_mode is filename, but {file.name} has neither train nor eval in its name")
-    is_train = np.array(["train" in file.name for file in files], dtype=bool)
-    return indices[is_train], indices[~is_train]
+    is_eval = indices % parser.eval_interval == 0
+    if parser.eval_mode == "filename":
+        for file in files:
+            if "train" not in file.name and "eval" not in file.name:
+                raise InputError(f"eval_mode is filename, but {file.name} has neither train nor eval in its name")
+        is_eval = np.array(["train" not in file.name for file in files], dtype=bool)
+    return indices[~is_eval], indices[is_eval]
 
 
-def split_by_lists(lists: Mapping[str, Any], files: Sequence[Path]) -> tuple[Any, Any] | None:
-    """Return the indices of the training and the evaluation images from the dataset's lists; None if it has none.
-
-    Raises:
-        ValueError: if only one of the train and test lists exists, or a listed file is missing.
-    """
-    if all(names is None for names in lists.values()):
-        return None
-    splits = []
-    for split in ("train", "test"):
-        names = lists[split]
-        if names is None:
-            raise InputError(f"the dataset's list of filenames for split {split} is missing")
-        unknown = sorted(map(str, set(names) - set(files)))
-        if unknown:
-            raise InputError(f"some filenames for split {split} were not found, the first is {unknown[0]}")
-        listed = set(names)
-        splits.append(np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32))
-    return splits[0], splits[1]
+def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarray, " m"]:
+    """Return the indices of the files in a list of the dataset."""
+    if names is None:
+        raise InputError(f"the dataset's list of filenames for split {split} is missing")
+    listed = set(names)
+    unknown = sorted(map(str, listed - set(files)))
+    if unknown:
+        raise InputError(f"some filenames for split {split} were not found, the first is {unknown[0]}")
+    return np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32)
 
 
 # Cameras and files of a dataset, bit-identical to those of nerfstudio's data parsers.
@@ -384,17 +376,17 @@ def _check_files(files: Sequence[Path], path: Path) -> None:
         raise InputError(f"{path} lists {invalid}, which is not a regular file. Expected images.")
 
 
-def _distortion(entries: TransformsEntries, frame: FrameEntry) -> list[float]:
+def _row(entries: TransformsEntries, frame: FrameEntry) -> list[float]:
+    """Return focal lengths, principal point, size and distortion of an image."""
     is_shared = any(getattr(entries, name) is not None for name in ("k1", "k2", "k3", "p1", "p2", "distortion_params"))
     source = entries if is_shared else frame
-    if source.distortion_params is not None:
-        return source.distortion_params
-    return [float(getattr(source, name) or 0.0) for name in DISTORTION]
+    distortion = source.distortion_params
+    if distortion is None:
+        distortion = [float(getattr(source, name) or 0.0) for name in DISTORTION]
+    return [*(float(entries.value(frame, name)) for name in _INTRINSICS), *distortion]
 
 
-def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
-    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
-    folder, meta = path.parent, _entries(path, parser.data)
+def _check_transforms(meta: TransformsEntries, path: Path, parser: NerfstudioDataParserConfig) -> None:
     for name in _INTRINSICS:
         incomplete = [frame.file_path for frame in meta.frames if meta.value(frame, name) is None]
         if incomplete:
@@ -408,7 +400,16 @@ def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
             f"{path}: all {len(meta.frames)} cameras have the same position, so nerfstudio cannot scale them. Expected "
             "the cameras that the run was trained with; give the path of the dataset with --data."
         )
-    _check_files([folder / frame.file_path for frame in meta.frames], path)
+    _check_files([path.parent / frame.file_path for frame in meta.frames], path)
+    count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
+    if masked not in (0, count):
+        raise InputError(f"{path} lists masks for {masked} of {count} images; expected one for each, or none")
+
+
+def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
+    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    folder, meta = path.parent, _entries(path, parser.data)
+    _check_transforms(meta, path, parser)
     first = folder / meta.frames[0].file_path
     factor = _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
 
@@ -419,14 +420,13 @@ def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
     frames = [meta.frames[i] for i in order]
     files = [resolve(frame.file_path) for frame in frames]
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
-    if len(masks) not in (0, len(files)):
-        raise InputError(f"{path} lists masks for {len(masks)} of {len(files)} images; expected one for each, or none")
     resolved = {split: None if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
-    split_indices = split_by_lists(resolved, files) or split_by_mode(files, parser)
+    split_indices = split_files(files, resolved, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
-    rows = [[*(float(meta.value(frame, name)) for name in _INTRINSICS), *_distortion(meta, frame)] for frame in frames]
-    split = DatasetSplit(files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses(rows))
+    split = DatasetSplit(
+        files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses([_row(meta, frame) for frame in frames])
+    )
     train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
     transform = compose_applied_transform(transform, meta.applied_rows(parser.data))
     return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
@@ -508,37 +508,33 @@ def _parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
     if parser.masks_path is not None:
         folder = parser.data / parser.masks_path
         masks = _downscaled([(folder / image.name).with_suffix(".png") for image in images], folder, factor)
-    rows = {camera_id: _colmap_row(camera) for camera_id, camera in cameras.items()}
-    kind = _colmap_camera_type([cameras[image.camera_id] for image in images])
-    lenses = [rows[image.camera_id] for image in images]
-    if any(row[9] != 0 for row in lenses):
-        raise InputError("the distortion k4 of a camera is not zero")
+    kind, rows = _colmap_rows(cameras, images)
     flip = parser.assume_colmap_world_coordinate_convention
     poses, transform, scale = normalize_poses(
         [_pose(image, flip) for image in images], parser, parser.orientation_method
     )
-    split_indices = split_by_lists(_read_lists(parser), full_size) or split_by_mode(full_size, parser)
-    split = DatasetSplit(files, masks, kind, poses[:, :3, :4], *_lenses(lenses))
+    split_indices = split_files(full_size, _read_lists(parser), parser)
+    split = DatasetSplit(files, masks, kind, poses[:, :3, :4], *_lenses(rows))
     train, held_out = (
         split.select(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
     )
     return ParsedDataset(train, held_out, compose_applied_transform(transform, _FLIP if flip else None), scale)
 
 
-def _colmap_camera_type(cameras: Sequence[ColmapCamera]) -> str:
-    """Return nerfstudio's type of all cameras."""
-    kinds = {"FISHEYE" if "FISHEYE" in camera.model else "PERSPECTIVE" for camera in cameras}
+def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> tuple[str, list[list[float]]]:
+    """Return nerfstudio's type of all cameras, and a row for each image: fx, fy, cx, cy, width, height, distortion."""
+    rows = {}
+    for camera in cameras.values():
+        if camera.model not in _COLMAP_MODELS:
+            raise InputError(f"{camera.model} camera model is not supported yet")
+        values = {"w": camera.width, "h": camera.height, **camera.named_parameters()}
+        rows[camera.camera_id] = [values.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", "w", "h", *DISTORTION)]
+    kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera_id].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
         raise InputError("multiple camera models are not supported")
-    return kinds.pop()
-
-
-def _colmap_row(camera: ColmapCamera) -> list[float]:
-    """Return fx, fy, cx, cy, width, height and k1, k2, k3, k4, p1, p2."""
-    if camera.model not in _COLMAP_MODELS:
-        raise InputError(f"{camera.model} camera model is not supported yet")
-    values = {"w": camera.width, "h": camera.height, **camera.named_parameters()}
-    return [values.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", "w", "h", *DISTORTION)]
+    if any(rows[image.camera_id][9] != 0 for image in images):
+        raise InputError("the distortion k4 of a camera is not zero")
+    return kinds.pop(), [rows[image.camera_id] for image in images]
 
 
 def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:

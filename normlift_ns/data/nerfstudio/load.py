@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +18,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Views
 from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, Intrinsics
-from normlift_ns.data.images import SplitViews, scaled_size
+from normlift_ns.data.images import SplitViews, open_scaled
 from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
 from normlift_ns.data.nerfstudio.config_classes import (
     NAMED_COLORS,
@@ -85,20 +84,14 @@ class TrainedViews(SplitViews):
 
     def _load(self, index: int) -> tuple[UInt8[np.ndarray, "h w c"], Bool[np.ndarray, "h w"] | None]:
         """Read pixels and mask like nerfstudio's `InputDataset`."""
-        image, color, file = self._pixels(self.files[index]), self._mask_color, self._masks[index]
-        if file is None:
-            return image, None
-        with _open_scaled(file, self._scale, Image.Resampling.NEAREST) as opened:
-            mask = np.array(opened).astype(bool)
-        if mask.shape != image.shape[:2]:
-            raise InputError(f"the mask has shape {mask.shape}, the image {image.shape[:2]}")
-        if color is not None and any(color):
-            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(color)
+        image, mask = super()._load(index)
+        if mask is not None and self._mask_color is not None and any(self._mask_color):
+            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._mask_color)
             image = torch.where(torch.from_numpy(mask)[:, :, None], torch.from_numpy(image), filled).numpy()
         return image, mask
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
-        with _open_scaled(file, self._scale, Image.Resampling.BILINEAR) as opened:
+        with open_scaled(file, self._scale, Image.Resampling.BILINEAR) as opened:
             image = np.array(opened, dtype=np.uint8)
         if image.ndim == 2:
             image = image[:, :, None].repeat(3, axis=2)
@@ -114,13 +107,6 @@ class TrainedViews(SplitViews):
 def camera_type_error(file: Path, kind: str) -> str:
     """Return the message about an image whose camera is of a type that splatfacto does not support."""
     return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
-
-
-@contextmanager
-def _open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
-    """Open an image, resized by the camera_res_scale_factor."""
-    with Image.open(file) as opened:
-        yield opened if scale == 1 else opened.resize(scaled_size(opened.size, scale), resampling)
 
 
 # Trained splatfacto runs as a `Scene` of the core, without CUDA and without building a model.
@@ -229,15 +215,12 @@ class NerfstudioScene:
         return self.config.pipeline.model
 
 
-ViewsFactory = Callable[
-    [TrainerConfig, Path, Float[Tensor, "v 3 4"], Float[Tensor, " 3"]], tuple[SplitViews, SplitViews]
-]
-"""Function that returns the training and evaluation views. Its arguments are a config with absolute paths, the folder
-of the dataset, the training poses and the background color."""
-
-
 def load_nerfstudio_scene(
-    load_config: Path, *, data: Path | None = None, load_step: int | None = None, make_nerfstudio_views: ViewsFactory
+    load_config: Path,
+    *,
+    data: Path | None = None,
+    load_step: int | None = None,
+    make_nerfstudio_views: Callable[..., tuple[SplitViews, SplitViews]],
 ) -> NerfstudioScene:
     """Load a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
 
@@ -247,7 +230,9 @@ def load_nerfstudio_scene(
         load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
         data: current path of the dataset, if it was moved.
         load_step: step of the checkpoint; None: the last.
-        make_nerfstudio_views: creates the views for Aria's cameras (FISHEYE624), which only nerfstudio can undistort.
+        make_nerfstudio_views: creates the training and evaluation views of Aria's cameras (FISHEYE624), which only
+            nerfstudio can undistort, from a config with absolute paths, the folder of the dataset, the training poses
+            and the background color.
     Raises:
         FileNotFoundError: if the config, the checkpoint, the dataset or an image is missing.
         ValueError: if the config belongs to another method or program, the checkpoint is damaged, or the dataset is not
@@ -258,7 +243,13 @@ def load_nerfstudio_scene(
     config = with_absolute_paths(stored, location)
     checkpoint = read_checkpoint(find_checkpoint(config.relative_model_dir, load_step))
     datamanager, model = config.pipeline.datamanager, config.pipeline.model
-    _check_degree(checkpoint, model, load_config)
+    count, expected = checkpoint.splat.features_rest.shape[1], (model.sh_degree + 1) ** 2 - 1
+    if count != expected:
+        raise InputError(
+            f"{checkpoint.path} has {count} spherical harmonics beyond the first, but {load_config} has sh_degree "
+            f"{model.sh_degree}, which needs {expected}. Expected the checkpoint and the config of one training run; "
+            "copy both again."
+        )
     gaussians = checkpoint.splat.activated
     if not bool(gaussians.drawable.any()):
         raise InputError(
@@ -266,7 +257,13 @@ def load_nerfstudio_scene(
             "that are NaN or infinite, or zero quaternions. Give another checkpoint with --load-step, or train again."
         )
     dataset = parse_dataset(datamanager)
-    _check_images([*dataset.train.files, *(dataset.train.masks or ())], location)
+    files = [*dataset.train.files, *(dataset.train.masks or ())]
+    missing = [file for file in files if not file.is_file()]
+    if missing:  # found before a lift that takes minutes
+        raise FileNotFoundError(
+            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing, the first is "
+            f"{missing[0]}. Put them back, or give the path of the dataset with --data."
+        )
     remarks = _check_transform(dataset.transform, dataset.scale, location)
     poses = _training_poses(dataset.train, model, checkpoint)
     color = _background_color(model)
@@ -280,26 +277,6 @@ def load_nerfstudio_scene(
     return NerfstudioScene(
         stored, location, checkpoint, gaussians, train, held_out, dataset.transform, dataset.scale, identity, remarks
     )
-
-
-def _check_degree(checkpoint: Checkpoint, model: SplatfactoModelConfig, load_config: Path) -> None:
-    count, expected = checkpoint.splat.features_rest.shape[1], (model.sh_degree + 1) ** 2 - 1
-    if count != expected:
-        raise InputError(
-            f"{checkpoint.path} has {count} spherical harmonics beyond the first, but {load_config} has sh_degree "
-            f"{model.sh_degree}, which needs {expected}. Expected the checkpoint and the config of one training run; "
-            "copy both again."
-        )
-
-
-def _check_images(files: Sequence[Path], location: RunLocation) -> None:
-    """Raise if an image or mask is missing, before a lift that takes minutes."""
-    missing = [file for file in files if not file.is_file()]
-    if missing:
-        raise FileNotFoundError(
-            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing, the first is "
-            f"{missing[0]}. Put them back, or give the path of the dataset with --data."
-        )
 
 
 def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: RunLocation) -> tuple[str, ...]:
