@@ -149,7 +149,8 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
             f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images with: colmap image_undistorter, train the scene on "
             "those, and give that folder."
         )
-    return Intrinsics(width=camera.width, height=camera.height, **camera.named_parameters())
+    parameters: dict[str, Any] = camera.named_parameters()
+    return Intrinsics(width=camera.width, height=camera.height, **parameters)
 
 
 def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:

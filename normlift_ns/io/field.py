@@ -5,7 +5,7 @@ This module does not need torch.
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,16 +40,24 @@ class RowArrays(NamedTuple):
         Raises:
             ValueError: wrong type or shape, entries outside the matrix, or weights that are negative or not finite.
         """
-        size, weight_dtype = self.column.size, "float64" if self.weight.dtype == "float64" else "float32"
-        last = num_columns - 1 if size > 0 else 0
-        check_array(f"{name}: columns", self.column, "int32", (size,), 0, last)
-        check_array(f"{name}: weights", self.weight, weight_dtype, (size,), 0, sys.float_info.max)
-        check_array(f"{name}: offsets", self.offsets, "int64", (self.offsets.size,), 0, size)
+        weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
+        arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))
+        for part, array, dtype in (*arrays, ("weights", self.weight, weight_dtype)):
+            if array.ndim != 1 or array.dtype != dtype:
+                raise InputError(f"{name}: {part} are {array.dtype} {array.shape}, expected one-dimensional {dtype}")
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.size > 0 else []
-        if ends != [0, size] or bool((self.offsets[1:] < self.offsets[:-1]).any()):
+        size = self.column.size
+        if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
             raise InputError(
-                f"{name}: offsets must rise from 0 to the number of entries, got {ends} for {size} entries"
+                f"{name}: offsets must rise from 0 to the number of entries, got {ends} for {size} columns and "
+                f"{self.weight.size} weights"
             )
+        low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
+        if low < 0 or high >= num_columns:
+            raise InputError(f"{name}: columns are in {low}..{high}, expected 0..{num_columns - 1}")
+        least, most = (float(self.weight.min()), float(self.weight.max())) if size > 0 else (0.0, 0.0)
+        if not 0 <= least <= most < math.inf:
+            raise InputError(f"{name}: weights are in {least}..{most}, expected finite weights of at least 0")
 
 
 class EvidenceArrays(NamedTuple):

@@ -78,9 +78,9 @@ class TrainedViews(SplitViews):
         if any(distortion) and len(distortion) < needed:
             raise InputError(f"its distortion {distortion} cannot be undistorted (expected {needed} parameters)")
         k1, k2, k3, k4, p1, p2 = [*distortion, *[0.0] * 6][:6]
-        return Intrinsics(
-            *self._split.intrinsics[index].tolist(), *self._sizes[index], k1, k2, k3, p1, p2, k4, kind == "FISHEYE"
-        )
+        fx, fy, cx, cy = self._split.intrinsics[index].tolist()
+        width, height = self._sizes[index]
+        return Intrinsics(fx, fy, cx, cy, width, height, k1, k2, k3, p1, p2, k4, kind == "FISHEYE")
 
     def _load(self, index: int) -> tuple[UInt8[np.ndarray, "h w c"], Bool[np.ndarray, "h w"] | None]:
         """Read pixels and mask like nerfstudio's `InputDataset`."""
