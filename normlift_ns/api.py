@@ -17,7 +17,8 @@ from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.data.extra_images import add_stored_images
-from normlift_ns.data.nerfstudio.load import SplitViews, load_nerfstudio_scene
+from normlift_ns.data.images import SplitViews
+from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport

@@ -105,7 +105,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     config.timestamp = run_dir.name
     config.relative_model_dir = Path(CHECKPOINT_DIR)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    config.pipeline.model = NormLiftModelConfig.upgrade(source.model_config, semantics=Path(FIELD_FOLDER))
+    config.pipeline.model = NormLiftModelConfig(**{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)})
     if location.data_moved or config.output_dir.is_absolute():
         set_dataset(config, location.data)  # a relative path would not be found
     skip_seed_points(config)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.data.nerfstudio.config_file import check_config_exists, read_config_paths
+from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes
 from normlift_ns.io.run_dir import (

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
-from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
 
 UNLABELED, MASKED = -1, -2
@@ -281,7 +281,7 @@ class Evidence:
         tensors["region_view"] = self.region_view
         counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
         metadata = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
-        return save_tensors(Path(path), tensors, metadata, key=key, overwrite=True)
+        return save_arrays(Path(path), tensors, metadata, key=key, overwrite=True)
 
     @staticmethod
     def load(path: str | Path, *, key: str = "") -> Evidence:

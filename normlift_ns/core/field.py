@@ -29,7 +29,7 @@ from normlift_ns.core.lowrank import (
 from normlift_ns.core.partition import spatial_order
 from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
-from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
 from normlift_ns.io.manifest import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
 from normlift_ns.options import RelevancyRule, Storage
@@ -216,7 +216,7 @@ class SemanticField:
         (folder / MANIFEST_FILE).unlink(
             missing_ok=True
         )  # a folder without a manifest is incomplete and may be overwritten
-        digests = {FIELD_FILE: save_tensors(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
+        digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
         else:

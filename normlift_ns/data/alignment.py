@@ -34,11 +34,8 @@ _MIN_VISIBLE = 0.001
 """Fraction of the Gaussians that at least one of the views must see."""
 
 
-class _SmallView(NamedTuple):
-    """A view at no more than 400 pixels, and the divisor of its size."""
-
-    view: View
-    divisor: float
+_SmallView = tuple[View, float]
+"""A view at no more than 400 pixels, and the divisor of its size."""
 
 
 class Alignment(NamedTuple):
@@ -68,10 +65,10 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
     """
     views, settings = _sample_views(scene), settings or RasterSettings()
     render = partial(_render, scene, scene.gaussians.to(device), settings)
-    visible = max(_visible_fraction(scene, small.view.camera) for small in views)
-    psnrs = {small.view.name: _psnr(small.view, render(small, 1.0)) for small in views}
+    visible = max(float(in_frustum(scene.gaussians.means, view.camera).float().mean()) for view, _ in views)
+    psnrs = {small[0].name: _psnr(small[0], render(small, 1.0)) for small in views}
     mean, worst = sum(psnrs.values()) / len(psnrs), min(psnrs, key=lambda name: psnrs[name])
-    constant = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
+    constant = sum(_psnr(view, _mean_color(view)) for view, _ in views) / len(views)
     others = {factor: _mean_psnr(render, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
     best = max(others, key=lambda factor: others[factor])
     focal = best if others[best] > mean + _FOCAL_GAIN else 1.0
@@ -98,29 +95,25 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     Raises:
         ValueError: if Gaussians and cameras are unrelated.
     """
-    causes = (
-        "Likely causes: cameras of another capture; cameras in a different world from the splat's (give "
-        "--world-transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
-        "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
-        "training images; another --rasterize-mode or --background"
+    causes = "Likely causes: " + (
+        "the images, their exposure or transforms.json have changed since the training, or the training was stopped "
+        "early"
+        if trained_cameras
+        else "cameras of another capture; cameras in a different world from the splat's (give --world-transform; for "
+        "gsplat's trainer see --gsplat-normalize); other images, or distorted images with cameras for undistorted "
+        "ones; a different exposure from the training images; much smaller copies of the training images; another "
+        "--rasterize-mode or --background"
     )
-    if trained_cameras:
-        causes = (
-            "Likely causes: the images, their exposure or transforms.json have changed since the training, or the "
-            "training was stopped early"
-        )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            f"The cameras do not look at this splat: at most {match.visible_fraction:.2%} of its Gaussians are in "
-            "any of three "
-            f"training views. {causes}. --check False lifts anyway."
+            f"The cameras do not look at this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
+            f"of three training views. {causes}. --check False lifts anyway."
         )
     if match.psnr < match.mean_color_psnr and not trained_cameras:
         raise InputError(
             f"The splat does not show what its images show: renders from three of the cameras are further from the "
             f"images ({match.psnr:.1f} dB) than their mean color is ({match.mean_color_psnr:.1f} dB). {causes}. "
-            "--check "
-            "False lifts anyway."
+            "--check False lifts anyway."
         )
     if match.focal_factor != 1.0:
         return (
@@ -146,10 +139,10 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
 def _sample_views(scene: Scene) -> list[_SmallView]:
     last = len(scene.train) - 1
     views = [_shrink(scene.train[index]) for index in sorted({0, last // 2, last})]
-    usable = [small for small in views if small.view.mask is None or bool(small.view.mask.any())]
+    usable = [(view, divisor) for view, divisor in views if view.mask is None or bool(view.mask.any())]
     if len(usable) == 0:
         raise InputError(
-            f"The masks of {', '.join(small.view.name for small in views)} leave no pixels. Expected masks that are "
+            f"The masks of {', '.join(view.name for view, _ in views)} leave no pixels. Expected masks that are "
             "zero at pixels to ignore; are they inverted?"
         )
     return usable
@@ -168,27 +161,23 @@ def _shrink(view: View) -> _SmallView:
         coverage = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
         mask = coverage > 0.999
     smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
-    return _SmallView(View(smaller, image.round().to(torch.uint8), mask, view.name), divisor)
+    return View(smaller, image.round().to(torch.uint8), mask, view.name), divisor
 
 
 def _mean_psnr(render: Callable[[_SmallView, float], Tensor], views: Sequence[_SmallView], factor: float) -> float:
-    return sum(_psnr(small.view, render(small, factor)) for small in views) / len(views)
+    return sum(_psnr(small[0], render(small, factor)) for small in views) / len(views)
 
 
 def _render(
     scene: Scene, gaussians: GaussianScene, settings: RasterSettings, small: _SmallView, factor: float
 ) -> UInt8[Tensor, "h w 3"]:
     """Render the scene so that it looks like a downscaled render at full size."""
-    camera = _scale_focal(small.view.camera, factor)
-    as_trained = small.divisor < _MAX_DIVISOR_AS_TRAINED
-    small_settings = replace(settings, eps2d=settings.eps2d / small.divisor**2 if as_trained else _SMALL_EPS2D)
+    view, divisor = small
+    camera = replace(view.camera, K=view.camera.K * torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]]))
+    as_trained = divisor < _MAX_DIVISOR_AS_TRAINED
+    small_settings = replace(settings, eps2d=settings.eps2d / divisor**2 if as_trained else _SMALL_EPS2D)
     mode = scene.rasterize_mode if as_trained else "antialiased"
     return render_image(scene, camera, settings=small_settings, mode=mode, gaussians=gaussians)
-
-
-def _scale_focal(camera: Camera, factor: float) -> Camera:
-    scale = torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
-    return Camera(camera.K * scale, camera.world_to_camera, camera.width, camera.height)
 
 
 def _psnr(view: View, render: UInt8[Tensor, "h w 3"]) -> float:
@@ -202,10 +191,6 @@ def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
     pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
     color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
     return color.round().to(torch.uint8).expand_as(view.image)
-
-
-def _visible_fraction(scene: Scene, camera: Camera) -> float:
-    return float(in_frustum(scene.gaussians.means, camera).float().mean())
 
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:

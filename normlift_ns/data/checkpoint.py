@@ -17,7 +17,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.splat import (
+    GAUSSIAN_PARAMETERS,
+    SplatFile,
+    SplatParameters,
+    splat_from_parameters,
+    validate_splat,
+)
 from normlift_ns.errors import InputError
 
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
@@ -91,7 +97,6 @@ def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[.
 # Safe reading of nerfstudio checkpoints, which runs no code from the file.
 
 
-GAUSSIAN_PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 _PREFIX = "gauss_params."
 _MAX_STEP = 10**9
 
@@ -103,6 +108,8 @@ class Checkpoint(NamedTuple):
     step: int
     model: dict[str, Tensor]
     """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, …, without optimizers and LPIPS."""
+    splat: SplatParameters
+    """The gauss_params."""
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
@@ -111,8 +118,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     Raises:
         FileNotFoundError: if there is no checkpoint, or none of that step; the message lists the steps that exist.
     """
-    steps = {path: _step_of(path) for path in sorted(folder.glob("step-*.ckpt"))}
-    checkpoints = {number: path for path, number in steps.items() if number is not None}
+    found = sorted(folder.glob("step-*.ckpt"))
+    checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
             f"No checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes every "
@@ -160,7 +167,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             "Train the capture with: ns-train splatfacto --data ..."
         )
     splat = splat_from_parameters({name: model[_PREFIX + name] for name in GAUSSIAN_PARAMETERS}, path)
-    return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()})
+    return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()}, splat)
 
 
 def validate_step(step: Any, path: Path) -> int:
@@ -291,9 +298,6 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
 _RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
 _ADVICE = "give another file with --load-gsplat"
 _GSPLAT_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-_UNSUPPORTED = {
-    "app_module": "an appearance network (--app_opt), without which its Gaussians have no colors",
-}
 
 
 def read_gsplat_checkpoint(path: Path) -> SplatFile:
@@ -306,17 +310,13 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]
-    steps = {step for step, _, _ in loaded}
-    if len(steps) > 1:
-        raise InputError(
-            f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
-            "of one training run; put them into a separate folder."
-        )
     splats = [splat_from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
-    if len({splat.degree for splat in splats}) > 1:
+    steps = {step for step, _, _ in loaded}
+    if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
+        steps_named = f"steps: {', '.join(map(str, sorted(steps)))}"
         raise InputError(
-            f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training run; "
-            "put them into a separate folder."
+            f"{files[0].parent} has ranks of different {steps_named if len(steps) > 1 else 'spherical harmonics'}. "
+            "Expected the files of one training run; put them into a separate folder."
         )
     names = splats[0].parameters
     merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
@@ -371,12 +371,12 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
         hint = "; for a nerfstudio run, give its config.yml with --load-config" if "pipeline" in keys else ""
         raise InputError(f"{path} is not a gsplat checkpoint: expected `splats` in it, found {keys}{hint}.")
-    for key, meaning in _UNSUPPORTED.items():
-        if key in loaded:
-            raise InputError(
-                f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
-                "trainer's --save_ply and give that with --load-ply."
-            )
+    if "app_module" in loaded:
+        raise InputError(
+            f"{path} holds `app_module`: an appearance network (--app_opt), without which its Gaussians have no "
+            "colors. Train it again without that option, or export a PLY file with the trainer's --save_ply and give "
+            "that with --load-ply."
+        )
     missing = [name for name in _GSPLAT_NAMES if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
         raise InputError(

@@ -10,23 +10,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from normlift_ns.data.frames import Intrinsics
+from normlift_ns.data.frames import PERSPECTIVE_MODELS, Frame, Intrinsics, find_images, find_masks
+from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
 
-_INTRINSICS = {
-    "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy, {}),
-    "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, {}),
-    "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, {"k1": k}),
-    "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, {"k1": k1, "k2": k2}),
-    "OPENCV": lambda fx, fy, cx, cy, k1, k2, p1, p2: (fx, fy, cx, cy, {"k1": k1, "k2": k2, "p1": p1, "p2": p2}),
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fx fy cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
 }
-"""COLMAP's camera models: functions from their parameters to fx, fy, cx, cy and distortion."""
-_MODEL_SIZES = (
-    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-)  # fmt: skip
-"""Camera models in the order of their IDs in binary files, each with its number of parameters."""
+"""Names of the parameters of COLMAP's camera models, which are in the order of their IDs in binary files."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
 _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
@@ -60,6 +62,11 @@ class ColmapCamera(NamedTuple):
     width: int
     height: int
     params: tuple[float, ...]
+
+    def named_parameters(self) -> dict[str, float]:
+        """Return the parameters by name, with fx and fy for a shared focal length; the model must be a known one."""
+        values = dict(zip(CAMERA_MODELS[self.model].split(), self.params))
+        return {"fx": values["f"], "fy": values.pop("f"), **values} if "f" in values else values
 
 
 class ColmapImage(NamedTuple):
@@ -136,14 +143,14 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
     Raises:
         ValueError: if `normlift_ns` cannot undistort images of this camera model.
     """
-    if camera.model not in _INTRINSICS:
+    if camera.model not in PERSPECTIVE_MODELS:
         raise InputError(
             f"{model}: camera {camera.camera_id} has the model {camera.model}; supported models are "
-            f"{', '.join(_INTRINSICS)}. Undistort the images with: colmap image_undistorter, train the scene on those, "
-            "and give that folder."
+            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images with: colmap image_undistorter, train the scene on "
+            "those, and give that folder."
         )
-    fx, fy, cx, cy, distortion = _INTRINSICS[camera.model](*camera.params)
-    return Intrinsics(fx, fy, cx, cy, camera.width, camera.height, **distortion)
+    parameters: dict[str, Any] = camera.named_parameters()
+    return Intrinsics(width=camera.width, height=camera.height, **parameters)
 
 
 def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
@@ -152,6 +159,35 @@ def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
 
     matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
     return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
+
+
+def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice: str) -> CameraFile:
+    """Read the cameras of a COLMAP project, and locate its images.
+
+    Args:
+        folder: absolute path of the project.
+        images, masks: folders of the images and masks; None: images/ in the project, and no masks.
+        advice: what to do about missing images, for error messages.
+    Raises:
+        FileNotFoundError: if the reconstruction, an image or a mask is missing.
+        ValueError: as in `read_colmap_model` and `colmap_intrinsics`.
+    """
+    model = find_colmap_model(folder)
+    cameras, registered = read_colmap_model(model)
+    registered.sort(key=lambda image: image.name)  # as training tools sort them
+    intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
+    images_dir = (images or folder / "images").absolute()
+    if not images_dir.is_dir():
+        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
+    names = [image.name for image in registered]
+    files = find_images(names, images_dir, model, advice, allow_copies=True)
+    mask_files = [None] * len(files) if masks is None else find_masks(names, masks)
+    base = folder if images_dir.is_relative_to(folder) else images_dir.parent
+    frames = [
+        Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
+        for image, file, mask in zip(registered, files, mask_files)
+    ]
+    return CameraFile(frames, frozenset(), model, folder, base)
 
 
 def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:
@@ -187,7 +223,8 @@ def _read(
         if path.suffix == ".bin":
             data = _ByteReader(path.read_bytes())
             entries = list(parse_binary(data))
-            data.check_end()
+            if data.offset != len(data.data):
+                raise InputError(f"{len(data.data) - data.offset:,} bytes too many")
             return entries
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
         return list(parse_text([line for line in lines if not line.startswith("#")]))
@@ -224,22 +261,18 @@ class _ByteReader:
             raise InputError(f"it declares {number:,} entries, but has {len(self.data):,} bytes")
         return number
 
-    def check_end(self) -> None:
-        if self.offset != len(self.data):
-            raise InputError(f"{len(self.data) - self.offset:,} bytes too many")
-
 
 def _cameras_binary(data: _ByteReader) -> Iterator[ColmapCamera]:
     for _ in range(data.count()):
         camera_id, model_id, width, height = data.unpack("iiQQ")
-        if not 0 <= model_id < len(_MODEL_SIZES):
+        if not 0 <= model_id < len(CAMERA_MODELS):
             raise InputError(f"camera {camera_id} has the unknown model ID {model_id}")
-        name, count = _MODEL_SIZES[model_id]
-        yield ColmapCamera(camera_id, name, width, height, data.unpack(f"{count}d"))
+        name, parameters = list(CAMERA_MODELS.items())[model_id]
+        yield ColmapCamera(camera_id, name, width, height, data.unpack(f"{len(parameters.split())}d"))
 
 
 def _cameras_text(lines: list[str]) -> Iterator[ColmapCamera]:
-    counts = dict(_MODEL_SIZES)
+    counts = {name: len(parameters.split()) for name, parameters in CAMERA_MODELS.items()}
     for line in filter(None, lines):
         camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:

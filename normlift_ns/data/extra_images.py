@@ -10,17 +10,14 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View, Views
-from normlift_ns.data.cameras import CameraFile, read_camera_file
 from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import SplatScene
-from normlift_ns.data.transforms import read_transforms, relative_name
+from normlift_ns.data.open_splat import SplatScene, read_camera_file
+from normlift_ns.data.transforms import CameraFile, read_transforms, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
@@ -136,7 +133,8 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
     """
     old = [frame for frame in extended.frames if _key(frame.name) in known]
     source = np.stack([frame.pose for frame in old]) if len(old) > 0 else np.zeros((0, 3, 4))
-    target = np.array([_opengl_pose(known[_key(frame.name)]).numpy() for frame in old]).reshape(-1, 3, 4)
+    inverses = [torch.linalg.inv(known[_key(frame.name)].world_to_camera.double())[:3].numpy() for frame in old]
+    target = np.array(inverses).reshape(-1, 3, 4) * [1, -1, -1, 1]  # x right, y up, z backward
     centered_source, centered_target = (
         poses[:, :, 3] - poses[:, :, 3].sum(axis=0) / max(1, len(old)) for poses in (source, target)
     )
@@ -163,9 +161,3 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
             "model, no bundle adjustment). Cameras that the training itself optimized have moved too."
         )
     return WorldTransform(np.concatenate([rotation, translation[:, None] / scale], axis=1), scale)
-
-
-def _opengl_pose(camera: Camera) -> Float[Tensor, "3 4"]:
-    """Return a camera-to-world pose with x right, y up, z backward."""
-    pose = torch.linalg.inv(camera.world_to_camera.double())[:3]
-    return pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0])

@@ -128,8 +128,15 @@ _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a rotation from orthonormal, because files round."""
 
 
+PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+"""Camera models that `Intrinsics` covers, by the names that COLMAP and nerfstudio give them."""
+
+
 class Intrinsics(NamedTuple):
-    """Intrinsics, in pixels, of a pinhole camera with OpenCV's distortion k1 k2 p1 p2 k3."""
+    """Intrinsics, in pixels, of a camera with OpenCV's distortion.
+
+    It is k1 k2 p1 p2 k3 of a pinhole camera, or k1 k2 k3 k4 of a fisheye camera.
+    """
 
     fx: float
     fy: float
@@ -142,11 +149,18 @@ class Intrinsics(NamedTuple):
     k3: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    k4: float = 0.0
+    fisheye: bool = False
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float]:
         """k1, k2, k3, p1, p2."""
-        return self[6:]
+        return self[6:11]
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether a distortion parameter is not zero."""
+        return any(self[6:12])
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the intrinsics of the same image at another size."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
-from normlift_ns.data.frames import Frame, Intrinsics, image_warnings, read_image_header
+from normlift_ns.data.frames import Frame, ImageHeader, Intrinsics, check_mask, image_warnings, read_image_header
 from normlift_ns.errors import InputError
 
 
@@ -117,25 +119,117 @@ def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 
     return (alpha * image[:, :, :3] + (1 - alpha) * 255 * background).round().to(torch.uint8)
 
 
-class ImageViews:
-    """Lazy `Views` of images on disk: indexing reads and undistorts one image.
+_NERFSTUDIO_MODES = {"RGB", "RGBA", "L", "CMYK"}
+"""Pillow modes that nerfstudio can train on, CMYK with wrong colors."""
 
-    Undistortion is that of nerfstudio's FullImageDatamanager, with which stock commands see the same images: OpenCV's
-    optimal new camera matrix without black borders, cropped to its region of interest.
+
+def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    return int(size[0] * scale), int(size[1] * scale)
+
+
+@contextmanager
+def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
+    """Open an image, resized by nerfstudio's camera_res_scale_factor."""
+    with Image.open(file) as opened:
+        yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
+
+
+class SplitViews:
+    """Lazy `Views` of V images on disk: indexing reads and undistorts one image.
 
     Args:
-        frames: image files and their cameras.
+        files: the images.
+        names: the image files relative to the dataset.
+        masks: one mask per image, or None for all or some of them.
+        sizes: width and height of the cameras, before undistortion.
+        poses: camera-to-world poses [V, 3, 4] in OpenGL convention: the split's, or those optimized by the training.
         background: RGB in 0..1, blended behind images with an alpha channel.
+        scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
     """
 
-    def __init__(self, frames: Sequence[Frame], background: Float[Tensor, " 3"]) -> None:
-        self.frames = list(frames)
-        """The frames, as the camera file describes them."""
-        self.names = [frame.name for frame in frames]
-        self._background = background
+    _LISTED_IN, _ADVICE, _TRAINED = "the dataset", "give the path of the dataset with --data", "run"
+    """For messages: what lists the images, the alternative to restoring one, and what was trained with them."""
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        names: Sequence[str],
+        masks: Sequence[Path | None] | None,
+        sizes: Sequence[Sequence[int]],
+        poses: Float[Tensor, "v 3 4"],
+        background: Float[Tensor, " 3"],
+        scale: float = 1.0,
+    ) -> None:
+        self.files = list(files)
+        """Absolute paths of the images."""
+        self.names = list(names)
+        """Image files relative to the dataset, with forward slashes."""
+        self._masks, self._sizes, self._poses = masks or [None] * len(self.files), sizes, poses
+        self._background, self._scale = background, scale
+
+    def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
+        """Read an image at the size of the camera; not called in subclasses with their own `_load`."""
+        raise NotImplementedError
+
+    def _lens(self, index: int) -> Intrinsics:
+        """Return the intrinsics of an image; not called in subclasses with their own `_undistort` and `_pinhole`."""
+        raise NotImplementedError
+
+    def _load(self, index: int) -> tuple[Any, Any]:
+        """Read an image [H, W, C] and its mask or None, at the size of the camera."""
+        image, file = self._pixels(self.files[index]), self._masks[index]
+        if file is None:
+            return image, None
+        with open_scaled(file, self._scale, Image.Resampling.NEAREST) as opened:
+            mask = np.array(opened).astype(bool)
+        if mask.shape != image.shape[:2]:
+            raise InputError(
+                f"the mask has shape {mask.shape}, expected {image.shape[:2]}: one channel of the same size as its "
+                "image; save it in grayscale"
+            )
+        return image, mask
+
+    def _check_header(self, index: int, header: ImageHeader) -> None:
+        """Raise if nerfstudio would misread an image, or it or its mask does not have the expected size."""
+        file, mask = self.files[index], self._masks[index]
+        if header.mode not in _NERFSTUDIO_MODES:
+            raise InputError(
+                f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
+                "RGBA or grayscale; convert the images, and train again."
+            )
+        self._check_size(index, header.size if self._scale == 1 else _scaled_size(header.size, self._scale))
+        if mask is not None:
+            check_mask(mask, file, header.size)
+
+    def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
+        """Return image and mask without distortion, and whether they had any."""
+        lens = self._lens(index)
+        values = None if mask is None else torch.from_numpy(_undistort_mask(mask, lens)).bool()
+        return torch.from_numpy(undistort_image(image, lens)[0]), values, lens.is_distorted
+
+    def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
+        """Return intrinsics, width and height of an undistorted image."""
+        return _undistorted_intrinsics(self._lens(index))
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.files)
+
+    def __getitem__(self, index: int) -> View:
+        """Read and undistort one image.
+
+        Raises:
+            IndexError: if there is no such view.
+            FileNotFoundError, ValueError: if a file is missing, cannot be read or differs in size from its camera; the
+                message names it.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"view {index} of {len(self)}")
+        index %= len(self)
+        distorted, distorted_mask = self._read(index)
+        image, mask, was_distorted = self._undistort(index, distorted, distorted_mask)
+        original_size = (distorted.shape[1], distorted.shape[0]) if was_distorted else None
+        image = blend_background(image, self._background)
+        return View(self.cameras[index], image, mask, self.names[index], original_size)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -144,126 +238,171 @@ class ImageViews:
 
     @cached_property
     def _cameras(self) -> list[Camera]:
-        return [_camera(frame) for frame in self.frames]
+        return [self._camera(i) for i in range(len(self))]
+
+    def _camera(self, index: int) -> Camera:
+        try:
+            return to_camera(self._poses[index], *self._pinhole(index))
+        except InputError as error:
+            raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
 
     def check_files(self) -> tuple[str, ...]:
         """Check the headers of all images, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: if an image is missing, not an image, or has more than 8 bits per channel.
+            FileNotFoundError, ValueError: if an image is missing, not an image, or misread; the message names it. For a
+                run of nerfstudio, also if an image or mask does not have the size of its camera or image.
         """
-        files = [frame.file for frame in self.frames]
-        headers = [read_image_header(file) for file in files]
-        for file, header in zip(files, headers):
-            _check_mode(file, header.mode)
-        return image_warnings(files, headers)
+        headers = [read_image_header(file) for file in self.files]
+        for index, header in enumerate(headers):
+            self._check_header(index, header)
+        return image_warnings(self.files, headers)
 
-    def __getitem__(self, index: int) -> View:
-        """Read and undistort one image.
+    def _check_size(self, index: int, size: Sequence[int]) -> None:
+        expected = self._sizes[index]
+        if list(size) != list(expected):
+            raise InputError(
+                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{expected[1]} (width x height). Use the images that the {self._TRAINED} was trained with."
+            )
 
-        Raises:
-            IndexError: if there is no such view.
-            FileNotFoundError, ValueError: if the file is missing, cannot be read or has changed its size.
-        """
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"view {index} of {len(self)}")
-        frame = self.frames[index % len(self)]
-        pixels = torch.from_numpy(undistort_image(_read(frame), frame.intrinsics)[0])
-        image = blend_background(pixels, self._background)
-        size = (frame.intrinsics.width, frame.intrinsics.height) if any(frame.intrinsics.distortion) else None
-        return View(self.cameras[index], image, _mask(frame), frame.name, size)
+    def _read(self, index: int) -> tuple[Any, Any]:
+        """Load an image and its mask, and check their files and size."""
+        try:
+            image, mask = self._load(index)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"{error.filename} is missing, but {self._LISTED_IN} lists it. Put it back, or {self._ADVICE}."
+            ) from error
+        except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
+            mask = self._masks[index]
+            raise InputError(
+                f"{self.files[index]}{'' if mask is None else f' or its mask {mask}'} cannot be read: {error}. "
+                "Expected an 8-bit image; copy it again from the capture."
+            ) from error
+        self._check_size(index, image.shape[1::-1])
+        return image, mask
 
 
-def _camera(frame: Frame) -> Camera:
-    try:
-        return _pinhole(frame)
-    except (InputError, cv2.error) as error:
-        raise InputError(f"The camera of {frame.file} cannot be used: {error}") from error
+class ImageViews(SplitViews):
+    """Lazy `Views` of images on disk: indexing reads and undistorts one image.
+
+    Undistortion is that of nerfstudio's FullImageDatamanager, with which stock commands see the same images: OpenCV's
+    optimal new camera matrix without black borders, cropped to its region of interest.
+
+    Args:
+        frames: image files and their cameras.
+        background: RGB in 0..1, blended behind images with an alpha channel.
+        scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
+    """
+
+    _LISTED_IN, _ADVICE, _TRAINED = "the camera file", "give the folder of the images", "splat"
+
+    def __init__(self, frames: Sequence[Frame], background: Float[Tensor, " 3"]) -> None:
+        self.frames = list(frames)
+        """The frames, as the camera file describes them."""
+        super().__init__(
+            [frame.file for frame in frames],
+            [frame.name for frame in frames],
+            [frame.mask for frame in frames],
+            [(frame.intrinsics.width, frame.intrinsics.height) for frame in frames],
+            torch.from_numpy(np.array([frame.pose for frame in frames])).float(),
+            background,
+        )
+
+    def _lens(self, index: int) -> Intrinsics:
+        return self.frames[index].intrinsics
+
+    def _check_header(self, index: int, header: ImageHeader) -> None:
+        if problem := _mode_problem(header.mode):
+            raise InputError(f"{self.files[index]} cannot be read: {problem}.")
+
+    def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
+        with Image.open(file) as image:
+            if problem := _mode_problem(image.mode):
+                raise InputError(problem)
+            mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
+            return np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
 
 
-def _pinhole(frame: Frame) -> Camera:
-    matrix, width, height = _undistorted_intrinsics(frame.intrinsics)
-    return to_camera(torch.from_numpy(frame.pose).float(), torch.from_numpy(matrix).float(), width, height)
+def _mode_problem(mode: str) -> str | None:
+    if mode[0] not in "IF":
+        return None
+    return (
+        f"its pixel format is {mode}, expected 8 bits per channel; convert the images to those that the splat was "
+        "trained with"
+    )
 
 
 @lru_cache  # images of one camera differ only in their poses
-def _undistorted_intrinsics(intrinsics: Intrinsics) -> tuple[Float[np.ndarray, "3 3"], int, int]:
+def _undistorted_intrinsics(lens: Intrinsics) -> tuple[Float[Tensor, "3 3"], int, int]:
     """Return the camera matrix, width and height of the undistorted image."""
-    if not any(intrinsics.distortion):
-        return _matrix(intrinsics), intrinsics.width, intrinsics.height
-    pixels, matrix = undistort_image(np.empty((intrinsics.height, intrinsics.width, 1), np.uint8), intrinsics)
-    return matrix, pixels.shape[1], pixels.shape[0]
+    if not lens.is_distorted:
+        return torch.from_numpy(_matrix(lens)), lens.width, lens.height
+    image, matrix = undistort_image(np.zeros((lens.height, lens.width, 1), np.uint8), lens)
+    return torch.from_numpy(matrix).float(), image.shape[1], image.shape[0]
 
 
-def _matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
+def _matrix(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
     """Return the camera matrix in nerfstudio's precision, float32."""
-    fx, fy, cx, cy = intrinsics[:4]
+    fx, fy, cx, cy = lens[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
 
 
 def undistort_image(
-    image: UInt8[np.ndarray, "h w c"], intrinsics: Intrinsics
+    image: UInt8[np.ndarray, "h w c"], lens: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "h2 w2 c"], Float[np.ndarray, "3 3"]]:
-    """Undistort an image, and return it with its camera matrix."""
-    matrix = _matrix(intrinsics)
-    if not any(intrinsics.distortion):
-        return image, matrix
-    k1, k2, k3, p1, p2 = (float(np.float32(value)) for value in intrinsics.distortion)
-    coefficients = np.array([k1, k2, p1, p2, k3, 0, 0, 0])
+    """Undistort an image, and return it with its camera matrix.
+
+    Raises:
+        ValueError: if OpenCV cannot undistort it.
+    """
+    if not lens.is_distorted:
+        return image, _matrix(lens)
+    try:
+        pixels, pinhole, (x, y) = _undistorted_fisheye(image, lens) if lens.fisheye else _undistorted(image, lens)
+    except (InputError, cv2.error, ValueError) as error:
+        parameters = [*lens[6:9], lens.k4, lens.p1, lens.p2]
+        raise InputError(f"its distortion {parameters} cannot be undistorted ({error})") from error
+    fx, fy = pinhole[0, 0], pinhole[1, 1]
+    return pixels, np.array([[fx, 0, pinhole[0, 2] - x + 0.5], [0, fy, pinhole[1, 2] - y + 0.5], [0, 0, 1]])
+
+
+def _undistorted(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int]]:
+    """Return an undistorted image, its camera matrix before it was cropped, and the corner of the crop."""
+    if lens.k4 != 0:
+        raise InputError("only k1, k2, k3, p1 and p2 can be undistorted")
+    k1, k2, k3, p1, p2 = (float(np.float32(value)) for value in lens.distortion)
+    coefficients, matrix = np.array([k1, k2, p1, p2, k3, 0, 0, 0]), _matrix(lens)
     matrix[:2, 2] -= 0.5  # OpenCV puts pixel centers at integers
     pinhole, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(matrix, coefficients, image.shape[1::-1], 0)
     if w < 1 or h < 1:
-        raise InputError(f"undistortion with {intrinsics.distortion} leaves no pixel of the image")
+        raise InputError("undistortion leaves no pixel of the image")
     pixels = cv2.undistort(image, matrix, coefficients, None, pinhole)[y : y + h, x : x + w]
-    fx, fy = pinhole[0, 0], pinhole[1, 1]
-    cropped = np.array([[fx, 0, pinhole[0, 2] - x + 0.5], [0, fy, pinhole[1, 2] - y + 0.5], [0, 0, 1]])
-    return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)), cropped
+    return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)), pinhole, (x, y)
 
 
-def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
-    try:
-        with Image.open(frame.file) as image:
-            _check_mode(frame.file, image.mode)
-            mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
-            pixels = np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{frame.file} is missing, but the camera file lists it. Put it back, or give the folder of the images."
-        ) from None
-    except InputError:
-        raise
-    except Exception as error:  # Pillow's readers raise any kind of exception on a damaged file
-        raise InputError(f"{frame.file} cannot be read ({error}). Copy it again from the capture.") from error
-    size, expected = pixels.shape[1::-1], (frame.intrinsics.width, frame.intrinsics.height)
-    if size != expected:
-        raise InputError(
-            f"{frame.file} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x {expected[1]} (width x "
-            "height). Use the images that the splat was trained with."
-        )
-    return pixels
+def _undistorted_fisheye(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int]]:
+    matrix, coefficients, pinhole = _fisheye(lens)
+    size = image.shape[1::-1]
+    maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1)
+    pixels = cv2.remap(image, maps[0], maps[1], interpolation=cv2.INTER_LINEAR)
+    return pixels.reshape(*pixels.shape[:2], -1), np.asarray(pinhole), (0, 0)
 
 
-def _check_mode(file: Path, mode: str) -> None:
-    if mode[0] in "IF":
-        raise InputError(
-            f"{file} cannot be read: its pixel format is {mode}, expected 8 bits per channel. Convert the images to "
-            "those that the splat was trained with."
-        )
+def _fisheye(lens: Intrinsics) -> tuple[Any, Any, Any]:
+    """Return camera matrix, coefficients and pinhole camera matrix, with pixel centers at integers."""
+    matrix, coefficients = _matrix(lens), np.array([*lens[6:9], lens.k4], np.float32)
+    matrix[:2, 2] -= 0.5
+    pinhole = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+        matrix, coefficients, (lens.width, lens.height), np.eye(3), balance=0
+    )
+    return matrix, coefficients, pinhole
 
 
-def _mask(frame: Frame) -> Bool[Tensor, "h w"] | None:
-    if frame.mask is None:
-        return None
-    size = (frame.intrinsics.height, frame.intrinsics.width)
-    try:
-        with Image.open(frame.mask) as image:
-            values = np.array(image)
-    except Exception as error:  # as in _read
-        raise InputError(f"The mask {frame.mask} cannot be read ({error}). Copy it again from the capture.") from error
-    if values.shape != size:
-        raise InputError(
-            f"The mask {frame.mask} of {frame.file} has shape {values.shape}, expected {size}: one channel of the same "
-            "size as its image. Save it in grayscale."
-        )
-    mask = np.where(values != 0, np.uint8(255), np.uint8(0))[:, :, None]
-    return torch.from_numpy(undistort_image(mask, frame.intrinsics)[0][:, :, 0]).bool()
+def _undistort_mask(mask: Bool[np.ndarray, "h w"], lens: Intrinsics) -> UInt8[np.ndarray, "h w"]:
+    values = mask.astype(np.uint8) * np.uint8(255)
+    if not lens.is_distorted or not lens.fisheye:
+        return undistort_image(values[:, :, None], lens)[0][:, :, 0]
+    matrix, coefficients, pinhole = _fisheye(lens)
+    return cv2.fisheye.undistortImage(values, matrix, coefficients, None, pinhole)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -18,17 +17,19 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
-from normlift_ns.data.cameras import CameraFile, read_camera_file
-from normlift_ns.data.checkpoint import (
-    GAUSSIAN_PARAMETERS,
-    find_checkpoint,
-    read_checkpoint,
-)
-from normlift_ns.data.colmap import read_colmap_points
-from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
+from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
+from normlift_ns.data.colmap import read_colmap, read_colmap_points
+from normlift_ns.data.frames import Frame, WorldTransform, check_frames, rescale_intrinsics, transform_frames
 from normlift_ns.data.images import ImageViews, held_out_names
-from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
-from normlift_ns.data.transforms import gsplat_normalization, read_json_file, read_transforms, write_transforms
+from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
+from normlift_ns.data.transforms import (
+    CameraFile,
+    gsplat_normalization,
+    read_json_file,
+    read_transforms,
+    read_world_transform,
+    write_transforms,
+)
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import Background, RasterizeMode, SplatOptions
@@ -37,6 +38,41 @@ from normlift_ns.registry import Registry
 
 BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 _MIN_POINTS, _PARALLEL = 4, 1e-6
+
+
+# Camera files: COLMAP projects and transforms.json.
+
+
+def read_camera_file(options: SplatOptions, advice: str = "give the folder of the images with --images") -> CameraFile:
+    """Read the camera file that the options name, and check that its images exist.
+
+    Args:
+        options: locations of cameras, images and masks.
+        advice: what to do about missing images, for error messages.
+    Raises:
+        FileNotFoundError: if a file, folder, image or mask is missing.
+        ValueError: if the options name no camera file or two, or the file cannot be read.
+    """
+    count = (options.colmap is not None) + (options.transforms is not None)
+    if count != 1:
+        raise InputError(
+            f"A splat needs one camera file, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            "with --colmap, or a transforms.json with --transforms."
+        )
+    for name, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and not folder.is_dir():
+            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give an existing folder.")
+    if options.colmap is None:
+        cameras = read_transforms(
+            Path(options.transforms or "").absolute(), options.images, options.masks, advice=advice
+        )
+    else:
+        cameras = read_colmap(options.colmap.absolute(), options.images, options.masks, advice=advice)
+    check_frames(cameras.frames, cameras.source)
+    return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
+
+
+# Splats with their images.
 
 
 @dataclass(frozen=True)
@@ -118,8 +154,33 @@ def open_splat(
     held_out = _held_out(options, cameras)
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
-    worlds = _candidate_worlds(file, options, cameras)
-    return _first_aligned(partial(_scene, path, options, cameras, file, held_out), worlds, say)
+
+    def scene_in(world: WorldTransform) -> SplatScene:
+        placed = transform_frames(cameras.frames, world)
+        if file.pose_adjust is not None:
+            placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
+        train, rest = _views(placed, held_out if options.views == "train" else frozenset(), options.background)
+        return SplatScene(
+            file.splat,
+            train,
+            rest,
+            cameras.folder.name or "splat",
+            path,
+            file.step,
+            Path("outputs").absolute(),
+            cameras.names_root,
+            {
+                "source_splat": str(path),
+                "source_cameras": str(cameras.source),
+                "source_step": file.step,
+                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+            },
+            options.rasterize_mode or file.rasterize_mode or "classic",
+            options.background,
+            train.check_files(),
+        )
+
+    return _first_aligned(scene_in, _candidate_worlds(file, options, cameras), say)
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
@@ -133,41 +194,13 @@ def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
     return held_out
 
 
-def _scene(
-    path: Path,
-    options: SplatOptions,
-    cameras: CameraFile,
-    file: SplatFile,
-    held_out: frozenset[str],
-    world: WorldTransform,
-) -> SplatScene:
-    """Return the scene with its cameras mapped to a world."""
-    placed = transform_frames(cameras.frames, world)
-    if file.pose_adjust is not None:
-        placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
-    background = BACKGROUND_COLORS[options.background]
-    train = ImageViews([x for x in placed if options.views == "all" or x.name not in held_out], background)
-    rest = ImageViews([x for x in placed if options.views == "train" and x.name in held_out], background)
-    identity = {
-        "source_splat": str(path),
-        "source_cameras": str(cameras.source),
-        "source_step": file.step,
-        "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
-    }
-    return SplatScene(
-        file.splat,
-        train,
-        rest,
-        cameras.folder.name or "splat",
-        path,
-        file.step,
-        Path("outputs").absolute(),
-        cameras.names_root,
-        identity,
-        options.rasterize_mode or file.rasterize_mode or "classic",
-        options.background,
-        train.check_files(),
+def _views(frames: Sequence[Frame], held_out: frozenset[str], background: Background) -> tuple[ImageViews, ImageViews]:
+    """Return the training images and those that were held out."""
+    train, rest = (
+        ImageViews([frame for frame in frames if (frame.name in held_out) == is_rest], BACKGROUND_COLORS[background])
+        for is_rest in (False, True)
     )
+    return train, rest
 
 
 SPLAT_READERS = Registry(
@@ -248,8 +281,9 @@ def _candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFil
     There are several if only the images can tell. A PLY file may come from gsplat's trainer too, so its normalized
     world is the alternative if that of the cameras does not fit.
     """
-    if cameras.to_splat is not None:
-        return [("", cameras.to_splat)]
+    if options.world_transform is not None:
+        world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
+        return [("", world)]
     same = [("", WorldTransform(np.eye(4)[:3], 1.0))]
     if not options.gsplat_normalize or not (file.by_gsplat or options.colmap):
         return same
@@ -377,7 +411,7 @@ def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
         parameters["features_rest"] = torch.zeros(len(scene.splat), 3, 3)
     return {
         "step": scene.step,
-        "pipeline": {f"_model.gauss_params.{name}": parameters[name] for name in GAUSSIAN_PARAMETERS},
+        "pipeline": {f"_model.gauss_params.{name}": tensor for name, tensor in parameters.items()},
     }
 
 
@@ -404,7 +438,6 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     except msgspec.ValidationError as error:
         raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
-    parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
     if data is not None and not data.is_dir():
         raise FileNotFoundError(
             f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
@@ -416,13 +449,9 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         advice="give their folder with --data",
     )
     check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
-    background = BACKGROUND_COLORS[saved.background]
-    train, held_out = (
-        ImageViews([frame for frame in cameras.frames if (frame.name in cameras.held_out) == is_held_out], background)
-        for is_held_out in (False, True)
-    )
+    train, held_out = _views(cameras.frames, cameras.held_out, saved.background)
     return SplatScene(
-        splat_from_parameters(parameters, checkpoint.path),
+        checkpoint.splat,
         train,
         held_out,
         saved.name,

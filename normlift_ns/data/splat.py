@@ -24,6 +24,14 @@ _MAX_MEDIAN_WIDTH = 0.02
 """Largest plausible width of the median Gaussian, as a fraction of the scene. If a file has no negative log scales and
 exceeds it, its scales are linear."""
 
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "features_dc": tuple(f"f_dc_{i}" for i in range(3)),
+    "opacities": ("opacity",),
+    "scales": tuple(f"scale_{i}" for i in range(3)),
+    "quats": tuple(f"rot_{i}" for i in range(4)),
+}
+"""Parameters of fixed size, with the properties of a PLY file that hold their columns."""
 _DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _SAMPLE_SIZE, _BLOCK_ROWS = 2**20, 2**18
 _MIN_LOGITS = 100
@@ -52,7 +60,7 @@ class SplatParameters:
     @property
     def parameters(self) -> dict[str, Tensor]:
         """The tensors by splatfacto's names."""
-        return {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: getattr(self, name) for name in GAUSSIAN_PARAMETERS}
 
     @property
     def degree(self) -> int:
@@ -65,6 +73,9 @@ class SplatParameters:
         return GaussianScene(self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
 
 
+GAUSSIAN_PARAMETERS = tuple(item.name for item in fields(SplatParameters))
+
+
 def validate_splat(splat: SplatParameters, file: Path) -> None:
     """Raise if the Gaussians cannot be drawn.
 
@@ -74,7 +85,10 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     """
     if len(splat) == 0:
         raise InputError(f"{file} holds no Gaussians. Export the scene again.")
-    for name, values in _activated_values(splat):
+    activated = splat.activated  # logits and logarithms themselves may be infinite
+    geometry = {"means": splat.means, "rotations": splat.quats, "scales": activated.scales}
+    colors = (("opacities", activated.opacities), ("colors", splat.features_dc), ("colors", splat.features_rest))
+    for name, values in (*geometry.items(), *colors):
         blocks = values.reshape(len(splat), -1).split(_BLOCK_ROWS)
         invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
         if len(invalid) > 0:
@@ -103,16 +117,6 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
         )
 
 
-def _activated_values(splat: SplatParameters) -> Iterator[tuple[str, Tensor]]:
-    """Yield the values that must be finite; logits and logarithms themselves may be infinite."""
-    yield "means", splat.means
-    yield "rotations", splat.quats
-    yield "scales", splat.activated.scales
-    yield "opacities", splat.activated.opacities
-    yield "colors", splat.features_dc
-    yield "colors", splat.features_rest
-
-
 def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> SplatParameters:
     """Return a float32 splat from a trainer's tensors, after checking their types and shapes.
 
@@ -126,28 +130,22 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
     if parameters["means"].ndim == 2 and n == 0:
         raise InputError(f"{file} holds no Gaussians. Give the file of a training run that kept some.")
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "features_dc": (3,)}
-    for name, shape in shapes.items():
-        value = parameters[name]
-        if tuple(value.shape) != (n, *shape) or value.dtype not in _DTYPES:
+    for name, columns in _COLUMNS.items():
+        value, shape = parameters[name], (n, len(columns))
+        if tuple(value.shape) != shape or value.dtype not in _DTYPES:
             raise InputError(
                 f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
-                f"{(n, *shape)}, one row per Gaussian. Copy the file again, or give that of another training run."
+                f"{shape}, one row per Gaussian. Copy the file again, or give that of another training run."
             )
     rest = parameters["features_rest"]
-    if (
-        rest.ndim != 3
-        or len(rest) != n
-        or rest.shape[2] != 3
-        or rest.shape[1] not in SH_DEGREES
-        or rest.dtype not in _DTYPES
-    ):
+    is_valid = rest.ndim == 3 and rest.shape[::2] == (n, 3) and rest.shape[1] in SH_DEGREES and rest.dtype in _DTYPES
+    if not is_valid:
         raise InputError(
             f"{file}: its spherical harmonics have shape {tuple(rest.shape)} and type {rest.dtype}, expected "
             f"floating-point numbers of shape ({n}, K, 3) with K = {', '.join(map(str, SH_DEGREES))} for degrees "
             f"{', '.join(map(str, SH_DEGREES.values()))}. Copy the file again, or give that of another training run."
         )
-    return SplatParameters(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})
+    return SplatParameters(**{name: parameters[name].detach().float() for name in GAUSSIAN_PARAMETERS})
 
 
 class SplatFile(NamedTuple):
@@ -170,13 +168,6 @@ class SplatFile(NamedTuple):
 _MAX_HEADER_BYTES = 2**20
 _PLY_BLOCK_ROWS = 2**18
 """Number of Gaussians read at a time."""
-_REQUIRED = (
-    *"xyz",
-    *(f"f_dc_{i}" for i in range(3)),
-    "opacity",
-    *(f"scale_{i}" for i in range(3)),
-    *(f"rot_{i}" for i in range(4)),
-)
 _MODES: dict[str, RasterizeMode] = {
     "mip": "antialiased", "antialiased": "antialiased", "classic": "classic", "default": "classic",
 }  # fmt: skip
@@ -234,14 +225,15 @@ def _check_properties(path: Path, vertex: PlyElement) -> None:
         raise InputError(
             f"{path} is a compressed PLY file. Expand it with: splat-transform {path.name} scene.ply, and give that."
         )
-    missing = [name for name in _REQUIRED if name not in names]
+    required = [name for columns in _COLUMNS.values() for name in columns]
+    missing = [name for name in required if name not in names]
     if missing:
         raise InputError(
             f"{path} is not a splat: its {vertex.count:,} vertices lack {', '.join(missing)}. Expected the properties "
             f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
             f"{', '.join([item for item in sorted(names) if not item.startswith('f_rest_')][:16])}. {_advice(missing)}"
         )
-    lists = [item.name for item in vertex.properties if item.name in _REQUIRED and hasattr(item, "len_dtype")]
+    lists = [item.name for item in vertex.properties if item.name in required and hasattr(item, "len_dtype")]
     if lists:
         raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
 
@@ -256,13 +248,10 @@ def check_ply_header(path: Path) -> None:
     with path.open("rb") as file:
         header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0]
     lines = [line.split() for line in header.replace(b"\r", b"\n").split(b"\n")]
+    starts = [i for i, words in enumerate(lines) if words[:1] == [b"element"]]
     declared = 0
-    for i, words in enumerate(lines):
-        if words[:1] != [b"element"]:
-            continue
-        rest = lines[i + 1 :]
-        end = next((j for j, other in enumerate(rest) if other[:1] == [b"element"]), len(rest))
-        properties = sum(other[:1] == [b"property"] for other in rest[:end])
+    for start, end in zip(starts, [*starts[1:], len(lines)]):
+        words, properties = lines[start], sum(other[:1] == [b"property"] for other in lines[start:end])
         count = words[2] if len(words) == 3 else b""
         if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
             raise InputError(
@@ -300,17 +289,10 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
 
 def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParameters:
     n, k = len(table), len(rest) // 3
-    groups = {
-        "means": ["x", "y", "z"],
-        "quats": [f"rot_{i}" for i in range(4)],
-        "scales": [f"scale_{i}" for i in range(3)],
-        "opacities": ["opacity"],
-        "features_dc": [f"f_dc_{i}" for i in range(3)],
-    }
-    columns = {name: torch.empty(n, len(group)) for name, group in groups.items()}
+    columns = {name: torch.empty(n, len(group)) for name, group in _COLUMNS.items()}
     harmonics = torch.empty(n, k, 3)
     for start, rows in _blocks(path, table):
-        for name, group in groups.items():
+        for name, group in _COLUMNS.items():
             for i, column in enumerate(group):
                 columns[name].numpy()[start : start + len(rows), i] = rows[column]
         for i, column in enumerate(rest):  # all of red, then green, then blue

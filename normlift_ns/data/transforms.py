@@ -7,23 +7,32 @@ import json
 import math
 import tokenize
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from normlift_ns.data.frames import Frame, Intrinsics, WorldTransform, find_images, find_masks, read_image_header
+from normlift_ns.data.frames import (
+    PERSPECTIVE_MODELS,
+    Frame,
+    Intrinsics,
+    WorldTransform,
+    find_images,
+    find_masks,
+    read_image_header,
+)
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
 _MAX_VALUE = 1e30
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _MAX_JSON_BYTES = 2**27
 """Largest JSON file that is read; ten thousand frames take a tenth of that."""
 
@@ -68,6 +77,24 @@ class TransformsEntries(CameraEntry, kw_only=True):
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
+
+    @property
+    def lists(self) -> dict[str, list[str] | None]:
+        """The lists of files by split."""
+        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}
+
+    def value(self, frame: FrameEntry, name: str) -> Any:
+        """Return a parameter of a camera. As in nerfstudio, values for all frames take precedence over its own."""
+        shared = getattr(self, name)
+        return getattr(frame, name) if shared is None else shared
+
+    def applied_rows(self, folder: Path) -> list[list[float]] | None:
+        """Return the transform of the poses before they were stored, if any.
+
+        As in nerfstudio, files of an old ns-process-data in a folder imply one without naming it.
+        """
+        is_legacy = self.applied_transform is None and (folder / "colmap/sparse/0").exists()
+        return _LEGACY_FLIP if is_legacy else self.applied_transform
 
 
 def read_json_file(path: Path, expected: str) -> Any:
@@ -118,13 +145,17 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
         names = (frame.file_path, frame.mask_path or "-")
         if any(name.strip() == "" or "\0" in name for name in names):
             raise InputError(f"{path}: the file_path or mask_path {names} is not a valid file name.")
-        rows = frame.transform_matrix
-        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not (np.abs(rows) < _MAX_VALUE).all():
+        if not _is_matrix(frame.transform_matrix):
             raise InputError(
                 f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4 finite numbers. Expected a "
                 "camera-to-world matrix."
             )
     return entries
+
+
+def _is_matrix(rows: list[list[float]], bound: float = _MAX_VALUE) -> bool:
+    """Return whether these are 3 or 4 rows of 4 numbers below a bound."""
+    return len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and bool((np.abs(rows) < bound).all())
 
 
 def _check_numbers(entry: CameraEntry, source: str) -> None:
@@ -138,7 +169,7 @@ def _check_numbers(entry: CameraEntry, source: str) -> None:
         if not 0 < focal < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
     parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
-    for name, value in (*_given(entry, "cx", "cy", *_DISTORTION), *parameters):
+    for name, value in (*_given(entry, "cx", "cy", *DISTORTION), *parameters):
         if not abs(value) < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {value:g}, expected a number that float32 can hold.")
 
@@ -152,20 +183,24 @@ def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:
 
 
 _MIN_DETERMINANT = 1e-6
-_PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
-@dataclass(frozen=True)
-class TransformsFile:
-    """Contents of a transforms.json."""
+class CameraFile(NamedTuple):
+    """Contents of a transforms.json or a COLMAP reconstruction."""
 
     frames: list[Frame]
-    """Frames sorted by file, as in nerfstudio."""
+    """All images, sorted by file, with cameras in the file's world."""
     held_out: frozenset[str]
-    """Names of the frames that the file excludes from the training; most files exclude none."""
-    applied_transform: Float[np.ndarray, "4 4"]
+    """Names of the images that the file excludes from the training; most files exclude none."""
+    source: Path
+    """The file, or the folder of the COLMAP reconstruction."""
+    folder: Path
+    """Folder of the dataset."""
+    names_root: Path
+    """Folder that image names are relative to."""
+    applied_transform: Float[np.ndarray, "4 4"] | None = None
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
-    applied_scale: float
+    applied_scale: float = 1.0
     """Scale of that transform."""
 
 
@@ -176,7 +211,7 @@ def read_transforms(
     *,
     base: Path | None = None,
     advice: str = "give the folder of the images with --images",
-) -> TransformsFile:
+) -> CameraFile:
     """Read the frames of a transforms.json; images are located, but only opened if the file does not give their size.
 
     Args:
@@ -192,18 +227,22 @@ def read_transforms(
     path = path / "transforms.json" if path.is_dir() else path
     entries = read_transforms_entries(path)
     root = path.parent if base is None else base
+    names_root = (root if images is None or base is not None else images.parent).absolute()
     names = [relative_name(Path(frame.file_path), root) for frame in entries.frames]
     files = find_images(names, images or root, path, advice, allow_copies=images is not None)
     if base is None:
-        names = [relative_name(file, (root if images is None else images.parent).absolute()) for file in files]
+        names = [relative_name(file, names_root) for file in files]
     frames = [
         Frame(file, name, np.array(entry.transform_matrix[:3]), _intrinsics(entries, entry, file, path), mask)
         for entry, file, name, mask in zip(entries.frames, files, names, _masks(entries, root, images, masks, path))
     ]
     held_out = _held_out(entries, root, path)
-    return TransformsFile(
+    return CameraFile(
         sorted(frames, key=lambda frame: frame.file),
         frozenset(name for name, is_held_out in zip(names, held_out) if is_held_out),
+        path.absolute(),
+        path.absolute().parent,
+        names_root,
         _applied_transform(entries, path),
         entries.applied_scale,
     )
@@ -211,9 +250,8 @@ def read_transforms(
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
     """Return whether the file excludes each frame from the training. Like nerfstudio, reject lists of other files."""
-    lists = {"train": entries.train_filenames, "val": entries.val_filenames, "test": entries.test_filenames}
     files = [root / frame.file_path for frame in entries.frames]
-    for split, names in lists.items():
+    for split, names in entries.lists.items():
         unknown = [name for name in names or () if root / name not in files]
         if unknown:
             raise InputError(
@@ -264,17 +302,13 @@ def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
 
 
 def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:
-    """Return the intrinsics of a frame. As in nerfstudio, values for all frames take precedence over its own."""
-
-    def value(name: str) -> Any:
-        shared = getattr(entries, name)
-        return getattr(frame, name) if shared is None else shared
-
+    """Return the intrinsics of a frame."""
+    value = partial(entries.value, frame)
     model = value("camera_model") or "OPENCV"
     model = "OPENCV_FISHEYE" if value("is_fisheye") else model
-    if model not in _PERSPECTIVE_MODELS:
+    if model not in PERSPECTIVE_MODELS:
         raise InputError(
-            f"{path}: the camera_model is {model}; supported models are {', '.join(_PERSPECTIVE_MODELS)}. Undistort "
+            f"{path}: the camera_model is {model}; supported models are {', '.join(PERSPECTIVE_MODELS)}. Undistort "
             "the images, train the scene on those, and give their cameras."
         )
     size = (value("w"), value("h"))
@@ -303,10 +337,10 @@ def _focal(focal: float | None, angle: float | None, side: float) -> float | Non
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 
-def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, ...]:
+def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, float, float, float, float]:
     """Return k1, k2, k3, p1, p2: the values for all frames if there are any, otherwise the frame's own."""
-    source = entries if len(_given(entries, *_DISTORTION, "distortion_params")) > 0 else frame
-    values = [getattr(source, name) or 0.0 for name in _DISTORTION]
+    source = entries if len(_given(entries, *DISTORTION, "distortion_params")) > 0 else frame
+    values = [getattr(source, name) or 0.0 for name in DISTORTION]
     if source.distortion_params is not None:
         values = [*source.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values
@@ -319,13 +353,10 @@ def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tu
 
 
 def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarray, "4 4"]:
-    """Return the applied transform. As in nerfstudio, files of an old ns-process-data imply one without naming it."""
-    rows = entries.applied_transform
-    if rows is None and (path.parent / "colmap/sparse/0").exists():
-        rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+    rows = entries.applied_rows(path.parent)
     matrix = np.eye(4)
     if rows is not None:
-        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():
+        if not _is_matrix(rows, math.inf):
             raise InputError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _MIN_DETERMINANT or not 0 < entries.applied_scale < math.inf:
@@ -359,7 +390,7 @@ def _entry(frame: Frame) -> dict[str, Any]:
 
 _TOLERANCE = 1e-3
 """Largest deviation of a matrix from a similarity, because files round."""
-_MAX_ENTRY, _MAX_MATRIX_BYTES = 1e30, 2**16
+_MAX_MATRIX_BYTES = 2**16
 _EXPECTED_DATAPARSER = "the dataparser_transforms.json that ns-train wrote; copy it again from the run"
 _EXPECTED_MATRIX = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
 
@@ -387,8 +418,7 @@ def _to_world(values: Any, path: Path) -> WorldTransform:
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not hold a transform ({error}). Expected {_EXPECTED_DATAPARSER}.") from error
     rows = stored.transform
-    is_valid = len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and (np.abs(rows) < _MAX_ENTRY).all()
-    if not is_valid or not 0 < stored.scale < _MAX_ENTRY:
+    if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
         raise InputError(
             f"{path} does not hold a transform: {len(rows)} rows and scale {stored.scale:g}. Expected 3 rows of 4 "
             f"finite numbers and a positive scale: {_EXPECTED_DATAPARSER}."
@@ -460,7 +490,7 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     Raises:
         ValueError: if the matrix does not consist of a rotation, a scale and a translation.
     """
-    if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_ENTRY).all():
+    if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_VALUE).all():
         raise InputError(
             f"{source} has the shape {matrix.shape}, or its numbers are not finite. Expected {_EXPECTED_MATRIX}."
         )

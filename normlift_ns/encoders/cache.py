@@ -22,7 +22,7 @@ from torch import Tensor
 
 from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, ViewFeatures
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
-from normlift_ns.io.arrays import load_tensors, save_tensors
+from normlift_ns.io.arrays import load_arrays, save_arrays
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 
@@ -260,7 +260,7 @@ def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
 def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool]) -> Tensor | None:
     """Return a cached tensor; None if it is missing, damaged, cached under another key, or not valid."""
     try:
-        tensor = load_tensors(path, key=path.stem).tensors[name] if os.path.isfile(path) else None
+        tensor = load_arrays(path, key=path.stem, framework="pt").arrays[name] if os.path.isfile(path) else None
     except (FileNotFoundError, ValueError, KeyError):
         return None
     return tensor if tensor is not None and is_valid(tensor) else None
@@ -282,6 +282,6 @@ def _are_units(rows: Tensor, count: int) -> bool:
 def _write(path: Path, name: str, tensor: Tensor) -> None:
     """Write a tensor to the cache; raise OSError with advice if that fails."""
     try:
-        save_tensors(path, {name: tensor}, key=path.stem, overwrite=True)
+        save_arrays(path, {name: tensor}, key=path.stem, overwrite=True)
     except OSError as error:
         raise OSError(f"cannot cache 2D {name}: {error}; the next lift reuses the views cached so far") from error

@@ -11,79 +11,90 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 from xxhash import xxh3_128
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file
 
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number allowed in a file."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
-ArrayParts = Iterable[tuple[str, str, Sequence[int], Any]]
-"""Name, type in torch's notation, shape and bytes of each array."""
+_Array = Any
+"""A NumPy array or a tensor."""
 
 
 class ArrayFile(NamedTuple):
     """Content of a file."""
 
-    arrays: dict[str, np.ndarray]
+    arrays: dict[str, _Array]
     metadata: dict[str, str]
     """Metadata, without the digest."""
     digest: str | None
     """None for files of version 0.1."""
 
 
-def content_digest(parts: ArrayParts, metadata: Mapping[str, str], key: str) -> str:
-    """Return the digest of a key, metadata, and the names, types, shapes and values of arrays.
+def array_digest(arrays: Mapping[str, _Array], facts: Mapping[str, str], key: str = "") -> str:
+    """Return the digest of metadata, a key, and the names, types, shapes and values of arrays or tensors.
 
-    Args:
-        parts: the arrays, sorted by name.
-        metadata: metadata.
-        key: cache key, or an empty string.
+    >>> import torch
+    >>> table = {"a": np.eye(2)}
+    >>> array_digest(table, {}) == array_digest({"a": torch.eye(2, dtype=torch.float64)}, {})
+    True
+    >>> array_digest(table, {}) == array_digest(table, {}, "key") or array_digest(table, {}) == array_digest({}, {})
+    False
     """
-    state = xxh3_128(json.dumps([key, sorted(metadata.items())]).encode())
-    for name, dtype, shape, content in parts:
-        state.update(json.dumps([name, dtype, list(shape)]).encode())
-        state.update(content)
+    state = xxh3_128(json.dumps([key, sorted(facts.items())]).encode())
+    for name, array in sorted(arrays.items()):
+        dtype = f"torch.{array.dtype}" if isinstance(array, np.ndarray) else str(array.dtype)
+        state.update(json.dumps([name, dtype, list(array.shape)]).encode())
+        state.update(_bytes(array))
     return f"xxh3_128:{state.hexdigest()}"
 
 
-def array_digest(arrays: Mapping[str, np.ndarray], facts: Mapping[str, str], key: str = "") -> str:
-    """Return the digest of arrays and metadata, which equals `tensors.tensor_digest` of the same content.
+def _bytes(array: _Array) -> memoryview | bytes:
+    if isinstance(array, np.ndarray):
+        return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+    import torch  # noqa: PLC0415 (a query without torch loads this module)
 
-    >>> array_digest({"a": np.eye(2)}, {}) == array_digest({"a": np.eye(2, dtype=np.float32)}, {})
-    False
-    """
-    parts = (
-        (name, f"torch.{array.dtype}", array.shape, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
-        for name, array in sorted(arrays.items())
-    )
-    return content_digest(parts, facts, key)
+    flat = array.detach().cpu().reshape(-1).contiguous()
+    # a single element may have any stride
+    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data if array.numel() > 0 else b""
 
 
 def save_arrays(
     path: Path,
-    arrays: Mapping[str, np.ndarray],
+    arrays: Mapping[str, _Array],
     facts: Mapping[str, str] | None = None,
     *,
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Write a safetensors file and return its digest; see `save_tensors`."""
+    """Write a safetensors file and return its digest, which its metadata also records.
+
+    Args:
+        arrays: NumPy arrays only, or tensors only.
+        facts: further metadata.
+        key: key of the file in a cache; loading with a different key raises an error.
+        overwrite: replace an existing file.
+    Raises:
+        FileExistsError, OSError: as in `atomic_files`.
+    """
+    if all(isinstance(array, np.ndarray) for array in arrays.values()):
+        from safetensors.numpy import save_file  # noqa: PLC0415 (one of the two)
+
+        content: dict[str, Any] = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    else:
+        from safetensors.torch import save_file  # noqa: PLC0415 (as in `_bytes`)
+
+        content = {name: tensor.detach().contiguous().cpu() for name, tensor in arrays.items()}
     metadata = dict(facts or {})
-    content = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = array_digest(content, metadata, key)
     with atomic_file(path, overwrite=overwrite) as draft:
         save_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
@@ -106,13 +117,6 @@ def sort_metadata(path: Path) -> None:
             file.write(ordered)
 
 
-def load_arrays(
-    path: Path, *, key: str = "", legacy_keys: Collection[str] | None = None, remedy: str = "write it again"
-) -> ArrayFile:
-    """Read a file and check its digest; see `tensors.load_tensors`."""
-    return ArrayFile(*read_safetensors(path, "np", array_digest, key, legacy_keys, remedy))
-
-
 def read_metadata(path: Path) -> dict[str, str]:
     """Read the metadata in a file's header without checking the digest, which covers the whole file.
 
@@ -129,22 +133,25 @@ def read_metadata(path: Path) -> dict[str, str]:
         raise InputError(f"{path} is damaged or not a safetensors file ({error})") from error
 
 
-def read_safetensors(
+def load_arrays(
     path: Path,
-    framework: str,
-    digest: Callable[[Any, dict[str, str], str], str],
-    key: str,
-    legacy_keys: Collection[str] | None,
-    remedy: str,
-) -> tuple[dict[str, Any], dict[str, str], str | None]:
-    """Read a file, check its digest, and return its arrays, metadata and digest.
+    *,
+    key: str = "",
+    legacy_keys: Collection[str] | None = None,
+    remedy: str = "write it again",
+    framework: str = "np",
+) -> ArrayFile:
+    """Read a file of `save_arrays` and check its digest.
 
     Args:
-        framework: "np" or "pt", the type of the returned arrays.
-        digest: computes the digest of arrays, metadata and key.
-        key, legacy_keys, remedy: as in `tensors.load_tensors`.
+        key: the key that the file was saved with.
+        legacy_keys: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
+            these keys is read without a check. None: every file must have a digest.
+        remedy: what the error message suggests if the file is missing or damaged.
+        framework: "np" for NumPy arrays, "pt" for tensors.
     Raises:
-        FileNotFoundError, ValueError: as in `tensors.load_tensors`.
+        FileNotFoundError: the file does not exist.
+        ValueError: the digest does not match, or the file is not a safetensors file.
     """
     if path.exists() and not path.is_file():  # reading a pipe would never end
         raise InputError(f"{path} is not a regular file; {remedy}")
@@ -154,7 +161,7 @@ def read_safetensors(
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
         expected = facts.pop(DIGEST_KEY, None)
         has_digest = expected is not None or legacy_keys is None or set(facts) != set(legacy_keys)
-        actual = digest(arrays, facts, key) if has_digest else None
+        actual = array_digest(arrays, facts, key) if has_digest else None
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
@@ -162,13 +169,19 @@ def read_safetensors(
     if actual != expected:
         problem = f"expected {expected}" if expected else "but the file does not record one"
         raise InputError(f"{path} is damaged: its content has digest {actual}, {problem}; {remedy}")
-    return arrays, facts, actual
+    return ArrayFile(arrays, facts, actual)
 
 
 def check_array(
     name: str, array: np.ndarray, dtype: str, shape: Sequence[int], low: float | int, high: float | int = FLOAT32_MAX
 ) -> None:
-    """Raise if the type, shape or value range of an array is not as expected; see `tensors.check_tensor`.
+    """Raise if the type, shape or value range of an array is not as expected.
+
+    Args:
+        name: name of the array, for the error message.
+        low, high: bounds of its values, both inclusive; NaN and infinity are always out of range.
+    Raises:
+        ValueError: the array differs; the message has the actual and the expected properties.
 
     >>> check_array("means", np.zeros((2, 3), np.float32), "float32", (2, 3), 0)
     """
@@ -240,110 +253,3 @@ def _check_npy(file: IO[bytes]) -> None:
     if expected != found:
         lengths = " x ".join(map(str, shape))
         raise InputError(f"{lengths[:80]} {dtype} needs {expected:,} bytes, found {found:,}")
-
-
-class TensorFile(NamedTuple):
-    """Content of a file."""
-
-    tensors: dict[str, Tensor]
-    metadata: dict[str, str]
-    """Metadata, without the digest."""
-    digest: str | None
-    """None for files of version 0.1."""
-
-
-def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
-    """Return the digest of metadata, a key, and the names, types, shapes and values of tensors.
-
-    >>> import torch
-    >>> table = {"a": torch.eye(2)}
-    >>> tensor_digest(table, {}) == tensor_digest({"a": torch.eye(2)}, {})
-    True
-    >>> tensor_digest(table, {}) == tensor_digest(table, {}, "key") or tensor_digest(table, {}) == tensor_digest({}, {})
-    False
-    """
-    parts = ((name, str(x.dtype), x.shape, _bytes(x) if x.numel() > 0 else b"") for name, x in sorted(tensors.items()))
-    return content_digest(parts, facts, key)
-
-
-def _bytes(tensor: Tensor) -> memoryview:
-    import torch  # noqa: PLC0415 (a query without torch loads this module)
-
-    flat = tensor.detach().cpu().reshape(-1).contiguous()
-    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single element may have any stride
-
-
-def save_tensors(
-    path: Path,
-    tensors: Mapping[str, Tensor],
-    facts: Mapping[str, str] | None = None,
-    *,
-    key: str = "",
-    overwrite: bool = False,
-) -> str:
-    """Write a safetensors file and return its digest, which its metadata also records.
-
-    Args:
-        facts: further metadata.
-        key: key of the file in a cache; loading with a different key raises an error.
-        overwrite: replace an existing file.
-    Raises:
-        FileExistsError, OSError: as in `atomic_files`.
-    """
-    from safetensors.torch import save_file as save_tensor_file  # noqa: PLC0415 (as above)
-
-    metadata = dict(facts or {})
-    content = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
-    digest = tensor_digest(content, metadata, key)
-    with atomic_file(path, overwrite=overwrite) as draft:
-        save_tensor_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
-        sort_metadata(draft)
-    return digest
-
-
-def load_tensors(
-    path: Path, *, key: str = "", legacy_keys: Collection[str] | None = None, remedy: str = "write it again"
-) -> TensorFile:
-    """Read a file of `save_tensors` and check its digest.
-
-    Args:
-        key: the key that the file was saved with.
-        legacy_keys: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
-            these keys is read without a check. None: every file must have a digest.
-        remedy: what the error message suggests if the file is missing or damaged.
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the digest does not match, or the file is not a safetensors file.
-    """
-    return TensorFile(*read_safetensors(path, "pt", tensor_digest, key, legacy_keys, remedy))
-
-
-def check_tensor(
-    name: str,
-    tensor: Tensor,
-    dtype: torch.dtype,
-    shape: Sequence[int],
-    low: float | int,
-    high: float | int = FLOAT32_MAX,
-) -> None:
-    """Raise if the type, shape or value range of a tensor is not as expected.
-
-    Args:
-        name: name of the tensor, for the error message.
-        low, high: bounds of its values, both inclusive; NaN and infinity are always out of range.
-    Raises:
-        ValueError: the tensor differs; the message has the actual and the expected properties.
-    """
-    if tensor.dtype != dtype or tuple(tensor.shape) != tuple(shape):
-        raise InputError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
-    least, most = (x.item() for x in _extremes(tensor)) if tensor.numel() > 0 else (low, low)
-    if not low <= least <= most <= high:
-        raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
-
-
-def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the minimum and the maximum."""
-    try:
-        return tensor.aminmax()
-    except RuntimeError:  # torch before 2.2 lacks aminmax for half precision on the CPU
-        return tensor.float().aminmax()

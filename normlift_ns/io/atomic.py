@@ -195,11 +195,7 @@ def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
     draft, journal = temporary / "steps.json", temporary / f"steps{JOURNAL_SUFFIX}"
     text = json.dumps(steps)
     draft.write_text(f"{_signature(temporary, text)}\n{text}", "utf8")
-    descriptor = os.open(draft, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    _fsync(draft, os.O_RDWR)
     os.rename(draft, journal)
     return journal
 
@@ -473,22 +469,23 @@ def _flush(folder: Path) -> None:
             path = os.path.join(parent, name)
             with suppress(OSError):  # a file system without permissions
                 os.chmod(path, mode)
-            descriptor = os.open(path, os.O_RDWR)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            _fsync(path, os.O_RDWR)
         _flush_names(Path(parent))
 
 
 def _flush_names(folder: Path) -> None:
     """Flush the entries of a folder to the disk, if the system supports it."""
     with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        _fsync(folder, os.O_RDONLY)
+
+
+def _fsync(path: str | Path, flags: int) -> None:
+    """Flush a file or a folder, opened with these flags, to the disk."""
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:

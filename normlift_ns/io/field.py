@@ -107,9 +107,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         unlabeled = RowArrays(*(arrays[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
         region_view = arrays["region_view"]
         views, power, excluded = (int(metadata[name]) for name in EVIDENCE_COUNTS)
-        if region_view.ndim != 1 or region_view.dtype != "int32":
-            raise InputError(f"region_view is {region_view.dtype} {region_view.shape}, expected int32, [S]")
-        rows.check("region weights", len(region_view))
+        rows.check("region weights", region_view.size)
         if not (0 <= views <= _MAX_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
             counts = ", ".join(map(str, (views, power, excluded)))
             raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, out of range")
@@ -119,16 +117,13 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
                 f"{len(rows.offsets) - 1} Gaussians have region weights, but {len(unlabeled.offsets) - 1} have weights "
                 "of unlabeled pixels"
             )
-        _check_views(region_view, views)
+        last = views - 1 if region_view.size > 0 else 0
+        check_array("region_view", region_view, "int32", (region_view.size,), 0, last)
+        if bool((region_view[1:] < region_view[:-1]).any()):
+            raise InputError(f"region_view falls, expected rising values in 0..{views - 1}")
         return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); {remedy}") from error
-
-
-def _check_views(region_view: Int32[np.ndarray, " s"], views: int) -> None:
-    low, high = (int(region_view.min()), int(region_view.max())) if region_view.size > 0 else (0, -1)
-    if low < 0 or high >= views or bool((region_view[1:] < region_view[:-1]).any()):
-        raise InputError(f"region_view is in {low}..{high}, expected rising values in 0..{views - 1}")
 
 
 def read_field(folder: Path) -> FieldArrays:

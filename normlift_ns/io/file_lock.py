@@ -57,14 +57,6 @@ class Claim:
         return self.folder / f"{self.key}.{self.number}"
 
 
-class ObservedPulse(NamedTuple):
-    """Latest known heartbeat of a claim."""
-
-    heartbeat: bytes
-    since: float
-    """Time at which this process first read this pulse, in seconds of its own clock."""
-
-
 def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
     """Return the state of every task that was ever claimed, by key.
 
@@ -95,25 +87,6 @@ def is_claimable(state: ClaimState, at_start: ClaimState) -> bool:
     (True, False)
     """
     return state.number == 0 or state.outcome == ABANDONED or (state.outcome is not None and state == at_start)
-
-
-def observe_pulse(before: ObservedPulse | None, pulse: bytes, now: float) -> ObservedPulse:
-    """Return the updated heartbeat record after reading `pulse` at time `now`.
-
-    >>> before = ObservedPulse(b"7", since=10.0)
-    >>> observe_pulse(before, b"7", now=15.0).since, observe_pulse(before, b"8", now=15.0).since
-    (10.0, 15.0)
-    """
-    return before if before is not None and before.heartbeat == pulse else ObservedPulse(pulse, now)
-
-
-def is_dead(seen: ObservedPulse, now: float, patience: float) -> bool:
-    """Return whether a heartbeat has not changed for `patience` seconds.
-
-    >>> is_dead(ObservedPulse(b"7", since=10.0), 69.0, 60.0), is_dead(ObservedPulse(b"7", since=10.0), 70.0, 60.0)
-    (False, True)
-    """
-    return now - seen.since >= patience
 
 
 def read_claim_states(folder: Path) -> dict[str, ClaimState]:
@@ -214,7 +187,7 @@ def iter_claims(
     >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, timeout=60.0))
     (ClaimState(number=1, outcome='done'), [])
     """
-    heartbeats: dict[Claim, ObservedPulse] = {}
+    heartbeats: dict[Claim, tuple[bytes, float]] = {}  # the latest one of each claim, and when it was first read
     while True:
         now, current, waiting, mine = clock(), read_claim_states(folder), False, None
         for key in keys:
@@ -222,8 +195,10 @@ def iter_claims(
             available = is_claimable(state, initial_states.get(key, UNCLAIMED))
             if not available and state.outcome is None:
                 other = Claim(folder, key, state.number)
-                heartbeats[other] = observe_pulse(heartbeats.get(other), read_pulse(other), now)
-                available, waiting = is_dead(heartbeats[other], now, timeout), True
+                pulse = read_pulse(other)
+                if heartbeats.get(other, (None, now))[0] != pulse:
+                    heartbeats[other] = pulse, now
+                available, waiting = now - heartbeats[other][1] >= timeout, True
             if available and (mine := try_claim(folder, key, state.number)) is not None:
                 break
             waiting |= available  # another process claimed it first, and may die
@@ -251,10 +226,9 @@ def append_jsonl(path: Path, line: Any) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    with os.fdopen(descriptor, "wb", buffering=0) as file:
+    with path.open("ab", buffering=0) as file:
         file.write(msgspec.json.encode(line) + b"\n")
-        os.fsync(descriptor)
+        os.fsync(file.fileno())
 
 
 def read_jsonl(folder: Path, kind: type[_Line]) -> list[_Line]:

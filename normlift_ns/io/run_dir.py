@@ -7,15 +7,11 @@ import warnings
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, file_digest, refuse_existing, text_digest
 from normlift_ns.io.manifest import DIGESTED_PATH, MANIFEST_FILE, check_file_digests, read_manifest
-
-if TYPE_CHECKING:
-    pass
-
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""

@@ -21,7 +21,7 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.images import to_camera
-from normlift_ns.data.nerfstudio.config_classes import active_sh_degree
+from normlift_ns.data.nerfstudio.load import active_sh_degree
 from normlift_ns.errors import InputError
 from normlift_ns.exports import TrainedSplat
 from normlift_ns.io.run_dir import FIELD_FOLDER, check_run

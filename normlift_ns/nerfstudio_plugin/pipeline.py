@@ -16,8 +16,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.data.checkpoint import numpy_scalar_globals
-from normlift_ns.data.nerfstudio.config import check_components, check_lift_options
-from normlift_ns.data.nerfstudio.config_file import dataset_in_config
+from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.encoders.base import FeatureSource

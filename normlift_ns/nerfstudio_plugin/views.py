@@ -15,10 +15,11 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
+from normlift_ns.data.images import SplitViews
 from normlift_ns.data.nerfstudio import config as plain
-from normlift_ns.data.nerfstudio.config import dump_config
-from normlift_ns.data.nerfstudio.config_file import locate_run
-from normlift_ns.data.nerfstudio.load import SplitViews, camera_type_error
+from normlift_ns.data.nerfstudio.config import dump_config, locate_run
+from normlift_ns.data.nerfstudio.load import camera_type_error
+from normlift_ns.data.transforms import relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
@@ -67,7 +68,8 @@ class DatasetViews(SplitViews):
 
     Args:
         dataset: a split as made by nerfstudio's datamanager; it is not changed.
-        folder, poses, background: as in `SplitViews`.
+        folder: folder of the dataset, to which `names` are relative.
+        poses, background: as in `SplitViews`.
     """
 
     def __init__(
@@ -80,7 +82,8 @@ class DatasetViews(SplitViews):
         files, masks = dataset.image_filenames, dataset._dataparser_outputs.mask_filenames
         sides = torch.stack([dataset.cameras.width, dataset.cameras.height])
         sizes = sides.reshape(2, -1).T.tolist() if len(files) > 0 else []
-        super().__init__(files, masks, sizes, folder, poses, background, dataset.scale_factor)
+        names = [relative_name(file, folder) for file in files]
+        super().__init__(files, names, masks, sizes, poses, background, dataset.scale_factor)
         self._dataset = dataset
         self._pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}
         """Undistorted cameras by their parameters, which most images share."""

@@ -22,7 +22,7 @@ from normlift_ns import Evidence, SemanticField, lift
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
-from normlift_ns.io.arrays import check_tensor, load_tensors, save_tensors, tensor_digest
+from normlift_ns.io.arrays import array_digest, check_array, load_arrays, save_arrays
 from normlift_ns.io.atomic import text_digest
 from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
 from tests.examples import FACTOR, examples
@@ -76,7 +76,7 @@ def test_a_message_says_what_was_found_expected_and_what_to_type(tmp_path: Path)
     path.write_bytes(flipped(path.read_bytes(), 8 * path.stat().st_size - 1))
     with safe_open(path, "pt") as file:
         written = file.metadata()["digest"]
-    found = tensor_digest(load_file(path), {})
+    found = array_digest(load_file(path), {})
     with pytest.raises(ValueError, match=rf"^{path} .*{found}.*{written}.*ns-normlift --load-config"):
         SemanticField.load(tmp_path)
 
@@ -253,7 +253,11 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
 def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     evidence.save(path)
-    save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).metadata.items() if k != "digest"})
+    save_file(
+        load_file(path),
+        path,
+        metadata={k: v for k, v in load_arrays(path).metadata.items() if k != "digest"},
+    )
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
     with pytest.raises(ValueError, match="does not record one"):
         Evidence.load(path, key="a")
@@ -262,32 +266,33 @@ def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> No
 def test_a_digest_covers_names_types_shapes_numbers_facts_and_key() -> None:
     base, facts = {"a": torch.arange(6.0), "b": torch.ones(2)}, {"f": "1"}
     digests = [
-        tensor_digest(base, facts),
-        tensor_digest(base, facts, "key"),
-        tensor_digest(base, {"f": "2"}),
-        tensor_digest(base, {"g": "1"}),
-        tensor_digest({"a": base["b"], "b": base["a"]}, facts),
-        tensor_digest({**base, "a": base["a"].view(2, 3)}, facts),
-        tensor_digest({**base, "a": base["a"].view(torch.int32)}, facts),
-        tensor_digest({**base, "c": torch.zeros(0)}, facts),
-        tensor_digest({**base, "b": torch.tensor([1.0, 1.0000001])}, facts),
+        array_digest(base, facts),
+        array_digest(base, facts, "key"),
+        array_digest(base, {"f": "2"}),
+        array_digest(base, {"g": "1"}),
+        array_digest({"a": base["b"], "b": base["a"]}, facts),
+        array_digest({**base, "a": base["a"].view(2, 3)}, facts),
+        array_digest({**base, "a": base["a"].view(torch.int32)}, facts),
+        array_digest({**base, "c": torch.zeros(0)}, facts),
+        array_digest({**base, "b": torch.tensor([1.0, 1.0000001])}, facts),
     ]
     assert len(set(digests)) == len(digests)
-    assert tensor_digest(dict(reversed(base.items())), facts) == digests[0]
+    assert array_digest(dict(reversed(base.items())), facts) == digests[0]
     strided = torch.stack([base["a"], base["a"]], dim=1)[:, 0]
-    assert tensor_digest({**base, "a": strided}, facts) == digests[0]
+    assert array_digest({**base, "a": strided}, facts) == digests[0]
 
 
 def test_tensors_of_any_kind_come_back(tmp_path: Path) -> None:
     kinds = (torch.zeros(0, 3), torch.tensor(3.0), torch.ones(2).bfloat16(), torch.tensor([True]), torch.ones(2).half())
     for i, tensor in enumerate(kinds):
-        digest = save_tensors(tmp_path / str(i), {"größe/\n": tensor}, {"fact": "ü"})
-        tensors, facts, found = load_tensors(tmp_path / str(i))
+        digest = save_arrays(tmp_path / str(i), {"größe/\n": tensor}, {"fact": "ü"})
+        tensors, facts, found = load_arrays(tmp_path / str(i), framework="pt")
         assert (facts, found) == ({"fact": "ü"}, digest)
         assert torch.equal(tensors["größe/\n"], tensor)
-        check_tensor("a", tensor, tensor.dtype, tensor.shape, 0, 3)
+        array = tensor.float().numpy()
+        check_array("a", array, "float32", array.shape, 0, 3)
         with pytest.raises(ValueError, match="a is "):
-            check_tensor("a", tensor, tensor.dtype, (*tensor.shape, 1), 0, 3)
+            check_array("a", array, "float32", (*array.shape, 1), 0, 3)
 
 
 def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
@@ -295,9 +300,9 @@ def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
     tensors = {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()}
     facts = {"a": "1\t/", "b": "ü\x7f\\", "c": '"'}
     for i in range(20):  # safetensors alone makes many files of it
-        save_tensors(tmp_path / str(i), tensors, facts)
+        save_arrays(tmp_path / str(i), tensors, facts)
         contents.add((tmp_path / str(i)).read_bytes())
-    assert load_tensors(tmp_path / "0").metadata == facts
+    assert load_arrays(tmp_path / "0").metadata == facts
     assert len(contents) == 1
 
 
@@ -364,7 +369,7 @@ def test_damaged_files(digests: bool, tmp_path: Path) -> None:
 def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "e.safetensors"
     random_evidence(15, VIEWS, 3).save(path)
-    tensors, facts, _ = load_tensors(path)
+    tensors, facts, _ = load_arrays(path, framework="pt")
     views = tensors["region_view"]
     for facts_changed, tensors_changed, message in (
         ({"num_views": "-1"}, {}, "num_views.*-1, 1, 0"),
@@ -377,7 +382,7 @@ def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
         ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
         ({"num_excluded": "15"}, {}, None),
     ):
-        save_tensors(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
+        save_arrays(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
         if message is None:
             assert Evidence.load(path).num_excluded == 15
         else:
@@ -390,7 +395,7 @@ def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
     """With right digests."""
     path = tmp_path / "e.safetensors"
     random_evidence(15, VIEWS, 3).save(path)
-    tensors, facts, _ = load_tensors(path)
+    tensors, facts, _ = load_arrays(path, framework="pt")
 
     @examples(15, suppress_health_check=list(HealthCheck))
     @given(st.data())
@@ -401,7 +406,7 @@ def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
         given = {name: tensor for name, tensor in tensors.items() if name != array}
         if data.draw(st.booleans()):
             given[array] = other[: data.draw(st.integers(0, 4))].clone() if data.draw(st.booleans()) else -other
-        save_tensors(path, given, {**facts, fact: value}, overwrite=True)
+        save_arrays(path, given, {**facts, fact: value}, overwrite=True)
         survives(lambda: Evidence.load(path))
 
     test()

@@ -20,7 +20,7 @@ import pytest
 import torch
 
 from normlift_ns.io import atomic
-from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.atomic import (
     atomic_file,
     atomic_files,
@@ -102,7 +102,7 @@ def test_a_full_disk_names_the_final_file(tmp_path: Path, monkeypatch: pytest.Mo
 
     ways: dict[str, Callable[[Path], Any]] = {
         "a": lambda path: write_text_file(path, "x" * 2000),
-        "b": lambda path: save_tensors(path, {"a": numbers}),
+        "b": lambda path: save_arrays(path, {"a": numbers}),
         "c": with_torch,
         "run/inner/b.txt": folder,
     }
@@ -131,9 +131,9 @@ def test_files_have_the_rights_of_new_files_and_reach_the_disk(tmp_path: Path, m
     monkeypatch.setattr(os, "fsync", lambda number: flushed.append(os.fstat(number).st_ino) or sync(number))
     before = os.umask(0o027)
     try:
-        save_tensors(tmp_path / "a.safetensors", {"a": torch.zeros(1)})
+        save_arrays(tmp_path / "a.safetensors", {"a": torch.zeros(1)})
         with draft_directory(tmp_path / "run") as draft:
-            save_tensors(draft / "b.safetensors", {"a": torch.zeros(1)})
+            save_arrays(draft / "b.safetensors", {"a": torch.zeros(1)})
             flushed.clear()  # of the draft
             assert commit_directory(draft, tmp_path / "run")
             assert {(tmp_path / name).stat().st_ino for name in (".", "run", "run/b.safetensors")} <= set(flushed)

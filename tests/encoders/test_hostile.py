@@ -22,7 +22,7 @@ from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.encoders.open_clip_network import load_open_clip
 from normlift_ns.encoders.text_files import TextEmbeddingFile, write_text_embeddings
-from normlift_ns.io.arrays import load_tensors, read_npy, save_tensors
+from normlift_ns.io.arrays import load_arrays, read_npy, save_arrays
 from normlift_ns.segmentation.checkpoint import load_sam
 from normlift_ns.segmentation.regions import Grid, LabelFiles, read_image
 from tests.encoders.test_regions import grey_png
@@ -201,10 +201,10 @@ def test_cache_entries_that_do_not_fit_are_made_again(tmp_path: Path) -> None:
     for kind, name, tensors in (("regions", "labels", labels), ("features", "features", features)):
         (path,) = (tmp_path / kind).iterdir()
         for wrong in tensors:
-            save_tensors(path, {name: wrong.contiguous()}, key=path.stem, overwrite=True)
+            save_arrays(path, {name: wrong.contiguous()}, key=path.stem, overwrite=True)
             view = source.view(IMAGE, NAME)
             assert torch.equal(view.labels, expected.labels) and torch.equal(view.features, expected.features)
-            assert not torch.equal(load_tensors(path, key=path.stem).tensors[name].float(), wrong.float())
+            assert not torch.equal(load_arrays(path, key=path.stem, framework="pt").arrays[name].float(), wrong.float())
         path.unlink()
         for what in no_files(path):
             if what not in ("a folder", "a pipe"):

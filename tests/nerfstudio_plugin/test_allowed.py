@@ -14,8 +14,13 @@ import pytest
 import yaml
 from hypothesis import strategies as st
 
-from normlift_ns.data.nerfstudio.config import CONFIG_TARGETS, check_config_values, dump_config, read_trainer_config
-from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.data.nerfstudio.config import (
+    CONFIG_TARGETS,
+    check_config_values,
+    dump_config,
+    locate_run,
+    read_trainer_config,
+)
 from normlift_ns.errors import InputError
 from tests.hostile import fuzz
 from tests.nerfstudio_plugin.conftest import read

@@ -8,8 +8,7 @@ from pathlib import Path, PureWindowsPath
 import pytest
 import yaml
 
-from normlift_ns.data.nerfstudio.config import read_trainer_config
-from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.data.nerfstudio.config import locate_run, read_trainer_config
 from tests.nerfstudio_plugin.conftest import opened, read
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given
 from safetensors.torch import save_file
 
 from normlift_ns import InputError
-from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.manifest import read_manifest, write_manifest
 from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.query.text_encoder import encoder_digest
@@ -84,7 +84,7 @@ def store(folder: Path, facts: object, **tensors: torch.Tensor) -> Path:
     """A whole file, with a digest, of what no version of ours would write."""
     given = {"vectors": torch.eye(3)[:1], **tensors}
     text = facts if isinstance(facts, str) else json.dumps(facts)
-    save_tensors(folder / "queries.safetensors", given, {"question": text}, overwrite=True)
+    save_arrays(folder / "queries.safetensors", given, {"question": text}, overwrite=True)
     return folder / "queries.safetensors"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from normlift_ns.cli import evaluate, export, lift, query, view
 from normlift_ns.cli.preflight import check_unused_options
-from normlift_ns.data.nerfstudio.config_file import read_config_paths
+from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.encoders import weights
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig

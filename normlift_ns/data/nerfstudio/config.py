@@ -1,60 +1,268 @@
-"""Safe reading of config.yml: allowed classes, checks of values, and the files of the run."""
+"""Safe reading of a nerfstudio run's config.yml: its YAML, allowed classes, checks of values, and the run's files."""
 
 from __future__ import annotations
 
+import os
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
 from normlift_ns.data.nerfstudio.config_classes import (
+    CLASS_TARGETS,
     CONFIG_CLASS_NAMES,
     CONFIG_CLASSES,
     EventName,
-    FullImageDatamanagerConfig,
     OptimizerConfig,
     SchedulerConfig,
-    SplatfactoModelConfig,
     SupportedDataParserConfig,
-    Target,
     TrainerConfig,
-    intern_target,
-)
-from normlift_ns.data.nerfstudio.config_file import (
-    OBJECT_TAG,
-    RunLocation,
-    compose_config,
-    config_string,
-    describe_yaml_error,
 )
 from normlift_ns.errors import InputError
-from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.options import LiftOptions, RefineConfig, short_repr
+
+# The YAML of a config.yml, and the current paths of its run's files; reading them constructs no objects.
+
+
+OBJECT_TAG = "tag:yaml.org,2002:python/object"
+_MAX_BYTES = 2**18
+"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
+_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+
+
+def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
+    """Raise FileNotFoundError unless the path is that of a file.
+
+    Args:
+        path: path of a config.yml.
+        wrote: command that wrote it, for the message.
+    """
+    if not path.is_file():
+        hint = f"; {path / 'config.yml'} exists, give that path" if (path / "config.yml").is_file() else ""
+        method = "splatfacto" if wrote == "ns-train" else "normlift"
+        raise FileNotFoundError(
+            f"No config at {path}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
+        )
+
+
+def compose_config(path: Path) -> yaml.MappingNode:
+    """Return the YAML of a nerfstudio config, which names a method.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError, ValueError: if the file cannot be read, or is not a nerfstudio config.
+    """
+    check_config_exists(path)
+    size = path.stat().st_size
+    if size > _MAX_BYTES:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it has {size:,} bytes, more than {_MAX_BYTES:,}. {_EXPECTED}"
+        )
+    try:
+        root = yaml.compose(path.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except OSError as error:
+        raise OSError(f"{path} cannot be read: {error.strerror}. {_EXPECTED}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it is not valid YAML ({describe_yaml_error(error)}). {_EXPECTED}"
+        ) from error
+    is_object = isinstance(root, yaml.MappingNode) and root.tag.startswith(f"{OBJECT_TAG}:")
+    if not is_object or config_string(root, "method_name") is None:
+        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
+    return root
+
+
+def describe_yaml_error(error: Exception) -> str:
+    """Summarize a YAML error in one line: problem and line number."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, yaml.MarkedYAMLError):
+        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
+        return f"{error.problem}{line}"
+    return " ".join(str(error).split())
+
+
+def config_string(node: yaml.Node | None, *keys: str) -> str | None:
+    """Return the text at a path of keys in nested mappings; None if there is none."""
+    value = _value(node, *keys)
+    return value.value if isinstance(value, yaml.ScalarNode) else None
+
+
+def _value(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
+    for key in keys:
+        entries = node.value if isinstance(node, yaml.MappingNode) else ()
+        node = next((value for name, value in entries if isinstance(name, yaml.ScalarNode) and name.value == key), None)
+    return node
+
+
+def _stored_path(node: yaml.Node | None, *keys: str) -> Path | None:
+    """Return a path that nerfstudio wrote as a list of its parts."""
+    value = _value(node, *keys)
+    if not isinstance(value, yaml.SequenceNode) or not value.tag.endswith("Path"):
+        return None
+    parts = [part.value for part in value.value if isinstance(part, yaml.ScalarNode)]
+    return Path(*parts) if 0 < len(parts) == len(value.value) else None
+
+
+@dataclass(frozen=True)
+class ConfigPaths:
+    """Names and paths of a trained or lifted run; None if the config does not store them as nerfstudio does."""
+
+    experiment: str | None
+    output_dir: Path | None
+    """Folder that contains the experiment folder."""
+    data: tuple[Path, ...]
+    """Possible paths of the dataset; empty if the config has none."""
+
+
+def read_config_paths(path: Path) -> ConfigPaths:
+    """Read names and paths from a config.yml, in the time that its YAML takes.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as in `compose_config`.
+    """
+    root = compose_config(path)
+    names = [config_string(root, key) for key in ("experiment_name", "method_name", "timestamp")]
+    data = _stored_path(root, "pipeline", "datamanager", "data")
+    data = data or _stored_path(root, "pipeline", "datamanager", "dataparser", "data")
+    configured = _stored_path(root, "output_dir")
+    if configured is None:
+        return ConfigPaths(names[0], None, ())
+    output_dir, root = _folders(_absolute(path).parent, names, configured)
+    return ConfigPaths(names[0], output_dir, () if data is None else tuple(_dataset_candidates(data, output_dir, root)))
+
+
+@dataclass(frozen=True)
+class RunLocation:
+    """Current absolute paths of a run's files."""
+
+    run_dir: Path
+    """Folder of config.yml."""
+    output_dir: Path
+    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
+    root: Path | None
+    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
+    because output_dir is absolute or the run was moved."""
+    data: Path
+    """The dataset: a folder or a .json file."""
+    data_moved: bool
+    """Whether `data` differs from the path in the config, read relative to `root`."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the dataset."""
+        return self.data.parent if self.data.suffix == ".json" else self.data
+
+    def relative_to_root(self, path: Path) -> Path:
+        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
+        return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
+
+
+def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
+    """Locate the files of a run from the path of its config.yml, whatever the current directory.
+
+    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
+    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
+
+    Args:
+        config: contents of config.yml.
+        config_path: path of config.yml.
+        data: current path of the dataset, relative to the current directory; None: the path in the config.
+    Raises:
+        FileNotFoundError: if there is no dataset; the message names every path tried.
+    """
+    run_dir = _absolute(config_path).parent
+    names = (str(config.experiment_name), str(config.method_name), config.timestamp)
+    output_dir, root = _folders(run_dir, names, config.output_dir)
+    if data is not None:
+        if not data.exists():
+            raise FileNotFoundError(
+                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
+                "transforms.json that the run was trained with."
+            )
+        return RunLocation(run_dir, output_dir, root, _absolute(data), data_moved=True)
+    stored = dataset_in_config(config)
+    tried = _dataset_candidates(stored, output_dir, root)
+    for path in tried:
+        if path.exists():
+            moved = root is None or path != _absolute(root / stored)
+            return RunLocation(run_dir, output_dir, root, path, data_moved=moved)
+    raise FileNotFoundError(
+        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
+        "If it was moved, give its path with --data."
+    )
+
+
+def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tuple[Path, Path | None]:
+    """Return the folder above experiment/method/timestamp, and the working directory of the training if it is known.
+
+    Args:
+        run_dir: folder of config.yml.
+        names: experiment, method and timestamp.
+        output_dir: the folder in the config, which is relative to the working directory.
+    """
+    inferred = _strip_tail(run_dir, Path(*filter(None, names))) if all(names) else None
+    if inferred is not None:
+        return inferred, _strip_tail(inferred, Path(os.path.normpath(output_dir)))
+    # a moved run: inside the current directory, whatever its config names
+    is_elsewhere = output_dir.is_absolute() or ".." in output_dir.parts
+    return _absolute(Path("outputs") if is_elsewhere else output_dir), None
+
+
+def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> list[Path]:
+    """Return the possible paths of a dataset: in the working directory of the training, and in the current one."""
+    roots = output_dir.parents if root is None else (root,)
+    return list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
+
+
+def _strip_tail(path: Path, tail: Path) -> Path | None:
+    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
+    count = len(path.parts) - len(tail.parts)
+    return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
+
+
+def dataset_in_config(config: Any) -> Path:
+    """Return the path of the dataset in the config."""
+    datamanager = config.pipeline.datamanager
+    return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))
+
+
+# Construction of the objects in a config.yml, from allowed classes only, and writing them.
+
 
 _NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"
 
 
-def _default_target(cls: type) -> str | None:
-    """Return the class that a configuration class names as its `_target`."""
-    target = {field.name: field for field in fields(cls)}.get("_target")
-    if target is None:
-        return None
-    factory: Any = target.default_factory
-    return factory().name
-
-
-def _target_name(name: str, cls: type) -> str | None:
-    target = _default_target(cls)
-    return name.removesuffix("Config") if target and name.startswith("normlift_ns.plugin.") else target
-
-
-CONFIG_TARGETS: dict[str, str | None] = {name: _target_name(name, cls) for name, cls in CONFIG_CLASSES.items()}
+CONFIG_TARGETS: dict[str, str | None] = {
+    name: name.removesuffix("Config")
+    if name.startswith("normlift_ns.plugin.") and cls in CLASS_TARGETS
+    else CLASS_TARGETS.get(cls)
+    for name, cls in CONFIG_CLASSES.items()
+}
 """Names of the configuration classes, and of the classes that they instantiate."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
+_TARGET = "_target"
+"""Field with the class or function that a configuration class instantiates. It follows from the class, so it is checked
+when a config is read, and added when one is written."""
 _PATHS = {f"pathlib.{name}" for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath", "Path")}
+
+
+@dataclass(frozen=True)
+class _Name:
+    """Name of a class or function in a config, which is neither imported nor called."""
+
+    name: str
 
 
 class ConfigLoader(yaml.SafeLoader):
@@ -93,14 +301,10 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     yield config
     values = loader.construct_mapping(node, deep=True)
     known = {field.name: field for field in fields(cls)}
-    if "_target" in known and target is not None:
-        stored = values.get("_target", Target(target))
-        if stored != Target(target) or not isinstance(stored, Target):
-            stored_name = stored.name.rpartition(".")[2] if isinstance(stored, Target) else type(stored).__name__
-            raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
-        values["_target"] = intern_target(
-            _default_target(cls) or target
-        )  # the current name instead of that of version 0.1
+    stored = values.pop(_TARGET, None if target is None else _Name(target))
+    if target is not None and not (isinstance(stored, _Name) and stored.name == target):
+        stored_name = stored.name.rpartition(".")[2] if isinstance(stored, _Name) else type(stored).__name__
+        raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # translates the field names of version 0.1
         values = dict(vars(config))
@@ -126,7 +330,7 @@ def _construct_call(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
 def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     if name not in _TARGETS:
         raise _error(f"{name} is not part of a configuration", node)
-    return intern_target(name)
+    return _Name(name)
 
 
 def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
@@ -144,16 +348,20 @@ class _ConfigDumper(yaml.Dumper):
 
 
 def _represent_object(dumper: _ConfigDumper, config: Any) -> yaml.Node:
-    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", vars(config))
+    target = CLASS_TARGETS.get(type(config))
+    values = vars(config) if target is None else {_TARGET: _NAMES[target], **vars(config)}
+    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", values)
 
 
 def _represent_event(dumper: _ConfigDumper, event: EventName) -> yaml.Node:
     return dumper.represent_sequence(f"{OBJECT_TAG}/apply:{CONFIG_CLASS_NAMES[EventName]}", [event.value])
 
 
+_NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
+"""One object per name, which a dump references like a single class."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent_event if _cls is EventName else _represent_object)
-_ConfigDumper.add_representer(Target, lambda dumper, target: dumper.represent_scalar(_NAME_TAG + target.name, ""))
+_ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
 
 
 def dump_config(config: Any) -> str:
@@ -170,9 +378,16 @@ _PARTS = {
     "pipeline.datamanager.dataparser": tuple(cls.__name__ for cls in get_args(SupportedDataParserConfig)),
     "pipeline.model": ("SplatfactoModelConfig", "NormLiftModelConfig"),
 }
-_UNCHECKED = ("_target", "vis")
-"""Fields that are not checked here. The loader compares `_target`; `vis` only matters for training, and programs set it
-to values that the flag does not accept."""
+_RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "pipeline.model.sh_degree": (lambda x: 0 <= x <= 4, "0 to 4"),
+    "pipeline.model.sh_degree_interval": (lambda x: x >= 1, "at least 1"),
+    "pipeline.datamanager.camera_res_scale_factor": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
+    "pipeline.datamanager.dataparser.scale_factor": (lambda x: x > 0, "above 0"),
+    "pipeline.datamanager.dataparser.downscale_factor": (lambda x: x is None or 1 <= x <= 2**10, "1 to 1024, or null"),
+    "pipeline.datamanager.dataparser.train_split_fraction": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
+    "pipeline.datamanager.dataparser.eval_interval": (lambda x: x >= 1, "at least 1"),
+}
+"""Ranges of the numbers that a lift depends on, each with its description; not every data parser has all of them."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
 
@@ -187,13 +402,11 @@ def check_config_values(config: Any, path: Path) -> None:
     if type(config) is not TrainerConfig:
         raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")
     check_components(config, path)
-    for name, value, expected in _type_errors(config, TrainerConfig, "", 0):
+    for name, value, expected in chain(
+        _type_errors(config, TrainerConfig, "", 0), _name_errors(config), _range_errors(config)
+    ):
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
-    _check_names(config, path)
     pipeline: Any = config.pipeline
-    for name, value, in_range, expected in _ranges(pipeline.model, pipeline.datamanager):
-        if not in_range:
-            raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     if hasattr(pipeline, "lift"):
         check_lift_options(pipeline.lift, f"{path}: pipeline.lift")
 
@@ -205,14 +418,9 @@ def check_components(config: Any, path: Path) -> None:
         ValueError: if one of them is an instance of another class; the message names both classes.
     """
     for name, classes in _PARTS.items():
-        part: Any = config
-        for step in name.split("."):
-            part = getattr(part, step)
-        cls = type(part)
-        if (
-            cls.__name__ not in classes
-            or CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}") not in CONFIG_TARGETS
-        ):
+        cls = type(attrgetter(name)(config))
+        full_name = CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}")
+        if cls.__name__ not in classes or full_name not in CONFIG_TARGETS:
             raise InputError(
                 f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
                 f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
@@ -222,89 +430,68 @@ def check_components(config: Any, path: Path) -> None:
 
 def _format(value: Any) -> str:
     """Format any value briefly."""
-    if value is None or isinstance(value, str | bool | int | float | Path):
-        try:
-            text = "null" if value is None else repr(str(value) if isinstance(value, Path) else value)
-        except ValueError:  # an integer of thousands of digits
-            text = "a huge number"
-        return text if len(text) <= 60 else f"{text[:60]}…"
-    return f"a {type(value).__name__}"
+    if isinstance(value, str | bool | int | float | Path):
+        return short_repr(str(value) if isinstance(value, Path) else value)
+    return "null" if value is None else f"a {type(value).__name__}"
 
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
     """Yield values that violate their type hints: field name, value, and what was expected."""
+    parts, origin = get_args(hint), get_origin(hint)
     if depth > _MAX_DEPTH:
         yield name, value, "no more than a few levels"
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
-    elif get_origin(hint) in _GENERIC_CHECKS:
-        yield from _GENERIC_CHECKS[get_origin(hint)](value, hint, name, depth)
-    elif is_dataclass(hint):
-        yield from _dataclass_errors(value, hint, name, depth)
-    elif hint in _SCALARS:
-        is_valid, expected = _SCALARS[hint]
-        if not is_valid(value):
-            yield name, value, expected
-    elif isinstance(hint, type) and not isinstance(value, hint):
+    elif origin in (Union, types.UnionType):
+        yield from _union_errors(value, parts, name, depth)
+    elif origin is Literal:
+        if not any(type(value) is type(part) and value == part for part in parts):
+            yield name, value, " or ".join(map(repr, parts))
+    elif not _fits(value, hint):
         yield name, value, _describe(hint)
+    else:
+        for key, item, item_hint in _items(value, hint):
+            yield from _type_errors(item, item_hint, f"{name}{key}".removeprefix("."), depth + 1)
 
 
-def _union_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
+def _union_errors(value: Any, parts: tuple[Any, ...], name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
     classes = [part for part in parts if is_dataclass(part) and type(value) is part]
     errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
     if all(errors):
         yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
 
 
-def _literal_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
-    if not any(type(value) is type(part) and value == part for part in parts):
-        yield name, value, " or ".join(map(repr, parts))
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value matches a type hint, apart from the items in it."""
+    parts, origin = get_args(hint), get_origin(hint)
+    if origin is tuple:
+        return isinstance(value, tuple | list) and (parts[-1] is Ellipsis or len(value) == len(parts))
+    if origin is dict:
+        return isinstance(value, dict) and all(isinstance(key, str) for key in value)
+    return _SCALARS[hint][0](value) if hint in _SCALARS else not isinstance(hint, type) or isinstance(value, hint)
 
 
-def _tuple_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    parts = get_args(hint)
-    is_open = parts[-1] is Ellipsis
-    if not isinstance(value, tuple | list) or not (is_open or len(value) == len(parts)):
-        yield name, value, _describe(hint)
-        return
-    for i, (item, item_hint) in enumerate(zip(value, parts[:1] * len(value) if is_open else parts)):
-        yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
+def _items(value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the items of a value, each with its part of the name and its type hint."""
+    parts, origin = get_args(hint), get_origin(hint)
+    if origin is tuple:
+        hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        yield from ((f"[{i}]", item, item_hint) for i, (item, item_hint) in enumerate(zip(value, hints)))
+    elif origin is dict:
+        yield from ((f".{key[:40]}", item, parts[1]) for key, item in value.items())
+    elif is_dataclass(hint):
+        hints = get_type_hints(type(value))
+        for name in (field.name for field in fields(value)):
+            if name != "vis":  # only matters for training; programs set it to values that the flag does not accept
+                yield f".{name}", getattr(value, name), hints[name]
 
 
-def _dict_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        yield name, value, _describe(hint)
-        return
-    for key, item in value.items():
-        yield from _type_errors(item, get_args(hint)[1], f"{name}.{key[:40]}", depth + 1)
-
-
-def _dataclass_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    if not isinstance(value, hint):
-        yield name, value, _describe(hint)
-        return
-    hints = get_type_hints(type(value))
-    for field in fields(value):
-        if field.name not in _UNCHECKED:
-            full_name = f"{name}.{field.name}" if name else field.name
-            yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
-
-
-_GENERIC_CHECKS: dict[Any, Callable[[Any, Any, str, int], Iterator[tuple[str, Any, str]]]] = {
-    Union: _union_errors,
-    types.UnionType: _union_errors,
-    Literal: _literal_errors,
-    tuple: _tuple_errors,
-    dict: _dict_errors,
-}
-"""Checks of values by the origin of their type hint."""
 _SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     float: (lambda x: type(x) is not bool and isinstance(x, int | float) and abs(x) <= 1e300, "a finite number"),
     int: (lambda x: type(x) is int and abs(x) <= _MAX_INT, "a whole number"),
     str: (lambda x: isinstance(x, str) and "\0" not in x, "text"),
     Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
+    type(None): (lambda x: x is None, "null"),
 }
 """Checks of values by their type hint, each with what it expects."""
 
@@ -319,12 +506,13 @@ def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
 
 
 def _describe(hint: Any) -> str:
-    names = {float: "a number", int: "a whole number", str: "text", Path: "a path", type(None): "null"}
-    return names.get(hint) or getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
+    if hint in _SCALARS:
+        return _SCALARS[hint][1]
+    return getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
 
 
-def _check_names(config: TrainerConfig, path: Path) -> None:
-    """Raise if a name or path would lead out of the run's folders."""
+def _name_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
+    """Yield names and paths that would lead out of the run's folders."""
     for name in ("experiment_name", "method_name", "timestamp"):
         value = getattr(config, name)
         if (
@@ -333,39 +521,20 @@ def _check_names(config: TrainerConfig, path: Path) -> None:
             or {"/", "\\", "\0", "\n"} & set(value)
             or len(value) > 255
         ):
-            raise InputError(f"{path}: {name} is {_format(value)}, expected the name of one folder. {_REMEDY}")
-    relative = {
-        "viewer.relative_log_filename": Path(config.viewer.relative_log_filename),
-        "logging.relative_log_dir": config.logging.relative_log_dir,
-        "relative_model_dir": config.relative_model_dir,
-    }
-    for name, value in relative.items():
+            yield name, value, "the name of one folder"
+    for name in ("viewer.relative_log_filename", "logging.relative_log_dir", "relative_model_dir"):
+        value = Path(attrgetter(name)(config))
         if value.is_absolute() or ".." in value.parts:
-            raise InputError(
-                f"{path}: {name} is {_format(value)}, expected a relative path in the folder of the run. {_REMEDY}"
-            )
+            yield name, value, "a relative path in the folder of the run"
 
 
-def _ranges(
-    model: SplatfactoModelConfig, datamanager: FullImageDatamanagerConfig
-) -> Iterator[tuple[str, Any, bool, str]]:
-    """Yield the numbers that a lift depends on: name, value, whether it is in range, and the range."""
-    yield "pipeline.model.sh_degree", model.sh_degree, 0 <= model.sh_degree <= 4, "0 to 4"
-    interval = model.sh_degree_interval
-    yield "pipeline.model.sh_degree_interval", interval, interval >= 1, "at least 1"
-    scale = datamanager.camera_res_scale_factor
-    yield "pipeline.datamanager.camera_res_scale_factor", scale, 0 < scale <= 1, "above 0 and at most 1"
-    parser: Any = datamanager.dataparser
-    limits = {
-        "scale_factor": (lambda value: value > 0, "above 0"),
-        "downscale_factor": (lambda value: value is None or 1 <= value <= 2**10, "1 to 1024, or null"),
-        "train_split_fraction": (lambda value: 0 < value <= 1, "above 0 and at most 1"),
-        "eval_interval": (lambda value: value >= 1, "at least 1"),
-    }
-    for name, (in_range, expected) in limits.items():
-        value = getattr(parser, name, None)
-        if hasattr(parser, name):
-            yield f"pipeline.datamanager.dataparser.{name}", value, in_range(value), expected
+def _range_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
+    """Yield numbers that a lift depends on and that are out of range."""
+    for name, (in_range, expected) in _RANGES.items():
+        part, _, field = name.rpartition(".")
+        values = vars(attrgetter(part)(config))
+        if field in values and not in_range(values[field]):
+            yield name, values[field], expected
 
 
 def check_lift_options(options: LiftOptions, name: str) -> None:

@@ -1,59 +1,52 @@
-"""Mirrors of the nerfstudio configuration classes that a config.yml may name."""
+"""Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
+
+A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because each
+imports the class that it configures, its `_target`; of that the mirrors know only the name.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-from jaxtyping import Float
+from typing import Any, Literal, TypeVar
 
 from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
 
-if TYPE_CHECKING:
-    from torch import Tensor
+_Class = TypeVar("_Class", bound=type)
+_BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "normlift_ns.nerfstudio_plugin"
+_SCHEDULERS = "nerfstudio.engine.schedulers"
+CONFIG_CLASS_NAMES: dict[type, str] = {}
+"""Name of each class in a config.yml."""
+CLASS_TARGETS: dict[type, str] = {}
+"""Name of the class or function that each class configures, if it has a `_target`."""
 
 
-@dataclass(frozen=True)
-class Target:
-    """Name of a class or function in a config, which is neither imported nor called."""
+def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class]:
+    """Register a class as the mirror of the one of the same name in a module.
 
-    name: str
+    Args:
+        module: module of the original.
+        target: its `_target`, in the same module unless the name has a module of its own.
+    """
 
-    def __deepcopy__(self, memo: object) -> Target:
-        """Return the object itself, as for a class."""
-        return self
+    def register(cls: _Class) -> _Class:
+        CONFIG_CLASS_NAMES[cls] = f"{module}.{cls.__name__}"
+        if target is not None:
+            CLASS_TARGETS[cls] = target if "." in target else f"{module}.{target}"
+        return cls
 
-
-_TARGETS: dict[str, Target] = {}
-"""One object per name, which a dump references like a single class."""
-
-
-def intern_target(name: str) -> Target:
-    """Return the target of this name, always the same object."""
-    return _TARGETS.setdefault(name, Target(name))
+    return register
 
 
-def target_factory(name: str) -> Callable[[], Target]:
-    """Return a default factory for a field that names a target."""
-    return lambda: intern_target(name)
-
-
-# Mirrors of nerfstudio's configuration classes for datasets; see `classes`.
-
-
-_DATA_MODULE = "nerfstudio.data"
+# Mirrors of nerfstudio's configuration classes for datasets.
 
 
 @dataclass
-class NerfstudioDataParserConfig:
-    """Mirror of nerfstudio's NerfstudioDataParserConfig."""
+class PosedDataParserConfig:
+    """Fields that the configs of nerfstudio's data parsers for posed images share."""
 
-    _target: Target = field(
-        default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.nerfstudio_dataparser.Nerfstudio")
-    )
     data: Path = Path()
     scale_factor: float = 1.0
     downscale_factor: int | None = None
@@ -65,30 +58,25 @@ class NerfstudioDataParserConfig:
     train_split_fraction: float = 0.9
     eval_interval: int = 8
     depth_unit_scale_factor: float = 1e-3
+
+
+@_mirror(f"{_DATA}.dataparsers.nerfstudio_dataparser", "Nerfstudio")
+@dataclass
+class NerfstudioDataParserConfig(PosedDataParserConfig):
+    """Mirror of nerfstudio's NerfstudioDataParserConfig."""
+
     mask_color: tuple[float, float, float] | None = None
     load_3D_points: bool = False
 
 
+@_mirror(f"{_DATA}.dataparsers.colmap_dataparser", "ColmapDataParser")
 @dataclass
-class ColmapDataParserConfig:
+class ColmapDataParserConfig(PosedDataParserConfig):
     """Mirror of nerfstudio's ColmapDataParserConfig."""
 
-    _target: Target = field(
-        default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.colmap_dataparser.ColmapDataParser")
-    )
-    data: Path = Path()
-    scale_factor: float = 1.0
-    downscale_factor: int | None = None
     downscale_rounding_mode: Literal["floor", "round", "ceil"] = "floor"
-    scene_scale: float = 1.0
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    auto_scale_poses: bool = True
     assume_colmap_world_coordinate_convention: bool = True
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    train_split_fraction: float = 0.9
-    eval_interval: int = 8
-    depth_unit_scale_factor: float = 1e-3
     images_path: Path = Path("images")
     masks_path: Path | None = None
     depths_path: Path | None = None
@@ -97,11 +85,11 @@ class ColmapDataParserConfig:
     max_2D_matches_per_3D_point: int = 0
 
 
+@_mirror(f"{_DATA}.dataparsers.blender_dataparser", "Blender")
 @dataclass
 class BlenderDataParserConfig:
     """Mirror of nerfstudio's BlenderDataParserConfig."""
 
-    _target: Target = field(default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.blender_dataparser.Blender"))
     data: Path = Path("data/blender/lego")
     scale_factor: float = 1.0
     alpha_color: str | None = "white"
@@ -112,13 +100,11 @@ SupportedDataParserConfig = NerfstudioDataParserConfig | ColmapDataParserConfig 
 """Supported data parsers."""
 
 
+@_mirror(f"{_DATA}.datamanagers.full_images_datamanager", "FullImageDatamanager")
 @dataclass
 class FullImageDatamanagerConfig:
     """Mirror of nerfstudio's FullImageDatamanagerConfig."""
 
-    _target: Target = field(
-        default_factory=target_factory(f"{_DATA_MODULE}.datamanagers.full_images_datamanager.FullImageDatamanager")
-    )
     data: Path | None = None
     masks_on_gpu: bool = False
     images_on_gpu: bool = False
@@ -135,19 +121,20 @@ class FullImageDatamanagerConfig:
     fps_reset_every: int = 100
 
 
-# Mirrors of nerfstudio's configuration classes for optimizers and schedulers; see `classes`.
+# Mirrors of nerfstudio's configuration classes for optimizers and schedulers.
 
 
+@_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
 @dataclass
 class OptimizerConfig:
     """Mirror of nerfstudio's OptimizerConfig."""
 
-    _target: Target = field(default_factory=target_factory("torch.optim.adam.Adam"))
     lr: float = 0.0005
     eps: float = 1e-08
     max_norm: float | None = None
 
 
+@_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
 @dataclass
 class AdamOptimizerConfig(OptimizerConfig):
     """Mirror of nerfstudio's AdamOptimizerConfig."""
@@ -155,36 +142,35 @@ class AdamOptimizerConfig(OptimizerConfig):
     weight_decay: float = 0
 
 
+@_mirror("nerfstudio.engine.optimizers", "torch.optim.radam.RAdam")
 @dataclass
 class RAdamOptimizerConfig(OptimizerConfig):
     """Mirror of nerfstudio's RAdamOptimizerConfig."""
 
-    _target: Target = field(default_factory=target_factory("torch.optim.radam.RAdam"))
     weight_decay: float = 0
 
 
+@_mirror(_SCHEDULERS, "Scheduler")
 @dataclass
 class SchedulerConfig:
     """Mirror of nerfstudio's SchedulerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.Scheduler"))
 
-
+@_mirror(_SCHEDULERS, "MultiStepScheduler")
 @dataclass
 class MultiStepSchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's MultiStepSchedulerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.MultiStepScheduler"))
     max_steps: int = 1000000
     gamma: float = 0.33
     milestones: tuple[int, ...] = (500000, 750000, 900000)
 
 
+@_mirror(_SCHEDULERS, "ExponentialDecayScheduler")
 @dataclass
 class ExponentialDecaySchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's ExponentialDecaySchedulerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.ExponentialDecayScheduler"))
     lr_pre_warmup: float = 1e-8
     lr_final: float | None = None
     warmup_steps: int = 0
@@ -192,25 +178,20 @@ class ExponentialDecaySchedulerConfig(SchedulerConfig):
     ramp: Literal["linear", "cosine"] = "cosine"
 
 
+@_mirror(_SCHEDULERS, "CosineDecayScheduler")
 @dataclass
 class CosineDecaySchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's CosineDecaySchedulerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.CosineDecayScheduler"))
     warm_up_end: int = 5000
     learning_rate_alpha: float = 0.05
     max_steps: int = 300000
 
 
-# Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
-#
-# A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because
-# each imports the class that it configures; the mirrors keep only the name of that class, as `_target`.
+# Mirrors of nerfstudio's configuration classes for models, pipelines and the trainer.
 
 
-_BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "normlift_ns.nerfstudio_plugin"
-
-
+@_mirror("nerfstudio.utils.writer")
 class EventName(Enum):
     """Quantities that nerfstudio prints during training."""
 
@@ -223,6 +204,7 @@ class EventName(Enum):
     CURR_TEST_PSNR = "Test PSNR"
 
 
+@_mirror(_BASE)
 @dataclass
 class MachineConfig:
     """Mirror of nerfstudio's MachineConfig."""
@@ -235,11 +217,11 @@ class MachineConfig:
     device_type: Literal["cpu", "cuda", "mps"] = "cuda"
 
 
+@_mirror(_BASE, "nerfstudio.utils.writer.LocalWriter")
 @dataclass
 class LocalWriterConfig:
     """Mirror of nerfstudio's LocalWriterConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.utils.writer.LocalWriter"))
     enable: bool = False
     stats_to_track: tuple[EventName, ...] = (
         EventName.ITER_TRAIN_TIME,
@@ -252,6 +234,7 @@ class LocalWriterConfig:
     max_log_size: int = 10
 
 
+@_mirror(_BASE)
 @dataclass
 class LoggingConfig:
     """Mirror of nerfstudio's LoggingConfig."""
@@ -263,6 +246,7 @@ class LoggingConfig:
     profiler: Literal["none", "basic", "pytorch"] = "basic"
 
 
+@_mirror(_BASE)
 @dataclass
 class ViewerConfig:
     """Mirror of nerfstudio's ViewerConfig."""
@@ -281,11 +265,11 @@ class ViewerConfig:
     default_composite_depth: bool = True
 
 
+@_mirror("nerfstudio.cameras.camera_optimizers", "CameraOptimizer")
 @dataclass
 class CameraOptimizerConfig:
     """Mirror of nerfstudio's CameraOptimizerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.cameras.camera_optimizers.CameraOptimizer"))
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
     trans_l2_penalty: float = 1e-2
     rot_l2_penalty: float = 1e-3
@@ -293,11 +277,11 @@ class CameraOptimizerConfig:
     scheduler: SchedulerConfig | None = None
 
 
+@_mirror("nerfstudio.models.splatfacto", "SplatfactoModel")
 @dataclass
 class SplatfactoModelConfig:
     """Mirror of nerfstudio's SplatfactoModelConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.models.splatfacto.SplatfactoModel"))
     enable_collider: bool = True
     collider_params: dict[str, float] | None = field(default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0})
     loss_coefficients: dict[str, float] = field(default_factory=lambda: {"rgb_loss_coarse": 1.0, "rgb_loss_fine": 1.0})
@@ -335,44 +319,38 @@ class SplatfactoModelConfig:
     color_corrected_metrics: bool = False
 
 
+@_mirror(f"{_OURS}.model", "NormLiftModel")
 @dataclass
 class NormLiftModelConfig(SplatfactoModelConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
 
-    _target: Target = field(default_factory=target_factory(f"{_OURS}.model.NormLiftModel"))
     semantics: Path | None = None
 
-    @staticmethod
-    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
-        """Return a config of the same model with a semantic field; all fields of the config are copied."""
-        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
-        return NormLiftModelConfig(**values, semantics=semantics)
 
-
+@_mirror("nerfstudio.pipelines.base_pipeline", "VanillaPipeline")
 @dataclass
 class VanillaPipelineConfig:
     """Mirror of nerfstudio's VanillaPipelineConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.pipelines.base_pipeline.VanillaPipeline"))
     datamanager: FullImageDatamanagerConfig = field(default_factory=FullImageDatamanagerConfig)
     model: SplatfactoModelConfig = field(default_factory=SplatfactoModelConfig)
 
 
+@_mirror(f"{_OURS}.pipeline", "NormLiftPipeline")
 @dataclass
 class NormLiftPipelineConfig(VanillaPipelineConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.pipeline.NormLiftPipelineConfig`."""
 
-    _target: Target = field(default_factory=target_factory(f"{_OURS}.pipeline.NormLiftPipeline"))
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
     queries: tuple[str, ...] = ()
 
 
+@_mirror("nerfstudio.engine.trainer", "Trainer")
 @dataclass
 class TrainerConfig:
     """Mirror of nerfstudio's TrainerConfig."""
 
-    _target: Target = field(default_factory=target_factory("nerfstudio.engine.trainer.Trainer"))
     output_dir: Path = Path("outputs")
     method_name: str | None = None
     experiment_name: str | None = None
@@ -407,31 +385,6 @@ class TrainerConfig:
     start_paused: bool = False
 
 
-CONFIG_CLASS_NAMES: dict[type, str] = {
-    TrainerConfig: "nerfstudio.engine.trainer.TrainerConfig",
-    MachineConfig: f"{_BASE}.MachineConfig",
-    LoggingConfig: f"{_BASE}.LoggingConfig",
-    LocalWriterConfig: f"{_BASE}.LocalWriterConfig",
-    ViewerConfig: f"{_BASE}.ViewerConfig",
-    VanillaPipelineConfig: "nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig",
-    FullImageDatamanagerConfig: f"{_DATA}.datamanagers.full_images_datamanager.FullImageDatamanagerConfig",
-    NerfstudioDataParserConfig: f"{_DATA}.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig",
-    ColmapDataParserConfig: f"{_DATA}.dataparsers.colmap_dataparser.ColmapDataParserConfig",
-    BlenderDataParserConfig: f"{_DATA}.dataparsers.blender_dataparser.BlenderDataParserConfig",
-    SplatfactoModelConfig: "nerfstudio.models.splatfacto.SplatfactoModelConfig",
-    CameraOptimizerConfig: "nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig",
-    OptimizerConfig: "nerfstudio.engine.optimizers.OptimizerConfig",
-    AdamOptimizerConfig: "nerfstudio.engine.optimizers.AdamOptimizerConfig",
-    RAdamOptimizerConfig: "nerfstudio.engine.optimizers.RAdamOptimizerConfig",
-    SchedulerConfig: "nerfstudio.engine.schedulers.SchedulerConfig",
-    ExponentialDecaySchedulerConfig: "nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig",
-    CosineDecaySchedulerConfig: "nerfstudio.engine.schedulers.CosineDecaySchedulerConfig",
-    MultiStepSchedulerConfig: "nerfstudio.engine.schedulers.MultiStepSchedulerConfig",
-    NormLiftModelConfig: f"{_OURS}.model.NormLiftModelConfig",
-    NormLiftPipelineConfig: f"{_OURS}.pipeline.NormLiftPipelineConfig",
-    EventName: "nerfstudio.utils.writer.EventName",
-}
-"""Name of each class in a config.yml."""
 CONFIG_CLASSES: dict[str, type] = {
     **{
         name: cls
@@ -450,32 +403,8 @@ CONFIG_CLASSES: dict[str, type] = {
 """Classes that a config.yml may contain, by name."""
 
 
-# Background color and spherical harmonics degree of splatfacto renders.
-
-
 NAMED_COLORS = {
     "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
 }  # fmt: skip
 """nerfstudio's named colors, RGB in 0..1."""
-ASSUMED_STEP = 30000
-"""Step that splatfacto assumes for a loaded checkpoint, whatever its actual step."""
-_VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-
-
-def background_color(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
-    """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
-    import torch  # noqa: PLC0415 (commands read configs before they load torch)
-
-    name = config.background_color
-    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(NAMED_COLORS[name])
-
-
-def active_sh_degree(config: Any, step: int) -> int | None:
-    """Return the degree of the spherical harmonics at a training step; None: colors do not depend on the view.
-
-    Args:
-        config: splatfacto's model config, nerfstudio's own or its mirror.
-        step: training step.
-    """
-    return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None

@@ -1,82 +1,359 @@
-"""Datasets of trained runs: validation, and cameras as the data parsers of nerfstudio compute them.
+"""Datasets of trained runs: validation, and cameras, poses and splits as the data parsers of nerfstudio compute them.
 
-If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts all
-numbers in the files. These checks raise errors with advice instead.
+All steps are nerfstudio's own, in float32, so the cameras are bit-identical.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from normlift_ns.data.colmap import ColmapCamera, ColmapImage, read_colmap_model
-from normlift_ns.data.frames import read_image_header
-from normlift_ns.data.nerfstudio.cameras import (
-    DatasetSplit,
-    ParsedDataset,
-    compose_applied_transform,
-    normalize_poses,
-    split_by_lists,
-    split_by_mode,
-)
+from normlift_ns.data.frames import PERSPECTIVE_MODELS, read_image_header
 from normlift_ns.data.nerfstudio.config_classes import (
     NAMED_COLORS,
     BlenderDataParserConfig,
     ColmapDataParserConfig,
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
-    SupportedDataParserConfig,
+    PosedDataParserConfig,
 )
-from normlift_ns.data.transforms import CameraEntry, FrameEntry, TransformsEntries, read_transforms_entries
+from normlift_ns.data.transforms import DISTORTION, FrameEntry, TransformsEntries, read_transforms_entries
 from normlift_ns.errors import InputError
+
+_PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
+
+
+def normalize_poses(
+    rows: Any, parser: PosedDataParserConfig, orientation: str
+) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"], float]:
+    """Return poses in the scene's world, the transform to that world, and its scale.
+
+    Args:
+        rows: 4 x 4 camera-to-world matrices in the dataset's world.
+        parser: config of the data parser.
+        orientation: nerfstudio's orientation method.
+    Raises:
+        ValueError: if poses are not 4 x 4 matrices, or nerfstudio does not have the orientation method.
+    """
+    poses = torch.from_numpy(np.array(rows).astype(np.float32))
+    if poses.shape[1:] != (4, 4):
+        raise InputError(f"a pose has {poses.shape[1]} rows, expected 4")
+    poses, transform = _orient_and_center(poses, orientation, parser.center_method)
+    scale = 1.0
+    if parser.auto_scale_poses:
+        scale /= float(torch.max(torch.abs(poses[:, :3, 3])))
+    scale *= parser.scale_factor
+    poses[:, :3, 3] *= scale
+    return poses, transform, scale
+
+
+def compose_applied_transform(
+    transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
+) -> Float[Tensor, "3 4"]:
+    """Return the transform from the capture's original world if its poses were transformed before they were stored."""
+    if applied is None:
+        return transform
+    rows = torch.cat([torch.tensor(applied, dtype=transform.dtype), torch.tensor([[0.0, 0.0, 0.0, 1.0]])], 0)
+    return transform @ rows
+
+
+def _orient_and_center(
+    poses: Float[Tensor, "v 4 4"], method: str, center: str
+) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"]]:
+    """Orient and center poses like nerfstudio's `auto_orient_and_center_poses`.
+
+    Returns:
+        The poses in the scene's world before scaling, and the transform to that world.
+    Raises:
+        ValueError: if nerfstudio does not have the orientation method.
+    """
+    origins = poses[..., :3, 3]
+    mean = torch.mean(origins, dim=0)
+    translation = {
+        "poses": lambda: mean,
+        "focus": lambda: _focus_point(poses, mean),
+        "none": lambda: torch.zeros_like(mean),
+    }[center]()
+    if method == "pca":
+        return _orient_by_pca(poses, origins - mean, translation)
+    if method in ("up", "vertical"):
+        rotation = _rotation_between(_up_direction(poses, vertical=method == "vertical"), torch.tensor([0.0, 0.0, 1.0]))
+        transform = torch.cat([rotation, rotation @ -translation[..., None]], dim=-1)
+    elif method == "none":
+        transform = torch.eye(4)
+        transform[:3, 3] = -translation
+        transform = transform[:3, :]
+    else:
+        raise InputError(f"unknown orientation method {method!r}")
+    return transform @ poses, transform
+
+
+def _orient_by_pca(
+    poses: Float[Tensor, "v 4 4"], offsets: Float[Tensor, "v 3"], translation: Float[Tensor, " 3"]
+) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"]]:
+    _, axes = torch.linalg.eigh(offsets.T @ offsets)
+    axes = torch.flip(axes, dims=(-1,))
+    if torch.linalg.det(axes) < 0:
+        axes[:, 2] = -axes[:, 2]
+    transform = torch.cat([axes, axes @ -translation[..., None]], dim=-1)
+    oriented = transform @ poses
+    if oriented.mean(dim=0)[2, 1] < 0:
+        oriented[1:3, :] = -1 * oriented[1:3, :]  # flips the second and third pose, as nerfstudio does
+        transform[1:3, :] = -1 * transform[1:3, :]
+    return oriented, transform
+
+
+def _up_direction(poses: Float[Tensor, "v 4 4"], *, vertical: bool) -> Float[Tensor, " 3"]:
+    up = torch.mean(poses[:, :3, 1], dim=0)
+    up = up / torch.linalg.norm(up)
+    if not vertical:
+        return up
+    _, sizes, directions = torch.linalg.svd(poses[:, :3, 0], full_matrices=False)
+    if sizes[1] > _MIN_TILT * math.sqrt(poses.shape[0]):
+        direction = directions[2, :]
+        return direction if torch.dot(direction, up) > 0 else -direction
+    up = up - directions[0, :] * torch.dot(up, directions[0, :])
+    return up / torch.linalg.norm(up)
+
+
+def _rotation_between(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
+    """Return the rotation from one direction to another."""
+    a = a / torch.linalg.norm(a)
+    b = b / torch.linalg.norm(b)
+    axis = torch.linalg.cross(a, b)
+    if torch.sum(torch.abs(axis)) < _PARALLEL_TOLERANCE:
+        other = torch.tensor([1.0, 0, 0]) if abs(a[0]) < _PARALLEL_TOLERANCE else torch.tensor([0, 1.0, 0])
+        axis = torch.linalg.cross(a, other)
+    skew = _skew(axis / torch.linalg.norm(axis))
+    angle = torch.acos(torch.clip(torch.dot(a, b), -1, 1))
+    return torch.eye(3) + torch.sin(angle) * skew + (1 - torch.cos(angle)) * (skew @ skew)
+
+
+def _skew(axis: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
+    """Return the matrix of the cross product with a vector."""
+    x, y, z = axis
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _focus_point(poses: Float[Tensor, "v 4 4"], focus: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    """Return the point closest to the optical axes of all cameras that have it in front of them."""
+    directions, origins = -poses[:, :3, 2:3], poses[:, :3, 3:4]
+    active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
+    converged = False
+    while torch.sum(active.int()) > 1 and not converged:
+        directions, origins = directions[active], origins[active]
+        across = torch.eye(3) - directions * torch.transpose(directions, -2, -1)
+        squares = torch.transpose(across, -2, -1) @ across
+        focus = torch.linalg.inv(squares.mean(0)) @ (squares @ origins).mean(0)[:, 0]
+        active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
+        converged = bool(active.all())
+    return focus
+
+
+def apply_pose_adjustments(
+    poses: Float[Tensor, "v 3 4"], moves: Float[Tensor, "v 6"], mode: str
+) -> Float[Tensor, "v 3 4"]:
+    """Return the poses after the camera optimizer's adjustments, in mode SO3xR3 or SE3."""
+    exponential = _exp_so3xr3 if mode == "SO3xR3" else _exp_se3
+    optimized = []
+    for pose, move in zip(poses[:, None], moves.float()[:, None]):  # one by one, as in nerfstudio, for equal rounding
+        change = exponential(move)
+        rotation = torch.bmm(change[..., :3, :3], pose[..., :3, :3])
+        optimized.append(torch.cat([rotation, pose[..., :3, 3:] + change[..., :3, 3:]], dim=-1))
+    return torch.cat(optimized)
+
+
+def _exp_so3xr3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
+    axis_angle = move[:, 3:]
+    angle = torch.clamp((axis_angle * axis_angle).sum(1), 1e-4).sqrt()
+    inverse = 1.0 / angle
+    first, second = inverse * angle.sin(), inverse * inverse * (1.0 - angle.cos())
+    skew = _skew(axis_angle[0])[None]
+    transform = torch.zeros(1, 3, 4)
+    transform[:, :3, :3] = (
+        first[:, None, None] * skew + second[:, None, None] * torch.bmm(skew, skew) + torch.eye(3)[None]
+    )
+    transform[:, :3, 3] = move[:, :3]
+    return transform
+
+
+def _exp_se3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
+    translation, axis_angle = move[:, :3].view(-1, 3, 1), move[:, 3:].view(-1, 3, 1)
+    angle = torch.linalg.norm(axis_angle, dim=1).unsqueeze(1)
+    square = angle**2
+    small, ones = angle < 1e-2, torch.ones(1)
+    angle_1, square_1, cube_1 = (torch.where(small, ones, value) for value in (angle, square, angle**3))
+    sine = angle.sin()
+    cosine = torch.where(small, 8 / (4 + square) - 1, angle.cos())
+    sin_ratio = torch.where(small, 0.5 * cosine + 0.5, sine / angle_1)
+    cos_ratio = torch.where(small, 0.5 * sin_ratio, (1 - cosine) / square_1)
+    transform = torch.zeros(1, 3, 4)
+    transform[:, :3, :3] = cos_ratio * axis_angle @ axis_angle.transpose(1, 2)
+    for i in range(3):
+        transform[:, i, i] += cosine.view(-1)
+    scaled_axis = sin_ratio.view(-1, 1) * axis_angle.view(-1, 3)
+    for i, j, k in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
+        transform[:, i, j] -= scaled_axis[:, k]
+        transform[:, j, i] += scaled_axis[:, k]
+    sin_ratio = torch.where(small, 1 - square / 6, sin_ratio)
+    cos_ratio = torch.where(small, 0.5 - square / 24, cos_ratio)
+    cubic_ratio = torch.where(small, 1.0 / 6 - square / 120, (angle - sine) / cube_1)
+    transform[:, :, 3:] = sin_ratio * translation
+    transform[:, :, 3:] += cos_ratio * torch.cross(axis_angle, translation, dim=1)
+    transform[:, :, 3:] += cubic_ratio * (axis_angle @ (axis_angle.transpose(1, 2) @ translation))
+    return transform
+
+
+# Dataset splits: images and cameras for training and evaluation.
+
+
+@dataclass(frozen=True)
+class DatasetSplit:
+    """One split of a dataset: V image files and their cameras, before undistortion."""
+
+    files: list[Path]
+    masks: list[Path] | None
+    camera_type: str
+    """PERSPECTIVE, FISHEYE or another of nerfstudio's camera types."""
+    poses: Float[Tensor, "v 3 4"]
+    intrinsics: Float[Tensor, "v 4"]
+    """fx, fy, cx, cy."""
+    sizes: Int64[Tensor, "v 2"]
+    """Width, height."""
+    distortion: Float[Tensor, "v k"] | None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def select(self, indices: Int[np.ndarray, " m"]) -> DatasetSplit:
+        """Return the images and cameras at these indices."""
+        rows = torch.tensor(indices, dtype=torch.long)
+        return replace(
+            self,
+            files=[self.files[i] for i in indices],
+            masks=None if self.masks is None else [self.masks[i] for i in indices],
+            poses=self.poses[rows],
+            intrinsics=self.intrinsics[rows],
+            sizes=self.sizes[rows],
+            distortion=None if self.distortion is None else self.distortion[rows],
+        )
+
+    def resized(self, factor: float, rounding: str = "floor") -> DatasetSplit:
+        """Return the split with cameras for resized images, like nerfstudio's `rescale_output_resolution`."""
+        scale = torch.tensor([factor])
+        sides = self.sizes * scale
+        if rounding == "round":
+            sides = torch.floor(0.5 + sides)
+        elif rounding == "ceil":
+            sides = torch.ceil(sides)
+        return replace(self, intrinsics=self.intrinsics * scale, sizes=sides.to(torch.int64))
+
+
+@dataclass(frozen=True)
+class ParsedDataset:
+    """Result of a data parser."""
+
+    train: DatasetSplit
+    held_out: DatasetSplit
+    transform: Float[Tensor, "3 4"]
+    scale: float
+    """Map from the poses in the capture to the scene's world: scale * (transform @ point)."""
+
+
+def split_files(files: Sequence[Path], lists: Mapping[str, Any], parser: PosedDataParserConfig) -> tuple[Any, Any]:
+    """Return the indices of the training and the evaluation images: by the dataset's lists, or else by eval_mode.
+
+    Raises:
+        ValueError: if only one of the train and test lists exists, a listed file is missing, or eval_mode is filename
+            and a file name does not tell its split.
+    """
+    if any(names is not None for names in lists.values()):
+        return _listed_files(files, lists["train"], "train"), _listed_files(files, lists["test"], "test")
+    indices = np.arange(len(files))
+    if parser.eval_mode == "fraction":
+        count = math.ceil(len(files) * parser.train_split_fraction)
+        trained = np.linspace(0, len(files) - 1, count, dtype=int)
+        return trained, np.setdiff1d(indices, trained)
+    if parser.eval_mode == "all":
+        return indices, indices
+    is_eval = indices % parser.eval_interval == 0
+    if parser.eval_mode == "filename":
+        for file in files:
+            if "train" not in file.name and "eval" not in file.name:
+                raise InputError(f"eval_mode is filename, but {file.name} has neither train nor eval in its name")
+        is_eval = np.array(["train" not in file.name for file in files], dtype=bool)
+    return indices[~is_eval], indices[is_eval]
+
+
+def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarray, " m"]:
+    """Return the indices of the files in a list of the dataset."""
+    if names is None:
+        raise InputError(f"the dataset's list of filenames for split {split} is missing")
+    listed = set(names)
+    unknown = sorted(map(str, listed - set(files)))
+    if unknown:
+        raise InputError(f"some filenames for split {split} were not found, the first is {unknown[0]}")
+    return np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32)
+
+
+# Cameras and files of a dataset, bit-identical to those of nerfstudio's data parsers.
+
 
 MAX_AUTO_RESOLUTION = 1600
 _ADVICE = "Restore it, or give the path of the dataset with --data."
-_REQUIRED = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_COLMAP_MODELS = (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""COLMAP's camera models that nerfstudio reads."""
+_FLIP = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
+_CAMERA_TYPES = {
+    **dict.fromkeys(PERSPECTIVE_MODELS, "PERSPECTIVE"),
+    "OPENCV_FISHEYE": "FISHEYE",
+    **{
+        name: name
+        for name in (
+            "EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R",
+            "ORTHOPHOTO", "FISHEYE624",
+        )
+    },
+}  # fmt: skip
+"""nerfstudio's camera types by the camera_model of a file."""
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
-def check_dataset(parser: SupportedDataParserConfig) -> None:
-    """Raise if nerfstudio would ask about a dataset, could not read it, or would misread it.
+def parse_dataset(datamanager: FullImageDatamanagerConfig) -> ParsedDataset:
+    """Read the dataset of a run.
+
+    If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts
+    all numbers in the files. Here, these are errors with advice instead.
 
     Raises:
-        FileNotFoundError: if a camera file or an image folder is missing.
-        ValueError: if a camera file is damaged or holds invalid numbers.
+        FileNotFoundError: if a camera file, an image folder or an image whose size matters is missing.
+        ValueError: if a camera file is damaged or holds invalid numbers, or nerfstudio could not read the dataset.
     """
-    if isinstance(parser, NerfstudioDataParserConfig):
-        _check_nerfstudio(parser)
-    elif isinstance(parser, ColmapDataParserConfig):
-        _check_colmap(parser)
-    else:
-        _check_blender(parser)
-
-
-def image_size(file: Path, parser: SupportedDataParserConfig) -> tuple[int, int]:
-    """Return the width and height of an image.
-
-    Raises:
-        FileNotFoundError: if the file is missing.
-        ValueError: if the file is not an image.
-    """
-    if not file.exists():
-        raise FileNotFoundError(f"{file} is missing from the dataset {parser.data}. {_ADVICE}")
-    return read_image_header(file).size
-
-
-def _colmap_downscale_factor(file: Path, parser: ColmapDataParserConfig) -> int:
-    """Return the factor by which nerfstudio downscales images, which depends on one of them if the config has none."""
-    if parser.downscale_factor is not None:
-        return parser.downscale_factor
-    longest, factor = max(image_size(file, parser)), 1
-    while longest / factor > MAX_AUTO_RESOLUTION:
-        factor *= 2
-    return factor
+    parser = datamanager.dataparser
+    try:
+        dataset = _PARSERS[type(parser)](parser)
+        if len(dataset.train) == 0:
+            raise InputError("no image is left for the training")
+    except FileNotFoundError:
+        raise
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy on unusable numbers
+        if isinstance(error, InputError) and str(parser.data) in str(error):
+            raise
+        raise InputError(
+            f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
+            "that the run was trained with; give its path with --data."
+        ) from error
+    scale = datamanager.camera_res_scale_factor
+    return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))
 
 
 def _entries(path: Path, data: Path) -> TransformsEntries:
@@ -85,70 +362,11 @@ def _entries(path: Path, data: Path) -> TransformsEntries:
     return read_transforms_entries(path)
 
 
-def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
-    path = _transforms_path(parser)
-    entries = _entries(path, parser.data)
-    for name in _REQUIRED:
-        incomplete = [frame.file_path for frame in entries.frames if getattr(frame, name) is None]
-        if getattr(entries, name) is None and incomplete:
-            raise InputError(
-                f"{path} has no {name} for {incomplete[0]}. Expected focal lengths, principal point and size for every "
-                "frame."
-            )
-    _check_positions([frame.transform_matrix for frame in entries.frames], parser, path)
-    _check_files([path.parent / frame.file_path for frame in entries.frames], path)
-
-
-def _transforms_path(parser: NerfstudioDataParserConfig) -> Path:
-    return parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
-
-
-def _check_blender(parser: BlenderDataParserConfig) -> None:
-    for split in ("train", "test"):
-        path = parser.data / f"transforms_{split}.json"
-        entries = _entries(path, parser.data)
-        if entries.camera_angle_x is None or not 0 < entries.camera_angle_x < math.pi:
-            raise InputError(
-                f"{path}: camera_angle_x is {entries.camera_angle_x}, expected radians between 0 and pi. {_ADVICE}"
-            )
-        files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in entries.frames]
-        _check_files(files, path)
-        image_size(files[0], parser)  # nerfstudio reads all of this image
-
-
-def _check_colmap(parser: ColmapDataParserConfig) -> None:
-    """Check the dataset, and the folder of downscaled images, which nerfstudio would offer to create."""
-    model, images = parser.data / parser.colmap_path, parser.data / parser.images_path
-    if not model.is_dir():
-        raise FileNotFoundError(
-            f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
-        )
-    _, registered = read_colmap_model(model, text_first=True)
-    registered.sort(key=lambda image: image.image_id)
-    files = [images / image.name for image in registered]
-    _check_files(files, model)
-    factor = _colmap_downscale_factor(files[0], parser)
-    if factor == 1:
-        return
-    smaller = images.parent / f"{images.name}_{factor}"
-    missing = sorted(
-        {file.parent for file in (smaller / image.name for image in registered) if not file.parent.is_dir()}
-    )
-    if missing:
-        raise FileNotFoundError(
-            f"There is no folder {missing[0]} of images at 1/{factor} of their size, with which the run was trained. "
-            f"Copy it from the machine of the training, or create it by resizing the images in {images}. normlift_ns "
-            "does not write into datasets."
-        )
-
-
-def _check_positions(poses: Sequence[list[list[float]]], parser: NerfstudioDataParserConfig, path: Path) -> None:
-    positions = {tuple(row[3] for row in pose[:3]) for pose in poses}
-    if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
-        raise InputError(
-            f"{path}: all {len(poses)} cameras have the same position, so nerfstudio cannot scale them. Expected the "
-            "cameras that the run was trained with; give the path of the dataset with --data."
-        )
+def _image_size(file: Path, data: Path) -> tuple[int, int]:
+    """Return the width and height of an image."""
+    if not file.exists():
+        raise FileNotFoundError(f"{file} is missing from the dataset {data}. {_ADVICE}")
+    return read_image_header(file).size
 
 
 def _check_files(files: Sequence[Path], path: Path) -> None:
@@ -158,83 +376,165 @@ def _check_files(files: Sequence[Path], path: Path) -> None:
         raise InputError(f"{path} lists {invalid}, which is not a regular file. Expected images.")
 
 
-# Cameras and files of a COLMAP dataset, bit-identical to those of nerfstudio's `ColmapDataParser`.
+def _row(entries: TransformsEntries, frame: FrameEntry) -> list[float]:
+    """Return focal lengths, principal point, size and distortion of an image."""
+    is_shared = any(getattr(entries, name) is not None for name in ("k1", "k2", "k3", "p1", "p2", "distortion_params"))
+    source = entries if is_shared else frame
+    distortion = source.distortion_params
+    if distortion is None:
+        distortion = [float(getattr(source, name) or 0.0) for name in DISTORTION]
+    return [*(float(entries.value(frame, name)) for name in _INTRINSICS), *distortion]
 
 
-_INTRINSICS_AND_DISTORTION: dict[str, Callable[..., tuple[float, ...]]] = {
-    "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy),
-    "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
-    "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, k),
-    "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2),
-    "OPENCV": lambda fx, fy, cx, cy, k1, k2, p1, p2: (fx, fy, cx, cy, k1, k2, 0.0, 0.0, p1, p2),
-    "OPENCV_FISHEYE": lambda *values: values,
-    "SIMPLE_RADIAL_FISHEYE": lambda f, cx, cy, k: (f, f, cx, cy, k),
-    "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2),
-}
-"""COLMAP's camera models: functions from their parameters to fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
-_FLIP = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
+def _check_transforms(meta: TransformsEntries, path: Path, parser: NerfstudioDataParserConfig) -> None:
+    for name in _INTRINSICS:
+        incomplete = [frame.file_path for frame in meta.frames if meta.value(frame, name) is None]
+        if incomplete:
+            raise InputError(
+                f"{path} has no {name} for {incomplete[0]}. Expected focal lengths, principal point and size for every "
+                "frame."
+            )
+    positions = {tuple(row[3] for row in frame.transform_matrix[:3]) for frame in meta.frames}
+    if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
+        raise InputError(
+            f"{path}: all {len(meta.frames)} cameras have the same position, so nerfstudio cannot scale them. Expected "
+            "the cameras that the run was trained with; give the path of the dataset with --data."
+        )
+    _check_files([path.parent / frame.file_path for frame in meta.frames], path)
+    count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
+    if masked not in (0, count):
+        raise InputError(f"{path} lists masks for {masked} of {count} images; expected one for each, or none")
 
 
-def parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
-    """Read the dataset of a COLMAP reconstruction.
+def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
+    path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
+    folder, meta = path.parent, _entries(path, parser.data)
+    _check_transforms(meta, path, parser)
+    first = folder / meta.frames[0].file_path
+    factor = _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
 
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing, or nerfstudio could not read it.
-    """
-    cameras, images = read_colmap_model(parser.data / parser.colmap_path, text_first=True)
-    images = sorted(images, key=lambda image: image.image_id)
-    kind, values = _colmap_cameras(cameras, images)
-    images_dir = parser.data / parser.images_path
-    files = [images_dir / image.name for image in images]
+    def resolve(name: str, prefix: str = "images_") -> Path:
+        return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
+
+    order = np.argsort([resolve(frame.file_path) for frame in meta.frames])  # type: ignore[arg-type]
+    frames = [meta.frames[i] for i in order]
+    files = [resolve(frame.file_path) for frame in frames]
+    masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
+    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
+    split_indices = split_files(files, resolved, parser)
+    orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
+    poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
+    split = DatasetSplit(
+        files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses([_row(meta, frame) for frame in frames])
+    )
+    train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
+    transform = compose_applied_transform(transform, meta.applied_rows(parser.data))
+    return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
+
+
+def _camera_type(meta: TransformsEntries) -> str:
+    model = "OPENCV" if meta.camera_model is None else meta.camera_model
+    if model not in _CAMERA_TYPES:
+        raise InputError(f"unknown camera_model {model!r}")
+    return _CAMERA_TYPES[model]
+
+
+def _lenses(rows: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "v 4"], Int64[Tensor, "v 2"], Float[Tensor, "v k"]]:
+    """Return the intrinsics, sizes and distortion of images, given all of them in one row per image."""
+    return (
+        torch.tensor([row[:4] for row in rows], dtype=torch.float32),
+        torch.tensor([[int(side) for side in row[4:6]] for row in rows], dtype=torch.int64),
+        torch.tensor([row[6:] for row in rows], dtype=torch.float32),
+    )
+
+
+def _downscale_factor(
+    file: Path, parser: PosedDataParserConfig, has_copies: Callable[[int], bool] = lambda factor: True
+) -> int:
+    """Return the factor by which nerfstudio downscales images, which depends on one of them if the config has none."""
+    if parser.downscale_factor is not None:
+        return parser.downscale_factor
+    longest, factor = max(_image_size(file, parser.data)), 1
+    while longest / factor > MAX_AUTO_RESOLUTION and has_copies(2 * factor):
+        factor *= 2
+    return factor
+
+
+def _blender(parser: BlenderDataParserConfig) -> ParsedDataset:
+    if parser.alpha_color is not None and parser.alpha_color.lower() not in NAMED_COLORS:
+        raise InputError(f"alpha_color is {parser.alpha_color!r}, expected {', '.join(NAMED_COLORS)}")
+    train, held_out = (_blender_split(parser, split) for split in ("train", "test"))
+    return ParsedDataset(train, held_out, torch.eye(4)[:3, :], parser.scale_factor)
+
+
+def _blender_split(parser: BlenderDataParserConfig, split: str) -> DatasetSplit:
+    path = parser.data / f"transforms_{split}.json"
+    meta = _entries(path, parser.data)
+    angle = meta.camera_angle_x
+    if angle is None or not 0 < angle < math.pi:
+        raise InputError(f"{path}: camera_angle_x is {angle}, expected radians between 0 and pi. {_ADVICE}")
+    files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in meta.frames]
+    _check_files(files, path)
+    width, height = _image_size(files[0], parser.data)
+    focal = 0.5 * width / np.tan(0.5 * float(angle))
+    poses = torch.from_numpy(np.array([frame.transform_matrix for frame in meta.frames]).astype(np.float32)[:, :3])
+    poses[..., 3] *= parser.scale_factor
+    intrinsics = torch.tensor([[focal, focal, width / 2.0, height / 2.0]], dtype=torch.float32)
+    count = len(files)
+    sizes = torch.tensor([[width, height]], dtype=torch.int64).expand(count, 2)
+    return DatasetSplit(files, None, "PERSPECTIVE", poses, intrinsics.expand(count, 4), sizes, None)
+
+
+def _parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
+    model, images_dir = parser.data / parser.colmap_path, parser.data / parser.images_path
+    if not model.is_dir():
+        raise FileNotFoundError(
+            f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
+        )
+    cameras, images = read_colmap_model(model, text_first=True)
+    images.sort(key=lambda image: image.image_id)
+    full_size = [images_dir / image.name for image in images]
+    _check_files(full_size, model)
+    factor = _downscale_factor(full_size[0], parser)
+    files = _downscaled(full_size, images_dir, factor)
+    missing = sorted({file.parent for file in files if factor > 1 and not file.parent.is_dir()})
+    if missing:  # nerfstudio would offer to create it
+        raise FileNotFoundError(
+            f"There is no folder {missing[0]} of images at 1/{factor} of their size, with which the run was trained. "
+            f"Copy it from the machine of the training, or create it by resizing the images in {images_dir}. "
+            "normlift_ns does not write into datasets."
+        )
     masks = None
     if parser.masks_path is not None:
-        masks = [(parser.data / parser.masks_path / image.name).with_suffix(".png") for image in images]
+        folder = parser.data / parser.masks_path
+        masks = _downscaled([(folder / image.name).with_suffix(".png") for image in images], folder, factor)
+    kind, rows = _colmap_rows(cameras, images)
     flip = parser.assume_colmap_world_coordinate_convention
     poses, transform, scale = normalize_poses(
         [_pose(image, flip) for image in images], parser, parser.orientation_method
     )
-    split_indices = split_by_lists(_read_lists(parser), files) or split_by_mode(files, parser)
-    factor = _colmap_downscale_factor(files[0], parser)
-    if factor > 1:
-        files = _downscaled(files, images_dir, factor)
-        masks = None if masks is None else _downscaled(masks, parser.data / (parser.masks_path or ""), factor)
-    split = DatasetSplit(
-        files,
-        masks,
-        kind,
-        poses[:, :3, :4],
-        torch.tensor([row[:4] for row in values], dtype=torch.float32),
-        torch.tensor(
-            [[cameras[image.camera_id].width, cameras[image.camera_id].height] for image in images], dtype=torch.int64
-        ),
-        torch.tensor([row[4:] for row in values], dtype=torch.float32),
-    )
+    split_indices = split_files(full_size, _read_lists(parser), parser)
+    split = DatasetSplit(files, masks, kind, poses[:, :3, :4], *_lenses(rows))
     train, held_out = (
         split.select(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
     )
     return ParsedDataset(train, held_out, compose_applied_transform(transform, _FLIP if flip else None), scale)
 
 
-def _colmap_cameras(
-    cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]
-) -> tuple[str, list[list[float]]]:
-    """Return nerfstudio's type of all cameras, and fx, fy, cx, cy and k1, k2, k3, k4, p1, p2 of each image."""
-    intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
+def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> tuple[str, list[list[float]]]:
+    """Return nerfstudio's type of all cameras, and a row for each image: fx, fy, cx, cy, width, height, distortion."""
+    rows = {}
+    for camera in cameras.values():
+        if camera.model not in _COLMAP_MODELS:
+            raise InputError(f"{camera.model} camera model is not supported yet")
+        values = {"w": camera.width, "h": camera.height, **camera.named_parameters()}
+        rows[camera.camera_id] = [values.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", "w", "h", *DISTORTION)]
     kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera_id].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
         raise InputError("multiple camera models are not supported")
-    values = [intrinsics[image.camera_id] for image in images]
-    if any(row[7] != 0 for row in values):
+    if any(rows[image.camera_id][9] != 0 for image in images):
         raise InputError("the distortion k4 of a camera is not zero")
-    return kinds.pop(), values
-
-
-def _colmap_camera(camera: ColmapCamera) -> list[float]:
-    """Return fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
-    if camera.model not in _INTRINSICS_AND_DISTORTION:
-        raise InputError(f"{camera.model} camera model is not supported yet")
-    values = _INTRINSICS_AND_DISTORTION[camera.model](*camera.params)
-    return [*values, *[0.0] * (10 - len(values))]
+    return kinds.pop(), [rows[image.camera_id] for image in images]
 
 
 def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
@@ -257,159 +557,22 @@ def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
 
 
 def _read_lists(parser: ColmapDataParserConfig) -> dict[str, Any]:
-    lists: dict[str, Any] = {}
+    folder, lists = parser.data / parser.images_path, {}
     for split in ("train", "test", "validation"):
         path = parser.data / f"{split}_list.txt"
-        lists[split] = None
-        if path.is_file():
-            lists[split] = [parser.data / parser.images_path / name for name in path.read_text("utf8").splitlines()]
+        lists[split] = [folder / name for name in path.read_text("utf8").splitlines()] if path.is_file() else None
     return lists
 
 
-def _downscaled(files: Sequence[Path], folder: Path, factor: int) -> list[Path]:
-    return [folder.parent / f"{folder.name}_{factor}" / file.relative_to(folder) for file in files]
+def _downscaled(files: list[Path], folder: Path, factor: int) -> list[Path]:
+    """Return the copies of files in the folder of this downscale factor."""
+    smaller = folder.parent / f"{folder.name}_{factor}"
+    return files if factor == 1 else [smaller / file.relative_to(folder) for file in files]
 
 
-# Cameras and files of a dataset, bit-identical to those of nerfstudio's data parsers.
-
-
-_CAMERA_TYPES = {name: "PERSPECTIVE" for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")} | {
-    "OPENCV_FISHEYE": "FISHEYE",
-    **{
-        name: name
-        for name in (
-            "EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R",
-            "ORTHOPHOTO", "FISHEYE624",
-        )
-    },
-}  # fmt: skip
-"""nerfstudio's camera types by the camera_model of a file."""
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
-
-
-def parse_dataset(datamanager: FullImageDatamanagerConfig) -> ParsedDataset:
-    """Read the dataset of a run, after `check_dataset` has checked it.
-
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing, or nerfstudio could not read it.
-    """
-    parser = datamanager.dataparser
-    try:
-        dataset = _parse(parser)
-        if len(dataset.train) == 0:
-            raise InputError("no image is left for the training")
-    except FileNotFoundError:
-        raise
-    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy on unusable numbers
-        if isinstance(error, InputError) and str(parser.data) in str(error):
-            raise
-        raise InputError(
-            f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
-            "that the run was trained with; give its path with --data."
-        ) from error
-    scale = datamanager.camera_res_scale_factor
-    return ParsedDataset(
-        dataset.train.resized(scale), dataset.held_out.resized(scale), dataset.transform, dataset.scale
-    )
-
-
-def _parse(parser: SupportedDataParserConfig) -> ParsedDataset:
-    if isinstance(parser, NerfstudioDataParserConfig):
-        return _transforms(parser)
-    return parse_colmap(parser) if isinstance(parser, ColmapDataParserConfig) else _blender(parser)
-
-
-def _value(entries: TransformsEntries, frame: CameraEntry, name: str) -> float:
-    """Return the value for all frames, or the frame's own if there is none."""
-    shared = getattr(entries, name)
-    return float(getattr(frame, name) if shared is None else shared)
-
-
-def _distortion(entries: TransformsEntries, frame: CameraEntry) -> list[float]:
-    is_shared = any(getattr(entries, name) is not None for name in ("k1", "k2", "k3", "p1", "p2", "distortion_params"))
-    source = entries if is_shared else frame
-    if source.distortion_params is not None:
-        return source.distortion_params
-    return [float(getattr(source, name) or 0.0) for name in _DISTORTION]
-
-
-def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
-    path = _transforms_path(parser)
-    folder, meta = path.parent, read_transforms_entries(path)
-    factor = _downscale_factor(folder, Path(meta.frames[0].file_path), parser)
-
-    def resolve(name: str, prefix: str = "images_") -> Path:
-        return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
-
-    order = np.argsort([resolve(frame.file_path) for frame in meta.frames])  # type: ignore[arg-type]
-    frames = [meta.frames[i] for i in order]
-    files = [resolve(frame.file_path) for frame in frames]
-    masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
-    if len(masks) not in (0, len(files)):
-        raise InputError(f"{path} lists masks for {len(masks)} of {len(files)} images; expected one for each, or none")
-    lists = {"train": meta.train_filenames, "val": meta.val_filenames, "test": meta.test_filenames}
-    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in lists.items()}
-    split_indices = split_by_lists(resolved, files) or split_by_mode(files, parser)
-    orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
-    poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
-    split = DatasetSplit(files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses(meta, frames))
-    train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
-    transform = compose_applied_transform(transform, _applied_transform(meta, parser.data))
-    return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
-
-
-def _applied_transform(meta: TransformsEntries, data: Path) -> list[list[float]] | None:
-    """Return the transform of the poses before they were stored, which files of an old ns-process-data do not name."""
-    is_legacy = meta.applied_transform is None and (data / "colmap/sparse/0").exists()
-    return _LEGACY_FLIP if is_legacy else meta.applied_transform
-
-
-def _camera_type(meta: TransformsEntries) -> str:
-    model = "OPENCV" if meta.camera_model is None else meta.camera_model
-    if model not in _CAMERA_TYPES:
-        raise InputError(f"unknown camera_model {model!r}")
-    return _CAMERA_TYPES[model]
-
-
-def _lenses(
-    meta: TransformsEntries, frames: Sequence[FrameEntry]
-) -> tuple[Float[Tensor, "v 4"], Int64[Tensor, "v 2"], Float[Tensor, "v k"]]:
-    """Return the intrinsics, sizes and distortion of the frames."""
-    values = [[_value(meta, frame, name) for name in _INTRINSICS] for frame in frames]
-    return (
-        torch.tensor([row[:4] for row in values], dtype=torch.float32),
-        torch.tensor([[int(side) for side in row[4:]] for row in values], dtype=torch.int64),
-        torch.tensor([_distortion(meta, frame) for frame in frames], dtype=torch.float32),
-    )
-
-
-def _downscale_factor(folder: Path, name: Path, parser: NerfstudioDataParserConfig) -> int:
-    """Return the factor of the downscaled copies that nerfstudio reads if the images are too large and copies exist."""
-    if parser.downscale_factor is not None:
-        return parser.downscale_factor
-    longest, power = max(image_size(folder / name, parser)), 0
-    while longest / 2**power > MAX_AUTO_RESOLUTION and (folder / f"images_{2 ** (power + 1)}" / name.name).exists():
-        power += 1
-    return 2**power
-
-
-def _blender(parser: BlenderDataParserConfig) -> ParsedDataset:
-    if parser.alpha_color is not None and parser.alpha_color.lower() not in NAMED_COLORS:
-        raise InputError(f"alpha_color is {parser.alpha_color!r}, expected {', '.join(NAMED_COLORS)}")
-    train, held_out = (_blender_split(parser, split) for split in ("train", "test"))
-    return ParsedDataset(train, held_out, torch.eye(4)[:3, :], parser.scale_factor)
-
-
-def _blender_split(parser: BlenderDataParserConfig, split: str) -> DatasetSplit:
-    meta = read_transforms_entries(parser.data / f"transforms_{split}.json")
-    files = [parser.data / Path(frame.file_path.replace("./", "") + ".png") for frame in meta.frames]
-    width, height = image_size(files[0], parser)
-    focal = 0.5 * width / np.tan(0.5 * float(meta.camera_angle_x or 0.0))
-    poses = torch.from_numpy(np.array([frame.transform_matrix for frame in meta.frames]).astype(np.float32)[:, :3])
-    poses[..., 3] *= parser.scale_factor
-    intrinsics = torch.tensor([[focal, focal, width / 2.0, height / 2.0]], dtype=torch.float32)
-    count = len(files)
-    sizes = torch.tensor([[width, height]], dtype=torch.int64).expand(count, 2)
-    return DatasetSplit(files, None, "PERSPECTIVE", poses, intrinsics.expand(count, 4), sizes, None)
+_PARSERS: dict[type, Any] = {
+    NerfstudioDataParserConfig: _transforms,
+    ColmapDataParserConfig: _parse_colmap,
+    BlenderDataParserConfig: _blender,
+}
+"""Functions that read the dataset of each data parser."""
