@@ -1,4 +1,4 @@
-"""Builders of feature sources, encoders and regions from `SourceOptions`."""
+"""Builders of feature sources and regions from `SourceOptions`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from normlift_ns.encoders.base import Encoder, FeatureSource, RegionFeatures, Regions
-from normlift_ns.encoders.plugins import PluginEncoder, PluginRegions
-from normlift_ns.encoders.registry import ENCODERS, absolute_paths, encoder_kind
-from normlift_ns.encoders.text_files import TextEmbeddingFile, TextEncoder
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.plugins import PluginRegions
+from normlift_ns.encoders.registry import absolute_paths, make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import FeatureKind, SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
@@ -108,27 +107,6 @@ def _restore_settings(settings: object) -> dict[str, Any]:
     if not isinstance(settings, Mapping):
         raise TypeError(f"found {type(settings).__name__}, expected an object")
     return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
-
-
-def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
-    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
-    return make_encoder(options, device) if options.text_vectors is None else TextEmbeddingFile(options.text_vectors)
-
-
-def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """Return the encoder of the options.
-
-    Args:
-        device: Device of the network, such as "cuda"; results are always on the CPU.
-    Raises:
-        ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
-            rejects the options.
-        FileNotFoundError: If a weight file does not exist.
-    """
-    kind = encoder_kind(options.encoder)
-    if options.encoder in ENCODERS.built_in:
-        return kind.make(options, device)
-    return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:

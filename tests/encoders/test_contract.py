@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.encoders.build import make_encoder
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
+from normlift_ns.encoders.registry import make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
 from tests.encoders.tiny import CLIP, HUB, Largest, copied, needs_cuda, noise, refused

@@ -16,13 +16,14 @@ import pytest
 import torch
 
 from normlift_ns.cli.preflight import check_source_options
-from normlift_ns.encoders.build import make_encoder, make_source
+from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
 from normlift_ns.encoders.registry import (
     ENCODERS,
     encoder_kind,
     find_encoder_kind,
+    make_encoder,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
@@ -96,13 +97,13 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         install(tmp_path / str(number), "worse", f"[{ENCODERS.group}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
-            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.builtin"
+            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.registry"
             assert ENCODERS.names() == ["bad", *OURS]
 
 
 WRONG = """
 import torch
-from normlift_ns.encoders import EncoderKind
+from normlift_ns.encoders.registry import EncoderKind
 class Wrong:
     identity = {{}}
     def encode(self, image, labels): return {rows}
