@@ -339,7 +339,7 @@ class PatchFeatures:
     """A `FeatureSource` of patches.
 
     Raises:
-        ValueError: If the network has no features of patches, or the count is below 1.
+        ValueError: If the network has no features of patches.
     """
 
     encoder: DenseEncoder
@@ -348,8 +348,6 @@ class PatchFeatures:
     """Approximate number of patches per image, at least 1."""
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise InputError(f"number of regions per image must be at least 1, got {self.count}")
         reason = self.encoder.why_not_dense
         if reason is not None:
             raise InputError(reason)

@@ -10,10 +10,10 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,69 +26,25 @@ from normlift_ns.io.arrays import load_tensors, save_tensors
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 
-def cached(source: FeatureSource, folder: Path) -> FeatureSource:
-    """Return a source that caches expensive results in a folder.
-
-    Raises (later, when a view is requested):
-        OSError: If the folder cannot be written to, as when the disk is full.
-    """
-    if isinstance(source, PatchFeatures):
-        return CachedPatches(source, folder / "features")
-    if not isinstance(source, RegionFeatures):
-        return source
-    regions = CachedRegions(source.regions, folder / "regions")
-    encoder = CachedEncoder(source.encoder, folder / "features")
-    return replace(source, regions=regions, encoder=encoder)
-
-
 class NotCachedError(Exception):
     """A result that is not in the cache."""
 
 
-def cached_only(source: FeatureSource, folder: Path) -> FeatureSource:
-    """Return a source that reads cached results from a folder and never computes any that would be cached.
+def cached(source: FeatureSource, folder: Path, *, compute: bool = True) -> FeatureSource:
+    """Return a source that caches expensive results in a folder; sources without any are returned unchanged.
 
-    Its `view` raises `NotCachedError` if a result for the image is missing. Sources that are not cached are returned
-    unchanged.
+    Args:
+        compute: False: never compute results that would be cached.
+    Raises (later, when a view is requested):
+        OSError: If the folder cannot be written to, as when the disk is full.
+        NotCachedError: If `compute` is False, and a result for the image is missing.
     """
-    result: Any = cached(source, folder)
-    if isinstance(result, CachedPatches):
-        return replace(result, source=cast(Any, _NoPatches(result.source)))
-    if not isinstance(result, RegionFeatures):
-        return result
-    regions, encoder = cast(Any, result.regions), cast(Any, result.encoder)
-    return replace(
-        result,
-        regions=replace(regions, regions=_NoRegions(regions.regions)),
-        encoder=replace(encoder, encoder=_NoEncoder(encoder.encoder)),
-    )
-
-
-class _Stub:
-    """A stand-in with the settings of another object, which computes nothing."""
-
-    def __init__(self, original: Any) -> None:
-        self._original = original
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-
-class _NoPatches(_Stub):
-    def features(self, image: Tensor, name: str) -> Tensor:
-        raise NotCachedError
-
-
-class _NoRegions(_Stub):
-    def labels(self, image: Tensor, name: str) -> Tensor:
-        raise NotCachedError
-
-
-class _NoEncoder(_Stub):
-    def encode_each(self, views: Iterable[Any]) -> Iterator[Tensor]:
-        for _ in views:
-            raise NotCachedError
-        yield from ()
+    if isinstance(source, PatchFeatures):
+        return CachedPatches(source, folder / "features", compute)
+    if not isinstance(source, RegionFeatures):
+        return source
+    regions = CachedRegions(source.regions, folder / "regions", compute)
+    return RegionFeatures(regions, CachedEncoder(source.encoder, folder / "features", compute))
 
 
 @dataclass(frozen=True)
@@ -101,6 +57,8 @@ class CachedRegions:
     regions: Regions
     folder: Path
     """Contains one safetensors file per image; created if it does not exist."""
+    compute: bool = True
+    """See `cached`."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -121,6 +79,7 @@ class CachedRegions:
         path = self.path(image, name)
         labels = _read(path, "labels", lambda labels: _are_labels(labels, image))
         if labels is None:
+            _require(self.compute)
             labels = self.regions.labels(image, name)
             labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
             _write(path, "labels", labels)
@@ -142,6 +101,8 @@ class CachedEncoder:
     encoder: Encoder
     folder: Path
     """Contains one safetensors file per image and level; created if it does not exist."""
+    compute: bool = True
+    """See `cached`."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -162,6 +123,7 @@ class CachedEncoder:
                 count = int(labels.max()) + 1 if labels.numel() > 0 else 0
                 pending.append(_read(path, "features", partial(_are_units, count=count)))
                 if pending[-1] is None:
+                    _require(self.compute)
                     paths.append(path)
                     yield image, labels
 
@@ -190,6 +152,8 @@ class CachedPatches:
     source: PatchFeatures
     folder: Path
     """Contains one safetensors file per image; created if it does not exist."""
+    compute: bool = True
+    """See `cached`."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -203,6 +167,7 @@ class CachedPatches:
         labels = self.source.labels(image)
         features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
         if features is None:
+            _require(self.compute)
             features = self.source.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
@@ -245,6 +210,12 @@ class CachedTextMasks:
     @cached_property
     def _network(self) -> Sam3Network:
         return Sam3Network.load(self.checkpoint, self.device)
+
+
+def _require(compute: bool) -> None:
+    """Raise NotCachedError if results must not be computed."""
+    if not compute:
+        raise NotCachedError
 
 
 def _are_bits(bits: Tensor, size: tuple[int, int]) -> bool:

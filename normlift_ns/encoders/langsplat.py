@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -179,7 +179,6 @@ class LangSplat:
     """A `FeatureSource` of preprocessed images.
 
     Raises:
-        ValueError: If the level or `missing` is unknown.
         FileNotFoundError: If the folder does not exist, or contains no features.
     """
 
@@ -196,14 +195,6 @@ class LangSplat:
     """Accept maps of any size, not only those of the same image at another resolution."""
 
     def __post_init__(self) -> None:
-        for flag, value, known in (
-            ("--level", self.level, LangSplatLevel),
-            ("--features-missing", self.missing, MissingFeatures),
-        ):
-            if value not in get_args(known):
-                raise InputError(
-                    f"{flag} must be one of {', '.join(get_args(known))} with --features langsplat; got {value!r}"
-                )
         _ = self.folder
 
     @cached_property

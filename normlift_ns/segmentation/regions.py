@@ -92,35 +92,16 @@ def gray_bit_depth(path: Path) -> int | None:
 _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file."""
+_COMPACTNESS = 10.0
+"""Weight of spatial distance against color distance in superpixels; higher values give squarer regions."""
 _WORKERS = min(4, os.cpu_count() or 1)
 """Number of images that are segmented concurrently; superpixels need many times the memory of their image."""
 
 
-@dataclass(frozen=True)
-class Superpixels:
-    """Regions of similar size that follow image edges: SLIC on CIELAB color and position.
+class RegionDefaults:
+    """The members of `Regions` of methods with one level and without files, which segment one image at a time."""
 
-    Raises:
-        ValueError: If the count is below 1, or the compactness is not positive.
-    """
-
-    count: int = 256
-    """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
-    compactness: float = 10.0
-    """Weight of spatial distance against color distance, > 0; higher values give squarer regions."""
-
-    def __post_init__(self) -> None:
-        _check_count(self.count)
-        if not self.compactness > 0:
-            raise InputError(f"compactness of superpixels must be positive, got {self.compactness}")
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return {"kind": "superpixel", "count": self.count, "compactness": self.compactness}
-
-    @property
-    def at_once(self) -> int:
-        return _WORKERS
+    at_once = 1
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -128,42 +109,38 @@ class Superpixels:
 
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
+
+
+@dataclass(frozen=True)
+class Superpixels(RegionDefaults):
+    """Regions of similar size that follow image edges: SLIC on CIELAB color and position."""
+
+    count: int = 256
+    """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
+
+    at_once = _WORKERS
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "superpixel", "count": self.count, "compactness": _COMPACTNESS}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
 
-        segments = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
+        segments = slic(image.numpy(), n_segments=self.count, compactness=_COMPACTNESS, start_label=0)
         return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Square cells of one size; the image border cuts off those at the right and lower edges.
-
-    Raises:
-        ValueError: If the count is below 1.
-    """
+class Grid(RegionDefaults):
+    """Square cells of one size; the image border cuts off those at the right and lower edges."""
 
     count: int = 256
     """Approximate number of cells per image, at least 1. The side of a cell is a whole number of pixels."""
 
-    def __post_init__(self) -> None:
-        _check_count(self.count)
-
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "grid", "count": self.count}
-
-    @property
-    def at_once(self) -> int:
-        return 1
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        return ()
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         height, width = image.shape[:2]
@@ -173,7 +150,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class LabelFiles:
+class LabelFiles(RegionDefaults):
     """Label maps from a folder, one per image and of the size of the image. A PNG is grayscale with 1, 8 or 16 bits, or
     indexed, with palette indices as labels. An NPY file holds any integer type, and may hold several levels, [levels,
     H, W].
@@ -198,21 +175,18 @@ class LabelFiles:
     flag: str = "--regions-dir"
     """Name, in messages, of the option that sets the folder."""
 
+    at_once = _WORKERS
+
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
                 f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
-                "PNG or NPY "
-                "file per image"
+                "PNG or NPY file per image"
             )
 
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "files", "background": self.background, "resample": self.resample}
-
-    @property
-    def at_once(self) -> int:
-        return _WORKERS
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -267,10 +241,8 @@ class LabelFiles:
             if not self.resample:
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
-                    f"{name} is "
-                    f"{width}x{height}; make {self.description}s of the size of the image (undistortion crops "
-                    "images), or "
-                    "resample them by nearest neighbor: --regions-resample True"
+                    f"{name} is {width}x{height}; make {self.description}s of the size of the image (undistortion "
+                    "crops images), or resample them by nearest neighbor: --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
@@ -304,8 +276,7 @@ class LabelFiles:
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
                 f"{self.description} {path} has {maps.shape[2]} color channels; expected one value per pixel: save "
-                "it as an "
-                "8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
+                "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
             raise InputError(
@@ -316,12 +287,6 @@ class LabelFiles:
             raise InputError(f"{self.description} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         return maps.reshape(-1, *maps.shape[-2:])
-
-
-def _check_count(count: int) -> None:
-    """Raise InputError unless the count is positive."""
-    if count < 1:
-        raise InputError(f"number of regions per image must be at least 1, got {count}")
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -24,7 +23,6 @@ from torch.nn.functional import gelu, interpolate, layer_norm, linear, pad, scal
 
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.encoders.batching import AdaptiveBatches
-from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, SamPrecision
 from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,
@@ -42,6 +40,7 @@ from normlift_ns.segmentation.mask_filtering import (
     remove_small_regions,
     stack_masks,
 )
+from normlift_ns.segmentation.regions import RegionDefaults
 
 _BITS = 22
 
@@ -616,12 +615,11 @@ class _Candidates(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SamMasks:
+class SamMasks(RegionDefaults):
     """Regions of one level of SAM's automatic masks. The weights are loaded at the first use.
 
     Raises:
-        ValueError: If the level or the precision is unknown, transformers is not installed, or the checkpoint is not a
-            valid name.
+        ValueError: If transformers is not installed, or the checkpoint is not a valid name.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -636,11 +634,6 @@ class SamMasks:
     rules: MaskRules = field(default_factory=MaskRules)
 
     def __post_init__(self) -> None:
-        if self.level not in SAM_LEVELS:
-            raise InputError(f"unknown level {self.level!r} of SAM; --level is one of {', '.join(SAM_LEVELS)}")
-        if self.precision not in get_args(SamPrecision):
-            known = ", ".join(get_args(SamPrecision))
-            raise InputError(f"unknown precision {self.precision!r} of SAM; --sam-precision is one of {known}")
         check_sam_checkpoint(self.checkpoint)
 
     @property
@@ -650,15 +643,8 @@ class SamMasks:
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
     @property
-    def at_once(self) -> int:
-        return 1
-
-    @property
     def chosen(self) -> tuple[int, ...]:
         return (SAM_LEVELS.index(self.level),)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device; raises like `masks`."""

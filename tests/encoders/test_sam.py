@@ -154,7 +154,6 @@ def test_what_is_no_checkpoint(sam_weights, empty_hub, tmp_path, monkeypatch):
     refused(lambda: SamMasks("/nowhere/sam_vit_h.pth"), "/nowhere/sam_vit_h.pth", "--regions", error=missing)
     refused(lambda: SamMasks("sam_vit_h.pth"), "sam_vit_h.pth does not exist", error=missing)
     refused(lambda: SamMasks("vit_h"), "'vit_h'", "facebook/sam-vit-huge")
-    refused(lambda: SamMasks(str(sam_weights / "tiny"), level="xl"), "default, s, m, l", "'xl'", "--level")
     parts = ("facebook/sam-vit-huge", "Name or service not known", "--sam-model", "--regions patches")
     refused(lambda: SamMasks().masks(noise(30, 40)), *parts, error=missing)
     monkeypatch.setitem(sys.modules, "transformers", None)
