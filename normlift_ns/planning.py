@@ -32,7 +32,7 @@ from normlift_ns.encoders.base import FeatureSource, segmentation_workers
 from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
-from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_weights
+from normlift_ns.encoders.weights import find_local_sam, has_local_clip_weights
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,
@@ -445,7 +445,7 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     missing = []
     if (kind := resolve_regions(options, device)) in ("sam", "sam3"):
         model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
-        if not has_local_sam_weights(model):
+        if find_local_sam(model) is None:
             missing.append(f"those of SAM, {model}")
     family = MODEL_FAMILIES.get(options.encoder)
     if family is not None and find_local_model(resolve_model_name(options, family)) is None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from normlift_ns.encoders.weights import check_server, find_in_hub_cache, is_local_path
+from normlift_ns.encoders.weights import check_hub_access, find_cached_clip_weights, is_local_path
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.options import DEFAULT_MODEL
 
@@ -157,7 +157,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
         return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
     published = table.get_pretrained_cfg(model, pretrained)
     try:
-        return find_in_hub_cache(published, import_open_clip_module("constants")) or _download(published), published
+        return find_cached_clip_weights(published.get("hf_hub", "")) or _download(published), published
     except Exception as error:  # download clients raise exceptions without a common base class
         origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
         raise FileNotFoundError(
@@ -168,5 +168,5 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
 
 def _download(published: dict[str, Any]) -> Path:
     if published.get("hf_hub"):
-        check_server(importlib.import_module("huggingface_hub").constants.ENDPOINT)
+        check_hub_access()
     return Path(import_open_clip_module("pretrained").download_pretrained(published))

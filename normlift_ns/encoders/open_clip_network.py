@@ -26,7 +26,7 @@ from normlift_ns.encoders.open_clip import (
     open_clip_model_config,
 )
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
-from normlift_ns.encoders.weights import THIRD_PARTY_ERRORS, find_in_hub_cache
+from normlift_ns.encoders.weights import THIRD_PARTY_ERRORS, find_cached_clip_weights
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
@@ -289,7 +289,7 @@ def _find_local_weights(model: str, pretrained: str) -> tuple[Path, Mapping[str,
     if os.path.isfile(pretrained):
         return Path(pretrained), {}
     published = import_open_clip_module("pretrained").get_pretrained_cfg(model, pretrained)
-    path = find_in_hub_cache(published, import_open_clip_module("constants")) if published else None
+    path = find_cached_clip_weights(published.get("hf_hub", ""))
     return None if path is None else (path, published)
 
 

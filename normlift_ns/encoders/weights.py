@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import os
 import pickle
 import struct
@@ -11,13 +12,17 @@ import urllib.error
 import urllib.request
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 
+from normlift_ns.errors import InputError
+
+CONFIG_FILE = "config.json"
+_MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
@@ -45,46 +50,38 @@ def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
     """
     if os.path.isfile(pretrained):
         return True
-    repository = _hub_location(model, pretrained)
-    if not repository:
-        return None
-    owner_and_name, _, file = repository.rpartition("/")
-    return any(is_in_hub_cache(owner_and_name, name) for name in ([file] if file else _CLIP_FILES))
+    location = _hub_location(model, pretrained)
+    return find_cached_clip_weights(location) is not None if location else None
 
 
-def has_local_sam_weights(checkpoint: str) -> bool:
-    """Return whether a SAM checkpoint, given as a path or a hub name, is on this machine."""
-    cached = is_in_hub_cache(checkpoint, "config.json") and any(
-        is_in_hub_cache(checkpoint, name) for name in SAM_WEIGHT_FILES
-    )
-    return os.path.exists(checkpoint) or cached
+def find_local_sam(checkpoint: str) -> Path | None:
+    """Return the path of a SAM checkpoint on this machine, given as a path or a hub name; None if there is none."""
+    if os.path.exists(checkpoint):
+        return Path(checkpoint).resolve()
+    config, weights = find_in_hub_cache(checkpoint, CONFIG_FILE), find_in_hub_cache(checkpoint, *SAM_WEIGHT_FILES)
+    return None if config is None or weights is None else weights.parent
 
 
-def is_in_hub_cache(repository: str, file: str) -> bool:
-    """Return whether the Hugging Face hub cache holds a file in its main revision. Needs no network."""
+def find_in_hub_cache(repository: str, *names: str) -> Path | None:
+    """Return the path of the first of these files that the Hugging Face hub cache holds in the main revision of a
+    repository, or None. Needs no network."""
     constants = importlib.import_module("huggingface_hub.constants")
     folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
     try:
-        revision = (folder / "refs" / "main").read_text("utf8").strip()
-        return os.path.isfile(folder / "snapshots" / revision / file)
+        snapshot = folder / "snapshots" / (folder / "refs" / "main").read_text("utf8").strip()
+        return next((snapshot / name for name in names if os.path.isfile(snapshot / name)), None)
     except (OSError, ValueError):
-        return False
+        return None
 
 
-def find_in_hub_cache(published: Mapping[str, Any], constants: Any) -> Path | None:
-    """Return the path of the weights in the Hugging Face hub cache, or None. Needs no network.
+def find_cached_clip_weights(location: str) -> Path | None:
+    """Return the path of the weights of an OpenCLIP model in the hub cache, or None.
 
     Args:
-        published: Entry of open_clip's table of pretrained weights.
-        constants: open_clip's module of file names.
+        location: "OWNER/NAME/" or "OWNER/NAME/FILE", as in open_clip's table of pretrained weights.
     """
-    hub = importlib.import_module("huggingface_hub")
-    repository, name = os.path.split(published.get("hf_hub", ""))
-    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
-        path = hub.try_to_load_from_cache(repository, file) if repository else None
-        if isinstance(path, str):
-            return Path(path)
-    return None
+    repository, name = os.path.split(location)
+    return find_in_hub_cache(repository, *([name] if name else _CLIP_FILES))
 
 
 def _hub_location(model: str, tag: str) -> str | None:
@@ -118,8 +115,12 @@ def _argument(call: ast.AST, name: str) -> ast.expr:
     return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
 
 
-def check_server(address: str) -> None:
-    """Raise OSError if a server does not respond; the hub's own client would retry for most of a minute."""
+def check_hub_access() -> None:
+    """Raise OSError if the Hugging Face hub is not available for downloads; its own client would retry for most of a
+    minute."""
+    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
+        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
+    address = os.environ.get("HF_ENDPOINT", _HUB)
     try:
         urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
     except urllib.error.HTTPError:  # the server responded
@@ -128,11 +129,18 @@ def check_server(address: str) -> None:
         raise ConnectionError(f"{address} cannot be reached: {error}") from error
 
 
-def check_hub_access() -> None:
-    """Raise OSError if the Hugging Face hub is not available for downloads."""
-    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
-    check_server(os.environ.get("HF_ENDPOINT", _HUB))
+def download_model(name: str, choose_files: Callable[[dict[str, Any]], Sequence[str]]) -> Path:
+    """Download a model from the hub and return its folder: config.json first, then the files chosen by its content.
+
+    Args:
+        choose_files: Returns patterns of further files; errors that it raises are passed on.
+    Raises:
+        Exception: Download clients raise exceptions without a common base class.
+    """
+    check_hub_access()
+    download = importlib.import_module("huggingface_hub").snapshot_download
+    config = read_json(Path(download(name, allow_patterns=[CONFIG_FILE])) / CONFIG_FILE)
+    return Path(download(name, allow_patterns=[CONFIG_FILE, *choose_files(config)]))
 
 
 def is_local_path(name: str, parts: int) -> bool:
@@ -146,3 +154,22 @@ def is_local_path(name: str, parts: int) -> bool:
     """
     path = Path(name)
     return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: If the file does not exist, is not JSON, or holds anything but an object.
+    """
+    if not path.is_file():
+        raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
+    try:
+        content = json.loads(path.read_text("utf8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
+    return content

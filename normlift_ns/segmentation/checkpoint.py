@@ -6,7 +6,6 @@ Only the sizes of the parts are read from config.json, so it cannot name code, k
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,14 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.weights import SAM_WEIGHT_FILES, check_server, is_local_path
+from normlift_ns.encoders.weights import (
+    CONFIG_FILE,
+    SAM_WEIGHT_FILES,
+    download_model,
+    find_local_sam,
+    is_local_path,
+    read_json,
+)
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
@@ -95,10 +101,10 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If it is not one of `kinds`, or if the installed torch or transformers cannot run it.
-        OSError: If config.json is missing.
+        ValueError: If config.json is missing or not of one of `kinds`, or if the installed torch or transformers cannot
+            run it.
     """
-    model_type = _config(folder).get("model_type")
+    model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
         other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
@@ -138,7 +144,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     transformers = import_transformers()
     if not (folder / WEIGHTS_FILE).is_file():
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = getattr(transformers, kind.config)(**_sizes(_config(folder), kind))
+    config = getattr(transformers, kind.config)(**_sizes(read_json(folder / CONFIG_FILE), kind))
     with _quiet(transformers):
         model, report = getattr(transformers, kind.model).from_pretrained(
             None,
@@ -167,13 +173,6 @@ def _quiet(transformers: Any) -> Iterator[None]:
         logging.set_verbosity(level)
         if bar:
             logging.enable_progress_bar()
-
-
-def _config(folder: Path) -> dict[str, Any]:
-    config = json.loads((folder / "config.json").read_text("utf8"))
-    if not isinstance(config, dict):
-        raise InputError(f"config.json holds {type(config).__name__}, expected an object")
-    return config
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
@@ -301,18 +300,6 @@ def _title(kinds: Mapping[str, SamFamily]) -> str:
     return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
 
 
-def _find_local_sam(checkpoint: str) -> Path | None:
-    """Return the path of a checkpoint on this machine, including the cache of the hub; None if there is none."""
-    if os.path.exists(checkpoint):
-        return Path(checkpoint).resolve()
-    hub = importlib.import_module("huggingface_hub")
-    for file in SAM_WEIGHT_FILES:
-        config, weights = (hub.try_to_load_from_cache(checkpoint, name) for name in ("config.json", file))
-        if isinstance(config, str) and isinstance(weights, str):
-            return Path(weights).parent
-    return None
-
-
 def sam_identity(checkpoint: str) -> str:
     """Return the digest of local files, or the name of a checkpoint on the hub."""
     path = Path(checkpoint)
@@ -357,18 +344,6 @@ def checkpoint_errors(path: Path, title: str = "SAM") -> Iterator[None]:
         ) from None
 
 
-def load_sam(checkpoint: str) -> Any:
-    """Return the SamModel of transformers with the weights of a checkpoint of the first SAM, in float32 on the CPU.
-
-    Raises:
-        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-        ValueError: If the checkpoint is damaged or not of the first SAM.
-    """
-    path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
-    with checkpoint_errors(path):
-        return _load_first_sam(path)
-
-
 def _load_first_sam(path: Path) -> Any:
     config, state = _read_folder(path) if path.is_dir() else _read_file(path)
     for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
@@ -392,16 +367,12 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
-    local = _find_local_sam(checkpoint)
+    local = find_local_sam(checkpoint)
     if local is not None:
         return local
-    hub = importlib.import_module("huggingface_hub")
+    files = [WEIGHTS_FILE, *more]
     try:
-        check_server(hub.constants.ENDPOINT)
-        folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
-        known = json.loads((folder / "config.json").read_text("utf8")).get("model_type") in kinds
-        patterns = ["config.json", WEIGHTS_FILE, *more] if known else ["config.json"]
-        return Path(hub.snapshot_download(checkpoint, allow_patterns=patterns))
+        return download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
     except Exception as error:  # the download client raises unrelated exception types
         title = _title(kinds)
         raise FileNotFoundError(
@@ -416,7 +387,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     files = _weight_files(folder)
     if len(files) == 0:
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = json.loads((folder / "config.json").read_text())
+    config = read_json(folder / CONFIG_FILE)
     check_config_sizes(config)
     return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
 

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, get_args
 
 from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts
-from normlift_ns.encoders.weights import has_local_sam_weights
+from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, MASK_GROUP, FeatureKind, SourceOptions, short_repr
 from normlift_ns.registry import Registry
@@ -214,7 +214,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
     kind = encoder_kind(options.encoder)
     if not kind.learned:
         return "superpixel"
-    if device.startswith("cuda") and find_spec("transformers") is not None and has_local_sam_weights(DEFAULT_SAM):
+    if device.startswith("cuda") and find_spec("transformers") is not None and find_local_sam(DEFAULT_SAM) is not None:
         return "sam"
     return "patches" if kind.has_patches(options) else "superpixel"
 

@@ -27,7 +27,6 @@ from normlift_ns.options import DEFAULT_SAM, SamPrecision
 from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,
     import_transformers,
-    load_sam,
     load_sam_checkpoint,
     sam_identity,
 )
@@ -376,11 +375,6 @@ class SamNetwork(PromptedNetwork):
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         super().__init__(model, device, precision)
         self._decoder = MaskDecoder(self._model, self._dtype)
-
-    @classmethod
-    def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> SamNetwork:
-        """Load the network of a checkpoint; raises like `load_sam`."""
-        return cls(load_sam(checkpoint), device, precision)
 
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
         """Return network inputs: each image is scaled until its longer side fills the input, and padded with 0."""

@@ -201,10 +201,10 @@ def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_e
 
 
 def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsys):
-    def unreachable(address: str) -> None:
-        raise ConnectionError(f"{address} cannot be reached")
+    def unreachable(request: object, timeout: float) -> None:
+        raise OSError("no route")
 
-    monkeypatch.setattr(weights, "check_server", unreachable)
+    monkeypatch.setattr("urllib.request.urlopen", unreachable)
     monkeypatch.setenv("HF_ENDPOINT", "https://hub")
     for there in (False, True, None):
         asked: list[tuple[str, ...]] = []
