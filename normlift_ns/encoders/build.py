@@ -11,7 +11,7 @@ from typing import Any, get_args
 
 from normlift_ns.encoders.base import FeatureSource, RegionFeatures, Regions
 from normlift_ns.encoders.plugins import PluginRegions
-from normlift_ns.encoders.registry import absolute_paths, make_encoder
+from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import FeatureKind, SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
@@ -61,12 +61,8 @@ def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, An
     if options.features == "none":
         options = replace(options, regions=resolve_regions(options, device))
     settings = {**asdict(options), **absolute_paths(options)}
-    settings["sam_model"] = None if options.sam_model is None else _absolute_if_exists(options.sam_model)
+    settings["sam_model"] = None if options.sam_model is None else absolute_if_exists(options.sam_model)
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}
-
-
-def _absolute_if_exists(name: str) -> str:
-    return os.path.abspath(name) if os.path.exists(name) else name
 
 
 def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:

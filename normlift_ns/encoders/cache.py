@@ -77,9 +77,8 @@ class CachedRegions:
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
-        labels = _read(path, "labels", lambda labels: _are_labels(labels, image))
+        labels = _read(path, "labels", lambda labels: _are_labels(labels, image), self.compute)
         if labels is None:
-            _require(self.compute)
             labels = self.regions.labels(image, name)
             labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
             _write(path, "labels", labels)
@@ -121,9 +120,8 @@ class CachedEncoder:
             for image, labels in views:
                 path = self.path(image, labels)
                 count = int(labels.max()) + 1 if labels.numel() > 0 else 0
-                pending.append(_read(path, "features", partial(_are_units, count=count)))
+                pending.append(_read(path, "features", partial(_are_units, count=count), self.compute))
                 if pending[-1] is None:
-                    _require(self.compute)
                     paths.append(path)
                     yield image, labels
 
@@ -165,9 +163,8 @@ class CachedPatches:
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = cache_path(self.folder, self.identity, *_key_parts(image))
         labels = self.source.labels(image)
-        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
+        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1), self.compute)
         if features is None:
-            _require(self.compute)
             features = self.source.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
@@ -194,7 +191,12 @@ class CachedTextMasks:
         """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.segment`."""
         size = (image.shape[0], image.shape[1])
         paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
-        packed = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
+        expected = torch.Size((size[0], -(-size[1] // 8)))  # packed bits
+
+        def are_bits(bits: Tensor) -> bool:
+            return bits.dtype == torch.uint8 and bits.shape == expected
+
+        packed = {text: _read(path, "bits", are_bits) for text, path in paths.items()}
         new = [text for text, bits in packed.items() if bits is None]
         for text, masks in zip(new, self._network.segment(image, new) if len(new) > 0 else []):
             packed[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
@@ -212,29 +214,21 @@ class CachedTextMasks:
         return Sam3Network.load(self.checkpoint, self.device)
 
 
-def _require(compute: bool) -> None:
-    """Raise NotCachedError if results must not be computed."""
-    if not compute:
-        raise NotCachedError
-
-
-def _are_bits(bits: Tensor, size: tuple[int, int]) -> bool:
-    """Return whether a cached tensor has the type and shape of packed masks."""
-    return bits.dtype == torch.uint8 and bits.shape == (size[0], -(-size[1] // 8))
-
-
 def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
     """Return the parts of a cache key that identify a tensor: its type and shape, and its content."""
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
-def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool]) -> Tensor | None:
-    """Return a cached tensor; None if it is missing, damaged, cached under another key, or not valid."""
-    try:
+def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True) -> Tensor | None:
+    """Return a cached tensor; if it is missing, damaged, cached under another key, or not valid, return None, or raise
+    NotCachedError if results must not be computed."""
+    with suppress(FileNotFoundError, ValueError, KeyError):
         tensor = load_tensors(path, key=path.stem).tensors[name] if os.path.isfile(path) else None
-    except (FileNotFoundError, ValueError, KeyError):
-        return None
-    return tensor if tensor is not None and is_valid(tensor) else None
+        if tensor is not None and is_valid(tensor):
+            return tensor
+    if not compute:
+        raise NotCachedError
+    return None
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import string
@@ -335,15 +334,6 @@ def _is_shard(name: object) -> bool:
     return isinstance(name, str) and name.endswith(".safetensors") and name == os.path.basename(name)
 
 
-def patches_per_side(count: int) -> int:
-    """Return the number of patches along the side of a square image that has at most `count` patches.
-
-    >>> patches_per_side(256), patches_per_side(300)
-    (16, 17)
-    """
-    return max(1, math.isqrt(count))
-
-
 # Location of a network: a local folder, the Hugging Face hub cache, or a download. Needs no torch.
 
 
@@ -434,7 +424,6 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
         InputError: If it has another architecture.
     """
-    check_model_name(model, family)
     local = find_local_model(model)
     if local is not None:
         return local

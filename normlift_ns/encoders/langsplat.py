@@ -338,14 +338,9 @@ def check_unique_stems(names: Sequence[str]) -> None:
     Raises:
         ValueError: If the files of two images would have the same name.
     """
-    owner: dict[str, str] = {}
-    for name in names:
-        other = owner.setdefault(_stem(name), name)
-        if other != name:
-            raise InputError(
-                f"images {other} and {name} would both be exported as {_stem(name)}_s.npy, as LangSplat names its "
-                "files; rename the images such that they differ before the first dot, or lift without the export"
-            )
+    files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
+    remedy = "by renaming the images such that they differ before the first dot, or lift without the export"
+    check_files_distinct(files, "exported file", remedy)
 
 
 def _stem(name: str) -> str:

@@ -154,7 +154,7 @@ class OpenClipEncoder(NetworkEncoder):
 
     Raises:
         ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
-            tag. Also if the fill is unknown, or the template has no placeholder for the text.
+            tag. Also if the template has no placeholder for the text.
         FileNotFoundError: If a weight file does not exist.
     """
 
@@ -169,9 +169,11 @@ class OpenClipEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         check_open_clip_names(self.model, self.pretrained)
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
+    @cached_property
+    def _identity(self) -> dict[str, Any]:
+        path = Path(self.pretrained)
+        weights = file_digest(path) if path.is_file() else self.pretrained
+        return {"kind": "open_clip", "model": self.model, "pretrained": weights, "fill": self.fill}
 
     @property
     def why_not_dense(self) -> str | None:
@@ -189,11 +191,6 @@ class OpenClipEncoder(NetworkEncoder):
 
     def _width(self) -> int:
         return cast(Any, open_clip_model_config(self.model))["embed_dim"]
-
-    @cached_property
-    def _weights_identity(self) -> str:
-        path = Path(self.pretrained)
-        return file_digest(path) if path.is_file() else self.pretrained
 
 
 # The CLIP text tower in plain torch, for prompts that are not cached.

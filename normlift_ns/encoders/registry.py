@@ -251,8 +251,12 @@ def find_encoder_kind(name: object) -> EncoderKind | None:
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
     """Return the encoder's options that may be paths. The path of an existing file or folder is made absolute."""
     kind = find_encoder_kind(options.encoder)
-    values = {name: getattr(options, name) for name in (() if kind is None else kind.paths)}
-    return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
+    return {name: absolute_if_exists(getattr(options, name)) for name in (() if kind is None else kind.paths)}
+
+
+def absolute_if_exists(name: str) -> str:
+    """Return a name, as an absolute path if it is one of an existing file or folder."""
+    return os.path.abspath(name) if os.path.exists(name) else name
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:

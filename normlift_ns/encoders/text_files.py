@@ -292,9 +292,10 @@ class CachedTextEncoder:
         rows = {prompt: self._load(prompt) for prompt in prompts}
         new = [prompt for prompt, row in rows.items() if row is None]
         for prompt, row in zip(new, self._encoder.text(new).numpy() if len(new) > 0 else []):
-            rows[prompt] = row
-            with suppress(OSError):
-                self._save(prompt, row)
+            rows[prompt], path = row, self._path(prompt)
+            if path is not None:
+                with suppress(OSError):
+                    save_arrays(path, {_ARRAY: row}, key=path.stem, overwrite=True)
         return np.stack([row for prompt in prompts if (row := rows[prompt]) is not None])
 
     @cached_property
@@ -323,11 +324,6 @@ class CachedTextEncoder:
         if row is None or row.dtype != np.float32 or row.ndim != 1 or row.size == 0:
             return None
         return row if abs(float(np.linalg.norm(row)) - 1) < UNIT_TOLERANCE else None
-
-    def _save(self, prompt: str, row: Float32[np.ndarray, " d"]) -> None:
-        path = self._path(prompt)
-        if path is not None:
-            save_arrays(path, {_ARRAY: row}, key=path.stem, overwrite=True)
 
 
 def open_clip_text_identity(model: str, pretrained: str, template: str) -> dict[str, Any]:

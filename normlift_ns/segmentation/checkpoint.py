@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +46,8 @@ class SamFamily:
     """Network that transformers implements."""
 
     name: str
-    model: str
-    """Name of its model class in transformers."""
-    config: str
-    """Name of its config class in transformers."""
+    prefix: str
+    """Prefix of the names of its classes in transformers."""
     config_parts: tuple[str, ...]
     """Names of the configs in its config."""
     nested_types: tuple[tuple[str, str], ...] = ()
@@ -64,20 +62,19 @@ _SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
 _SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "detr_encoder_config",
                  "detr_decoder_config", "mask_decoder_config")  # fmt: skip
 _SAM3_NESTED = (("vision_config.backbone_config", "sam3_vit_model"), ("text_config", "clip_text_model"))
-SAM = SamFamily("SAM", "SamModel", "SamConfig", _SAM_CONFIGS)
-_SAM2 = SamFamily("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, min_transformers="4.56")
+SAM = SamFamily("SAM", "Sam", _SAM_CONFIGS)
+_SAM2 = SamFamily("SAM 2", "Sam2", _SAM_CONFIGS, _SAM2_NESTED, min_transformers="4.56")
 POINT_PROMPT_FAMILIES: dict[str, SamFamily] = {
     "sam": SAM,
     "sam2": _SAM2,
     "sam2_video": _SAM2,  # in the checkpoints of SAM 2 and 2.1, which contain the image model
-    "sam_hq": SamFamily("HQ-SAM", "SamHQModel", "SamHQConfig", _SAM_CONFIGS, min_transformers="4.52"),
+    "sam_hq": SamFamily("HQ-SAM", "SamHQ", _SAM_CONFIGS, min_transformers="4.52"),
 }
 """Networks that turn points into masks, by the model type of config.json."""
+_SAM3 = SamFamily("SAM 3", "Sam3", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0")
 TEXT_PROMPT_FAMILIES: dict[str, SamFamily] = {
-    "sam3": SamFamily("SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0"),
-    "sam3_video": SamFamily(
-        "SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, "detector_config", min_transformers="5.0"
-    ),
+    "sam3": _SAM3,
+    "sam3_video": replace(_SAM3, config_key="detector_config"),
 }
 """Networks that turn text prompts into masks, by the model type of config.json."""
 
@@ -127,7 +124,7 @@ def _check_supported(kind: SamFamily) -> None:
             f"{_ALTERNATIVE}"
         )
     transformers = import_transformers()
-    if not hasattr(transformers, kind.model):
+    if not hasattr(transformers, f"{kind.prefix}Model"):
         raise InputError(
             f"{kind.name} needs transformers {kind.min_transformers} or newer, found {transformers.__version__}; "
             f"{_ALTERNATIVE}"
@@ -144,9 +141,9 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     transformers = import_transformers()
     if not (folder / WEIGHTS_FILE).is_file():
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = getattr(transformers, kind.config)(**_sizes(read_json(folder / CONFIG_FILE), kind))
+    config = getattr(transformers, f"{kind.prefix}Config")(**_sizes(read_json(folder / CONFIG_FILE), kind))
     with _quiet(transformers):
-        model, report = getattr(transformers, kind.model).from_pretrained(
+        model, report = getattr(transformers, f"{kind.prefix}Model").from_pretrained(
             None,
             config=config,
             state_dict=load_file(folder / WEIGHTS_FILE),

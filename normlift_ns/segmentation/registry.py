@@ -232,18 +232,9 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
         value = getattr(options, option)
         if option not in source.options and value != getattr(default, option):
             shown = " ".join(value) if isinstance(value, tuple) else value
-            takers = " or ".join(x for x in sorted(MASK_SOURCES.built_in) if _takes(x, option))
-            raise InputError(
-                f'{_flag(option)} {shown} is for --regions {takers}, not for "{name}"; leave one of them out'
-            )
+            regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
+            takers = " or ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
+            flag = f"--{option.replace('_', '-')}"
+            raise InputError(f'{flag} {shown} is for --regions {takers}, not for "{name}"; leave one of them out')
     source.check(options)
     return source
-
-
-def _takes(name: str, option: str) -> bool:
-    """Return whether regions take an option."""
-    return name not in get_args(FeatureKind) and option in MASK_SOURCES.load(name).options
-
-
-def _flag(option: str) -> str:
-    return f"--{option.replace('_', '-')}"

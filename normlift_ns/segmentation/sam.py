@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import product
@@ -355,6 +354,9 @@ class PromptedNetwork(ABC):
         parts.extend(self.masks(lambda batch: measure_logits(self.enlarge(batch, size), offset), logits))
         return MaskMeasurements(*map(torch.cat, zip(*parts)))
 
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32)
+
     def _bilinear_weights(self, count: int, size: tuple[int, int], axis: int) -> tuple[Tensor, Tensor]:
         first, weights = bilinear_weights(count, self._side, self._input_size(size)[axis], size[axis])
         return first.to(self._device), weights.to(self._device)
@@ -402,7 +404,7 @@ class SamNetwork(PromptedNetwork):
 
     @torch.no_grad()
     def _embed(self, pixels: Tensor) -> list[Any]:
-        with torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32):
+        with self._autocast():
             return list(self._model.get_image_embeddings(pixels).float().split(1))
 
 
@@ -460,11 +462,6 @@ class _LibraryNetwork(PromptedNetwork):
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:
         raise NotImplementedError
-
-    @contextmanager
-    def _autocast(self) -> Iterator[None]:
-        with torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32):
-            yield
 
     _processor: Any
 
