@@ -32,7 +32,8 @@ from normlift_ns.encoders.base import FeatureSource, segmentation_workers
 from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
-from normlift_ns.encoders.weights import find_local_sam, has_local_clip_weights
+from normlift_ns.encoders.open_clip import has_local_clip_weights
+from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,

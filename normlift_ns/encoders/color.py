@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from normlift_ns.encoders.text_files import check_prompts
+from normlift_ns.encoders.text_files import RowEncoder, check_prompts
 from normlift_ns.errors import InputError, truncate_text
 
 if TYPE_CHECKING:
@@ -53,19 +53,13 @@ _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop",
 
 
 @dataclass(frozen=True)
-class ColorEncoder:
+class ColorEncoder(RowEncoder):
     """Encoder that compares mean CIELAB colors with color names; formulas in the module docstring. Needs neither
     weights nor a GPU."""
 
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "colour", "sigma": KERNEL_SIGMA}
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.

@@ -6,20 +6,22 @@ import os
 import re
 import string
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from normlift_ns.encoders.weights import (
     CONFIG_FILE,
     check_hub_access,
+    check_not_local,
+    check_packages,
     download_model,
     find_in_hub_cache,
-    is_local_path,
     read_json,
+    third_party_errors,
 )
-from normlift_ns.errors import InputError, summarize_error, truncate_text
+from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
@@ -337,7 +339,7 @@ def _is_shard(name: object) -> bool:
 # Location of a network: a local folder, the Hugging Face hub cache, or a download. Needs no torch.
 
 
-_MIN_VERSIONS = {"torch": (2, 6), "transformers": (4, 56)}
+_MIN_VERSIONS = {"torch": "2.6", "transformers": "4.56"}
 
 
 def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
@@ -348,18 +350,7 @@ def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
 
 def check_transformers_version(family: ModelFamily) -> None:
     """Raise InputError if installed packages are missing or too old."""
-    for package, minimum in _MIN_VERSIONS.items():
-        required = ".".join(map(str, minimum))
-        try:
-            installed = version(package)
-        except PackageNotFoundError:
-            installed = "none"
-        numbers = tuple(int(part) for part in installed.split(".")[:2] if part.isdigit())
-        if numbers < minimum:
-            raise InputError(
-                f"--encoder {family.name} needs {package} {required} or later, found {installed} (pip install -U "
-                f'"{package}>={required}"); --encoder open_clip does not'
-            )
+    check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "--encoder open_clip does not")
 
 
 def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
@@ -382,10 +373,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     if folder is not None:
         read_model_folder(folder, family)
         return
-    try:
+    with _download_errors(model, family):
         check_hub_access()
-    except OSError as error:
-        raise _unreachable(model, family, error) from None
 
 
 def check_model_name(model: str, family: ModelFamily) -> None:
@@ -399,10 +388,7 @@ def check_model_name(model: str, family: ModelFamily) -> None:
     )
     if os.path.isdir(model):
         return
-    if os.path.lexists(model):
-        raise InputError(f"{model}, given with --encoder-model, is not a folder; {example}")
-    if is_local_path(model, 2):
-        raise FileNotFoundError(f"{model}, given with --encoder-model, does not exist; {example}")
+    check_not_local(model, 2, "--encoder-model", "not a folder", example)
     if len(Path(model).parts) != 2:
         raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
 
@@ -434,17 +420,14 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
             raise InputError(f"{_other_architecture(model, config, family)}; {remedy}")
         return [*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]
 
-    try:
+    with _download_errors(model, family):
         return download_model(model, choose_files)
-    except InputError:
-        raise
-    except Exception as error:  # download clients raise exceptions without a common base class
-        raise _unreachable(model, family, error) from None
 
 
-def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
-    return FileNotFoundError(
-        f"the {family.title} network {model} is not on this machine and cannot be downloaded "
-        f"({summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
-        "that needs no weights: --encoder colour"
+def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
+    return third_party_errors(
+        f"the {family.title} network {model} is not on this machine and cannot be downloaded",
+        "go online once, give a folder with --encoder-model, or use the encoder that needs no weights: --encoder "
+        "colour",
+        FileNotFoundError,
     )

@@ -35,7 +35,8 @@ from normlift_ns.encoders.huggingface import (
     fetch_model,
     read_model_folder,
 )
-from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import CropFill
 
@@ -179,15 +180,9 @@ def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: s
         f"give another folder with --encoder-model, or a name such as {family.default_model}; or use "
         "--encoder open_clip"
     )
-    try:
+    with third_party_errors(f"{folder.path} is damaged or not a {family.title} network", remedy):
         model = _build_model(folder)
         tokenizer = _load_tokenizer(folder, model.config.text_config)
-    except MemoryError:
-        raise
-    except Exception as error:  # transformers and tokenizers define their own exceptions
-        raise InputError(
-            f"{folder.path} is damaged or not a {family.title} network ({summarize_error(error)}); {remedy}"
-        ) from None
     half = torch.device(device).type == "cuda"
     model = model.to(device, torch.float16 if half else torch.float32).eval().requires_grad_(False)
     mean, std = (torch.tensor(x, device=device)[:, None, None] for x in (folder.pixels.mean, folder.pixels.std))

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from normlift_ns.encoders import weights
+from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import (
     MODEL_FAMILIES,
     ModelFamily,
@@ -21,7 +21,7 @@ from normlift_ns.encoders.huggingface import (
     check_transformers_version,
     resolve_model_name,
 )
-from normlift_ns.encoders.open_clip import OPEN_CLIP_REMEDY, missing_patches_reason
+from normlift_ns.encoders.weights import check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
 from normlift_ns.registry import Registry
@@ -148,26 +148,22 @@ def _check_unchanged(pretrained: str, expected: object) -> None:
 
 def _check_weights(options: SourceOptions) -> None:
     """Raise FileNotFoundError if the weights are neither on this machine nor available for download."""
-    model, pretrained = options.encoder_model, options.encoder_pretrained
+    model, pretrained, remedy = options.encoder_model, options.encoder_pretrained, open_clip.OPEN_CLIP_REMEDY
     if Path(pretrained).is_file():
         return
-    if weights.is_local_path(pretrained, 1):
-        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {OPEN_CLIP_REMEDY}")
-    if weights.has_local_clip_weights(model, pretrained) is False:
-        try:
-            weights.check_hub_access()
-        except OSError as error:
-            raise FileNotFoundError(
-                f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded "
-                f"({error}); go online once, {OPEN_CLIP_REMEDY}"
-            ) from None
+    if is_local_path(pretrained, 1):
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
+    if open_clip.has_local_clip_weights(model, pretrained) is False:
+        problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
+        with third_party_errors(problem, f"go online once, {remedy}", FileNotFoundError):
+            check_hub_access()
 
 
 OPEN_CLIP = EncoderKind(
     _make_encoder,
     check=_check_weights,
     texts=_make_texts,
-    has_patches=lambda options: missing_patches_reason(options.encoder_model) is None,
+    has_patches=lambda options: open_clip.missing_patches_reason(options.encoder_model) is None,
     paths=("encoder_pretrained",),
 )
 """CLIP features of masked crops, or of patches."""

@@ -8,6 +8,7 @@ import os
 import struct
 import zipfile
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,6 +40,20 @@ class TextEncoder(Protocol):
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """See `FeatureSource.text`."""
         ...
+
+
+class RowEncoder(ABC):
+    """A text encoder that needs torch only for the type of its result."""
+
+    @abstractmethod
+    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
+        """Return one unit row per prompt."""
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return `rows` as a torch tensor."""
+        import torch  # noqa: PLC0415 (queries can do without torch)
+
+        return torch.from_numpy(self.rows(prompts))
 
 
 UNIT_TOLERANCE = 1e-3
@@ -109,7 +124,7 @@ _COMMENT_PREFIX = b"normlift_ns "
 
 
 @dataclass(frozen=True)
-class TextEmbeddingFile:
+class TextEmbeddingFile(RowEncoder):
     """Text embeddings from an NPZ file that holds one vector [D] per text, with the text as the name of the array.
 
     Raises:
@@ -143,21 +158,15 @@ class TextEmbeddingFile:
 
     @property
     def dimension(self) -> int | None:
-        """Length D of the embeddings; None for an empty file. Raises as `names`."""
+        """Length D of the embeddings; None for an empty file. Raises as `texts`."""
         return next((len(vector) for vector in self._vectors.values()), None)
 
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `names`.
+            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `texts`.
         """
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
-
-    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return `text` as a NumPy array, without torch."""
         check_prompts(prompts)
         return look_up_embeddings(prompts, self._vectors, str(self.file))
 
@@ -264,7 +273,7 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 
 @dataclass(frozen=True)
-class CachedTextEncoder:
+class CachedTextEncoder(RowEncoder):
     """A text encoder that caches its embeddings. The key: the text, and the settings that change its vector."""
 
     make_identity: Callable[[], dict[str, Any]]
@@ -275,12 +284,6 @@ class CachedTextEncoder:
     folder: Path | None
     """Contains one safetensors file per text; created if it does not exist. If the folder is None or cannot be written
     to, nothing is cached."""
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt.

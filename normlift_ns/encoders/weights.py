@@ -2,56 +2,44 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import json
 import os
-import pickle
-import struct
 import urllib.error
 import urllib.request
-import zipfile
-import zlib
-from collections.abc import Callable, Sequence
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
-
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, summarize_error
 
 CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
-"""Names of the weight files of OpenCLIP models in hub repositories."""
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 """Names of the weight files of SAM in the format of transformers."""
-THIRD_PARTY_ERRORS = (
-    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
-    ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
-    SafetensorError,
-)  # fmt: skip
-"""Exceptions that torch, safetensors and open_clip raise for a bad file or name. Out-of-memory errors are not among
-them."""
 
 
-def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
-    """Return whether the weights of an OpenCLIP model are on this machine.
+@contextmanager
+def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = InputError) -> Iterator[None]:
+    """Turn exceptions of other libraries, which have no common base class, into an error with a problem and a remedy.
 
-    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
-    Face hub.
-
-    >>> has_local_clip_weights("ViT-B-16", __file__)
-    True
+    Args:
+        error_type: InputError, or FileNotFoundError for downloads; the latter passes on InputErrors.
     """
-    if os.path.isfile(pretrained):
-        return True
-    location = _hub_location(model, pretrained)
-    return find_cached_clip_weights(location) is not None if location else None
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        if isinstance(error, InputError) and error_type is not InputError:
+            raise
+        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
+        raise error_type(f"{problem} ({reason}); {remedy}") from None
 
 
 def find_local_sam(checkpoint: str) -> Path | None:
@@ -74,47 +62,6 @@ def find_in_hub_cache(repository: str, *names: str) -> Path | None:
         return None
 
 
-def find_cached_clip_weights(location: str) -> Path | None:
-    """Return the path of the weights of an OpenCLIP model in the hub cache, or None.
-
-    Args:
-        location: "OWNER/NAME/" or "OWNER/NAME/FILE", as in open_clip's table of pretrained weights.
-    """
-    repository, name = os.path.split(location)
-    return find_in_hub_cache(repository, *([name] if name else _CLIP_FILES))
-
-
-def _hub_location(model: str, tag: str) -> str | None:
-    """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
-
-    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
-    hub, or the source has an unexpected form.
-    """
-    try:
-        spec = find_spec("open_clip")  # does not import the package
-        assert spec is not None and spec.origin is not None
-        source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
-        tables = {
-            node.targets[0].id: node.value
-            for node in ast.parse(source).body
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-        }
-        models = tables["_PRETRAINED"]
-        assert isinstance(models, ast.Dict)
-        names = [ast.literal_eval(key) for key in models.keys if key is not None]
-        entry = models.values[names.index(model.removesuffix("-quickgelu"))]
-        entry = tables[entry.id] if isinstance(entry, ast.Name) else entry
-        call = _argument(entry, tag.lower().replace("-", "_"))
-        return ast.literal_eval(_argument(call, "hf_hub"))
-    except (OSError, ValueError, LookupError, AttributeError, TypeError, AssertionError, SyntaxError, StopIteration):
-        return None
-
-
-def _argument(call: ast.AST, name: str) -> ast.expr:
-    """Return the value of a keyword argument of a call."""
-    return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
-
-
 def check_hub_access() -> None:
     """Raise OSError if the Hugging Face hub is not available for downloads; its own client would retry for most of a
     minute."""
@@ -135,7 +82,7 @@ def download_model(name: str, choose_files: Callable[[dict[str, Any]], Sequence[
     Args:
         choose_files: Returns patterns of further files; errors that it raises are passed on.
     Raises:
-        Exception: Download clients raise exceptions without a common base class.
+        Exception: See `third_party_errors`.
     """
     check_hub_access()
     download = importlib.import_module("huggingface_hub").snapshot_download
@@ -173,3 +120,32 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
     return content
+
+
+def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: str) -> None:
+    """Raise unless a name can be of another kind than local paths; for a name that is not the path of usable weights.
+
+    Args:
+        parts: As in `is_local_path`.
+        subject: What the name is, for the message.
+        problem: What a path is if it exists, for the message.
+    """
+    if os.path.lexists(name):
+        raise InputError(f"{subject} {name} is {problem}; {remedy}")
+    if is_local_path(name, parts):
+        raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
+
+
+def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:
+    """Raise InputError if installed packages are missing or older than "MAJOR.MINOR"."""
+    for package, minimum in minimums.items():
+        try:
+            installed = version(package)
+        except PackageNotFoundError:
+            installed = "none"
+        found, needed = (tuple(int(x) for x in text.split(".")[:2] if x.isdigit()) for text in (installed, minimum))
+        if found < needed:
+            raise InputError(
+                f"{subject} needs {package} {minimum} or later, found {installed} (pip install -U "
+                f'"{package}>={minimum}"); {alternative}'
+            )

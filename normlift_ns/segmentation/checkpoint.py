@@ -9,7 +9,7 @@ import importlib
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,12 @@ from torch import Tensor
 from normlift_ns.encoders.weights import (
     CONFIG_FILE,
     SAM_WEIGHT_FILES,
+    check_not_local,
+    check_packages,
     download_model,
     find_local_sam,
-    is_local_path,
     read_json,
+    third_party_errors,
 )
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
@@ -33,7 +35,7 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
-_MIN_TORCH = (2, 6)
+_MIN_TORCH = "2.6"
 _ALTERNATIVE = (
     "the first SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
 )
@@ -109,26 +111,9 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
         hint = "" if other is None else f" ({other.name} takes {prompts}: --regions {regions})"
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
-    _check_supported(kind)
+    if kind is not SAM:
+        check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
     return kind
-
-
-def _check_supported(kind: SamFamily) -> None:
-    """Raise InputError if the installed torch or transformers cannot run a network."""
-    if kind is SAM:
-        return
-    installed = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    if installed < _MIN_TORCH:
-        raise InputError(
-            f"{kind.name} needs torch {'.'.join(map(str, _MIN_TORCH))} or newer, found {torch.__version__}; "
-            f"{_ALTERNATIVE}"
-        )
-    transformers = import_transformers()
-    if not hasattr(transformers, f"{kind.prefix}Model"):
-        raise InputError(
-            f"{kind.name} needs transformers {kind.min_transformers} or newer, found {transformers.__version__}; "
-            f"{_ALTERNATIVE}"
-        )
 
 
 def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
@@ -282,10 +267,7 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
             with checkpoint_errors(path, title):
                 read_sam_family(folder, kinds)
         return
-    if os.path.lexists(path):
-        raise InputError(f"{title} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
-    if is_local_path(checkpoint, 2):
-        raise FileNotFoundError(f"{title} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
+    check_not_local(checkpoint, 2, f"{title} checkpoint", "neither a file nor a folder", remedy)
     if len(path.parts) != 2:
         raise InputError(
             f"{title} checkpoint {checkpoint!r} is neither a path nor a name on the hub such as {example}; {remedy}"
@@ -327,18 +309,9 @@ def transformers_folder(path: Path) -> Path | None:
     return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
 
 
-@contextmanager
-def checkpoint_errors(path: Path, title: str = "SAM") -> Iterator[None]:
+def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
     """Turn errors of other libraries into an InputError that names the checkpoint."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:  # the configs of transformers raise their own exception types for invalid values
-        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
-        raise InputError(
-            f"{title} checkpoint {path} is damaged or not a checkpoint of {title} ({reason}); {_REMEDIES[title]}"
-        ) from None
+    return third_party_errors(f"{title} checkpoint {path} is damaged or not a checkpoint of {title}", _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
@@ -367,15 +340,10 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
     local = find_local_sam(checkpoint)
     if local is not None:
         return local
-    files = [WEIGHTS_FILE, *more]
-    try:
+    title, files = _title(kinds), [WEIGHTS_FILE, *more]
+    problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
+    with third_party_errors(problem, f"go online once, or {_REMEDIES[title]}", FileNotFoundError):
         return download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
-    except Exception as error:  # the download client raises unrelated exception types
-        title = _title(kinds)
-        raise FileNotFoundError(
-            f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded "
-            f"({summarize_error(error)}); go online once, or {_REMEDIES[title]}"
-        ) from None
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:

@@ -194,14 +194,11 @@ class LabelFiles(RegionDefaults):
 
     def files(self, name: str) -> tuple[Path, ...]:
         path = self.path(name)
+        what = f"{self.description} {path}"
         if not path.is_file():
-            raise InputError(
-                f"{self.description} {path} is not a file; expected a PNG or NPY file with one value per pixel"
-            )
+            raise InputError(f"{what} is not a file; expected a PNG or NPY file with one value per pixel")
         if path.stat().st_size > _MAX_MAP_BYTES:
-            raise InputError(
-                f"{self.description} {path} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}"
-            )
+            raise InputError(f"{what} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}")
         return (path,)
 
     def path(self, name: str) -> Path:
@@ -263,6 +260,7 @@ class LabelFiles(RegionDefaults):
             ValueError: If a map cannot be read, or has color channels or fractional values.
         """
         path = self.path(name)
+        what = f"{self.description} {path}"
         if path.suffix == ".npy":
             maps = read_npy(path, self.description)
         else:
@@ -270,21 +268,18 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{self.description} {path} is a grayscale PNG with {bits} bits, whose values readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits, whose values readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{self.description} {path} has {maps.shape[2]} color channels; expected one value per pixel: save "
+                f"{what} has {maps.shape[2]} color channels; expected one value per pixel: save "
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(
-                f"{self.description} {path} holds {maps.dtype}; expected an integer type: save it with "
-                ".astype(numpy.int32)"
-            )
+            raise InputError(f"{what} holds {maps.dtype}; expected an integer type: save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
-            raise InputError(f"{self.description} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         return maps.reshape(-1, *maps.shape[-2:])
 

@@ -166,7 +166,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = {"torch": "2.6.0", "transformers": "5.0.0"}
-    monkeypatch.setattr("normlift_ns.encoders.huggingface.version", lambda package: versions[package])
+    monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: versions[package])
     options = SourceOptions(encoder="siglip2", encoder_model="/nowhere")
     for package, found, least in (("torch", "2.5.1", "2.6"), ("transformers", "4.49.0", "4.56")):
         versions[package], enough = found, versions[package]

@@ -97,5 +97,5 @@ def test_what_is_refused(written, tmp_path, monkeypatch):
     refused(lambda: Sam3Network.load(str(tmp_path), "cpu"), str(tmp_path), "no tokenizer.json")
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2"}))
     refused(lambda: Sam3Masks(("mug",), str(tmp_path)), "'sam2'", "--regions sam)", "'sam3'")
-    monkeypatch.setattr(torch, "__version__", "2.5.0")
+    monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: "2.5.0")
     refused(lambda: Sam3Masks(("mug",), str(written)), "SAM 3", "torch 2.6", "2.5.0")

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.open_clip import check_open_clip_names
-from normlift_ns.encoders.weights import find_in_hub_cache, find_local_sam, has_local_clip_weights
+from normlift_ns.encoders.open_clip import check_open_clip_names, has_local_clip_weights
+from normlift_ns.encoders.weights import find_in_hub_cache, find_local_sam
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, DEFAULT_SAM
 from normlift_ns.segmentation.checkpoint import check_sam_checkpoint
 from tests.encoders.tiny import refused
@@ -66,7 +66,7 @@ def test_weights_of_sam_and_a_broken_cache(empty_hub: Path, tmp_path: Path) -> N
 def test_imports_stay_light() -> None:
     code = """
 import sys
-from normlift_ns.encoders.weights import has_local_clip_weights
+from normlift_ns.encoders.open_clip import has_local_clip_weights
 has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
 assert {"torch", "open_clip", "transformers", "numpy", "skimage"}.isdisjoint(sys.modules), sys.modules.keys()
 """
