@@ -7,13 +7,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from normlift_ns.encoders.base import FeatureSource, RegionFeatures, Regions
 from normlift_ns.encoders.plugins import PluginRegions
 from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, make_encoder
 from normlift_ns.errors import InputError
-from normlift_ns.options import FeatureKind, SourceOptions
+from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
 
 
@@ -27,9 +27,6 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             without imported features.
         FileNotFoundError: As those. Also if the folder of features does not exist.
     """
-    if options.features not in get_args(FeatureKind):
-        known = ", ".join(get_args(FeatureKind))
-        raise InputError(f"unknown features {options.features!r}; --features is one of {known}")
     if options.features != "none":
         return _make_masks(options, options.features, device)
     if options.features_dir is not None:
@@ -82,7 +79,10 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
             "earlier version lifted it; lift again with: ns-normlift"
         )
     try:
-        options = SourceOptions(**_restore_settings(settings))
+        if not isinstance(settings, Mapping):
+            raise TypeError(f"found {type(settings).__name__}, expected an object")
+        values: Any = {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
+        options = SourceOptions(**values)
     except TypeError as error:
         raise InputError(
             f"the run's manifest has feature options that this version does not know ({error}); lift again "
@@ -96,13 +96,6 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
             "again with: ns-normlift"
         )
     return source
-
-
-def _restore_settings(settings: object) -> dict[str, Any]:
-    """Convert settings from a manifest back to option values."""
-    if not isinstance(settings, Mapping):
-        raise TypeError(f"found {type(settings).__name__}, expected an object")
-    return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, ViewFeatures
+from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.io.arrays import load_tensors, save_tensors
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
@@ -48,38 +48,45 @@ def cached(source: FeatureSource, folder: Path, *, compute: bool = True) -> Feat
 
 
 @dataclass(frozen=True)
-class CachedRegions:
-    """`Regions` that cache the label maps of all levels.
+class _Cached:
+    """A part of a source whose results are cached."""
 
-    The key: the image, its name, the files that are read for it, and the settings except the selected level.
-    """
-
-    regions: Regions
+    inner: Any
+    """Computes the results."""
     folder: Path
-    """Contains one safetensors file per image; created if it does not exist."""
+    """Contains one safetensors file per image, and per level if an encoder computes them; created if it does not
+    exist."""
     compute: bool = True
     """See `cached`."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        return self.regions.identity
+        return self.inner.identity
+
+
+@dataclass(frozen=True)
+class CachedRegions(_Cached):
+    """`Regions` that cache the label maps of all levels.
+
+    The key: the image, its name, the files that are read for it, and the settings except the selected level.
+    """
 
     @property
     def at_once(self) -> int:
-        return self.regions.at_once
+        return self.inner.at_once
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        return self.regions.chosen
+        return self.inner.chosen
 
     def files(self, name: str) -> tuple[Path, ...]:
-        return self.regions.files(name)
+        return self.inner.files(name)
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
         labels = _read(path, "labels", lambda labels: _are_labels(labels, image), self.compute)
         if labels is None:
-            labels = self.regions.labels(image, name)
+            labels = self.inner.labels(image, name)
             labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
             _write(path, "labels", labels)
         return labels.int()
@@ -91,21 +98,11 @@ class CachedRegions:
 
 
 @dataclass(frozen=True)
-class CachedEncoder:
+class CachedEncoder(_Cached):
     """An `Encoder` that caches region features.
 
     The key: the image, the labels, and the settings.
     """
-
-    encoder: Encoder
-    folder: Path
-    """Contains one safetensors file per image and level; created if it does not exist."""
-    compute: bool = True
-    """See `cached`."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.encoder.identity
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         return next(self.encode_each([(image, labels)]))
@@ -125,7 +122,7 @@ class CachedEncoder:
                     paths.append(path)
                     yield image, labels
 
-        for features in self.encoder.encode_each(uncached()):
+        for features in self.inner.encode_each(uncached()):
             _write(paths.popleft(), "features", features)
             while (rows := pending.popleft()) is not None:
                 yield rows
@@ -133,7 +130,7 @@ class CachedEncoder:
         yield from (rows for rows in pending if rows is not None)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.encoder.text(prompts)
+        return self.inner.text(prompts)
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Return the cache path of the features of the regions of an image, whether the file exists or not."""
@@ -141,36 +138,26 @@ class CachedEncoder:
 
 
 @dataclass(frozen=True)
-class CachedPatches:
+class CachedPatches(_Cached):
     """A `PatchFeatures` that caches the features of images.
 
     The key: the image, and the settings.
     """
 
-    source: PatchFeatures
-    folder: Path
-    """Contains one safetensors file per image; created if it does not exist."""
-    compute: bool = True
-    """See `cached`."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.source.identity
-
     def available(self, names: Sequence[str]) -> list[str]:
-        return self.source.available(names)
+        return self.inner.available(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = cache_path(self.folder, self.identity, *_key_parts(image))
-        labels = self.source.labels(image)
+        labels = self.inner.labels(image)
         features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1), self.compute)
         if features is None:
-            features = self.source.features(image, name)
+            features = self.inner.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.source.text(prompts)
+        return self.inner.text(prompts)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from normlift_ns.encoders.text_files import RowEncoder, check_prompts
+from normlift_ns.encoders.text_files import LazyTextEncoder, check_prompts
 from normlift_ns.errors import InputError, truncate_text
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop",
 
 
 @dataclass(frozen=True)
-class ColorEncoder(RowEncoder):
+class ColorEncoder(LazyTextEncoder):
     """Encoder that compares mean CIELAB colors with color names; formulas in the module docstring. Needs neither
     weights nor a GPU."""
 

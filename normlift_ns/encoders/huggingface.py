@@ -11,16 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.weights import (
-    CONFIG_FILE,
-    check_hub_access,
-    check_not_local,
-    check_packages,
-    download_model,
-    find_in_hub_cache,
-    read_json,
-    third_party_errors,
-)
+from normlift_ns.encoders import weights
+from normlift_ns.encoders.weights import CONFIG_FILE, find_in_hub_cache, read_json
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
@@ -72,7 +64,7 @@ MODEL_FAMILIES = {
             "SigLIP 2",
             ("siglip", "siglip2"),
             "google/siglip2-base-patch16-224",
-            str.lower,  # Not every tokenizer that is published with it does so.
+            str.lower,  # as in its training; not every tokenizer that is published with it does so
             "<pad>",
             ("Siglip2", "Gemma"),
         ),
@@ -81,7 +73,7 @@ MODEL_FAMILIES = {
             "MetaCLIP 2",
             ("metaclip_2",),
             "facebook/metaclip-2-worldwide-huge-quickgelu",
-            str,  # unchanged
+            str,  # unchanged, as it expects them
             "<pad>",
             ("XLMRoberta",),
             (0.48145466, 0.4578275, 0.40821073),
@@ -350,7 +342,7 @@ def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
 
 def check_transformers_version(family: ModelFamily) -> None:
     """Raise InputError if installed packages are missing or too old."""
-    check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "--encoder open_clip does not")
+    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "--encoder open_clip does not")
 
 
 def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
@@ -374,7 +366,7 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
         read_model_folder(folder, family)
         return
     with _download_errors(model, family):
-        check_hub_access()
+        weights.check_hub_access()
 
 
 def check_model_name(model: str, family: ModelFamily) -> None:
@@ -386,11 +378,8 @@ def check_model_name(model: str, family: ModelFamily) -> None:
     example = (
         f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default_model}"
     )
-    if os.path.isdir(model):
-        return
-    check_not_local(model, 2, "--encoder-model", "not a folder", example)
-    if len(Path(model).parts) != 2:
-        raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
+    if not os.path.isdir(model):
+        weights.check_not_local(model, 2, "--encoder-model", "not a folder", example)
 
 
 def find_local_model(model: str) -> Path | None:
@@ -399,8 +388,8 @@ def find_local_model(model: str) -> Path | None:
     if os.path.isdir(model):
         return Path(model).resolve()
     config = find_in_hub_cache(model, CONFIG_FILE)
-    weights = find_in_hub_cache(model, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
-    return None if config is None or weights is None else config.parent
+    found = find_in_hub_cache(model, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
+    return None if config is None or found is None else config.parent
 
 
 def fetch_model(model: str, family: ModelFamily) -> Path:
@@ -421,11 +410,11 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
         return [*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]
 
     with _download_errors(model, family):
-        return download_model(model, choose_files)
+        return weights.download_model(model, choose_files)
 
 
 def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
-    return third_party_errors(
+    return weights.third_party_errors(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded",
         "go online once, give a folder with --encoder-model, or use the encoder that needs no weights: --encoder "
         "colour",

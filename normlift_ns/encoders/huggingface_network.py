@@ -27,7 +27,6 @@ from torch.nn.functional import linear
 
 from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.huggingface import (
-    MODEL_FAMILIES,
     TOKENIZER_FILE,
     ModelFamily,
     ModelFolder,
@@ -236,8 +235,7 @@ class HuggingFaceEncoder(NetworkEncoder):
         FileNotFoundError: If the folder does not exist.
     """
 
-    kind: str
-    """siglip, siglip2 or metaclip2."""
+    family: ModelFamily
     model: str
     """Folder, or name on the hub."""
     fill: CropFill = "black"
@@ -247,16 +245,11 @@ class HuggingFaceEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         check_model_name(self.model, self.family)
 
-    @property
-    def family(self) -> ModelFamily:
-        """The family of the network."""
-        return MODEL_FAMILIES[self.kind]
-
     @cached_property
     def _identity(self) -> dict[str, Any]:
         """Settings of the image features. The network is identified by the content of its files, which are downloaded
         if missing."""
-        return {"kind": self.kind, "weights": file_digest(*self._folder.files), "fill": self.fill}
+        return {"kind": self.family.name, "weights": file_digest(*self._folder.files), "fill": self.fill}
 
     @cached_property
     def network(self) -> HuggingFaceNetwork:

@@ -15,6 +15,7 @@ import io
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -222,7 +223,10 @@ class LangSplat:
             ValueError: If a file is damaged or has another shape, tables have rows of different lengths, or two images
                 share their files.
         """
-        files_of = {name: files for name in names if (files := self._files(name)) is not None}
+        files_of: dict[str, _Files] = {}
+        for name in names:
+            with suppress(FileNotFoundError):
+                files_of[name] = self._files(name)
         absent = [name for name in names if name not in files_of]
         if len(absent) > 0:
             problem = f"{len(absent)} of {len(names)} images have no features in {self.folder}: {', '.join(absent)}"
@@ -248,7 +252,7 @@ class LangSplat:
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         """Return the regions and features of an image; raises as `available`, and ValueError if ids are not
         integers."""
-        files = self._require_files(name)
+        files = self._files(name)
         table, valid = read_feature_table(files.features)
         valid = torch.cat([valid, valid.new_zeros(1)])  # row -1
         maps = read_segment_map(files.segments, len(table))
@@ -271,20 +275,14 @@ class LangSplat:
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.texts.text(prompts)
 
-    def _files(self, name: str) -> _Files | None:
+    def _files(self, name: str) -> _Files:
         """Return the files of an image. LangSplat cuts names at the first dot, other programs at the last one."""
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")
             if stem != "" and all(map(os.path.isfile, files)):
                 return files
-        return None
-
-    def _require_files(self, name: str) -> _Files:
-        files = self._files(name)
-        if files is None:
-            raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
-        return files
+        raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
 
     def _fit(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
         """Return maps of the size of the image; raise InputError if they may show another crop."""
@@ -302,7 +300,7 @@ class LangSplat:
 
     def size(self, name: str) -> tuple[Path, int, int]:
         """Return the path, width and height of the segment map of an image; raises as `view`."""
-        files = self._require_files(name)
+        files = self._files(name)
         _, height, width = open_segment_map(files.segments).shape
         return files.segments, width, height
 

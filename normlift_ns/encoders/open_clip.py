@@ -201,18 +201,25 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
     """
-    table, local = import_open_clip_module("pretrained"), Path(pretrained)
-    if os.path.isfile(local):
-        tags = table.list_pretrained_tags_by_model(model)
-        published = table.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
-        return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
-    published = table.get_pretrained_cfg(model, pretrained)
+    path, published = find_local_clip_weights(model, pretrained)
+    if path is not None:
+        return path, published
     origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
     problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
-    with third_party_errors(
-        f"{problem} and cannot be downloaded", f"go online once, {OPEN_CLIP_REMEDY}", FileNotFoundError
-    ):
-        return find_cached_clip_weights(published.get("hf_hub", "")) or _download(published), published
+    remedy = f"go online once, {OPEN_CLIP_REMEDY}"
+    with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
+        return _download(published), published
+
+
+def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
+    """Return the weight file, None if it is not on this machine, and the description of `find_open_clip_weights`."""
+    table = import_open_clip_module("pretrained")
+    if os.path.isfile(pretrained):
+        tags = table.list_pretrained_tags_by_model(model)
+        published = table.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
+        return Path(pretrained), {key: published[key] for key in ("mean", "std") if key in published}
+    published = table.get_pretrained_cfg(model, pretrained)
+    return find_cached_clip_weights(published.get("hf_hub", "")), published
 
 
 def _download(published: dict[str, Any]) -> Path:

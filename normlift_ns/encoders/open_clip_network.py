@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,7 @@ from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.open_clip import (
     OPEN_CLIP_REMEDY,
     check_open_clip_names,
-    find_cached_clip_weights,
+    find_local_clip_weights,
     find_open_clip_weights,
     import_open_clip,
     import_open_clip_module,
@@ -258,10 +257,9 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     try:
         config = open_clip_model_config(model) or {}
         sizes = config["text_cfg"]
-        local = _find_local_weights(model, pretrained)
-        if local is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
+        path, published = find_local_clip_weights(model, pretrained)
+        if path is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
             return None
-        path, published = local
         shapes = _shapes(config["embed_dim"], **sizes)
         weights = _read(path, shapes)
         check_template(template)
@@ -276,15 +274,6 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     quick_gelu = config.get("quick_gelu", False) or published.get("quick_gelu", False)
     weights = {name: weight.to(device, torch.float32) for name, weight in weights.items()}
     return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
-
-
-def _find_local_weights(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
-    """Return the weight file and open_clip's description of its training; None if it is not on this machine."""
-    if os.path.isfile(pretrained):
-        return Path(pretrained), {}
-    published = import_open_clip_module("pretrained").get_pretrained_cfg(model, pretrained)
-    path = find_cached_clip_weights(published.get("hf_hub", ""))
-    return None if path is None else (path, published)
 
 
 def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:

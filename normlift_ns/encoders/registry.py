@@ -7,11 +7,11 @@ heavy.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import (
@@ -27,30 +27,9 @@ from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOption
 from normlift_ns.registry import Registry
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float32
-    from torch import Tensor
-
     from normlift_ns.encoders.base import Encoder
     from normlift_ns.encoders.color import ColorEncoder
-    from normlift_ns.encoders.text_files import CachedTextEncoder, TextEncoder
-
-
-class LazyTextEncoder(Protocol):
-    """A text encoder that imports torch only if it has to run a network."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """Every setting that changes the vectors, as JSON-serializable values."""
-        ...
-
-    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
-        ...
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        ...
+    from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEncoder
 
 
 @dataclass(frozen=True)
@@ -185,9 +164,8 @@ def _make_kind(family: ModelFamily) -> EncoderKind:
         from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder  # noqa: PLC0415 (needs torch)
 
         check_transformers_version(family)
-        return HuggingFaceEncoder(
-            family.name, resolve_model_name(options, family), options.crop_fill, device, options.text_template
-        )
+        model = resolve_model_name(options, family)
+        return HuggingFaceEncoder(family, model, options.crop_fill, device, options.text_template)
 
     check = partial(check_huggingface_options, family=family)
     return EncoderKind(make, check=check, has_patches=lambda options: True, paths=("encoder_model",))

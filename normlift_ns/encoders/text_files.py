@@ -8,7 +8,6 @@ import os
 import struct
 import zipfile
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -42,12 +41,12 @@ class TextEncoder(Protocol):
         ...
 
 
-class RowEncoder(ABC):
-    """A text encoder that needs torch only for the type of its result."""
+class LazyTextEncoder(TextEncoder, Protocol):
+    """A text encoder that imports torch only if it has to run a network."""
 
-    @abstractmethod
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt."""
+        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
+        ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """Return `rows` as a torch tensor."""
@@ -124,7 +123,7 @@ _COMMENT_PREFIX = b"normlift_ns "
 
 
 @dataclass(frozen=True)
-class TextEmbeddingFile(RowEncoder):
+class TextEmbeddingFile(LazyTextEncoder):
     """Text embeddings from an NPZ file that holds one vector [D] per text, with the text as the name of the array.
 
     Raises:
@@ -273,7 +272,7 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 
 @dataclass(frozen=True)
-class CachedTextEncoder(RowEncoder):
+class CachedTextEncoder(LazyTextEncoder):
     """A text encoder that caches its embeddings. The key: the text, and the settings that change its vector."""
 
     make_identity: Callable[[], dict[str, Any]]

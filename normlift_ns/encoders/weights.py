@@ -126,7 +126,7 @@ def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: s
     """Raise unless a name can be of another kind than local paths; for a name that is not the path of usable weights.
 
     Args:
-        parts: As in `is_local_path`.
+        parts: As in `is_local_path`; 2: names on the hub, OWNER/NAME.
         subject: What the name is, for the message.
         problem: What a path is if it exists, for the message.
     """
@@ -134,6 +134,8 @@ def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: s
         raise InputError(f"{subject} {name} is {problem}; {remedy}")
     if is_local_path(name, parts):
         raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
+    if parts == 2 and len(Path(name).parts) != parts:
+        raise InputError(f"{subject} {name!r} is neither a path nor a name on the hub; {remedy}")
 
 
 def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:

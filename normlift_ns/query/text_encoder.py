@@ -14,13 +14,12 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from normlift_ns.encoders.registry import (
     EncoderKind,
-    LazyTextEncoder,
     absolute_paths,
     encoder_kind,
     find_encoder_kind,
     make_encoder,
 )
-from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile
+from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import RelevancyRule, SourceOptions

@@ -18,16 +18,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.weights import (
-    CONFIG_FILE,
-    SAM_WEIGHT_FILES,
-    check_not_local,
-    check_packages,
-    download_model,
-    find_local_sam,
-    read_json,
-    third_party_errors,
-)
+from normlift_ns.encoders import weights
+from normlift_ns.encoders.weights import CONFIG_FILE, SAM_WEIGHT_FILES, read_json
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
@@ -112,7 +104,7 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
     if kind is not SAM:
-        check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
+        weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
     return kind
 
 
@@ -164,8 +156,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     for name, part in parts.items():
         if not isinstance(part, Mapping):
             raise InputError(f"{name} of config.json is {type(part).__name__}, expected an object")
-    check_config_sizes(parts)
-    sizes = _drop_other_entries(parts)
+    sizes = check_config_sizes(parts)
     for path, expected in kind.nested_types:
         part: Any = sizes
         for name in path.split("."):
@@ -176,41 +167,33 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     return sizes
 
 
-def _drop_other_entries(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        dropped = [name for name in value if str(name).startswith("_") or "attn_impl" in str(name)]
-        return {name: _drop_other_entries(x) for name, x in value.items() if name not in (*_NOT_SIZES, *dropped)}
-    return [_drop_other_entries(x) for x in value] if isinstance(value, list) else value
-
-
-def check_config_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
-    """Raise InputError for implausible sizes, because transformers builds a network of any size from its config."""
+def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
+    """Return values of a config without the entries that are not sizes; raise InputError for implausible sizes, because
+    transformers builds a network of any size from its config."""
     if depth > _MAX_DEPTH or (isinstance(values, Mapping | list) and len(values) > _MAX_PARTS):
         raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
     if isinstance(values, Mapping):
-        for key, value in values.items():
-            check_config_sizes(value, str(key), depth + 1)
-    elif isinstance(values, list):
-        for value in values:
-            check_config_sizes(value, name, depth + 1)
-    elif isinstance(values, int | float):
+        checked = {key: check_config_sizes(value, str(key), depth + 1) for key, value in values.items()}
+        return {k: x for k, x in checked.items() if not (k in _NOT_SIZES or k.startswith("_") or "attn_impl" in k)}
+    if isinstance(values, list):
+        return [check_config_sizes(value, name, depth + 1) for value in values]
+    if isinstance(values, int | float):
         limit = _MAX_PARTS if name.startswith("num_") or name.endswith("depth") else _MAX_SIZE
         if not -1 <= values <= limit:
             raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {limit:,}")
+    return values
 
 
 # SAM checkpoints: a folder in the format of transformers, a file published by Meta, or a name on the hub.
 
 
-SAM_REMEDY = (
-    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
-    "as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel"
-)
-SAM3_REMEDY = (
-    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
-    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment"
-)
-_REMEDIES = {"SAM": SAM_REMEDY, "SAM 3": SAM3_REMEDY}
+_REMEDIES = {
+    "SAM": f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file "
+    "such as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel",
+    "SAM 3": f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
+    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment",
+}
+"""What to do about a checkpoint, by the name of the networks."""
 _FIRST = "the first SAM, ViT-B, -L or -H"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
@@ -256,22 +239,13 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
         FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
-    title, example = _title(kinds), DEFAULT_SAM if kinds is POINT_PROMPT_FAMILIES else DEFAULT_SAM3
-    remedy = _REMEDIES[title]
-    path = Path(checkpoint)
-    if os.path.isfile(path) or os.path.isdir(path):
-        folder = transformers_folder(path)
-        if folder is not None and not (folder / "config.json").is_file():
-            raise InputError(f"{title} checkpoint {path} is a folder without config.json; {remedy}")
-        if folder is not None:
-            with checkpoint_errors(path, title):
-                read_sam_family(folder, kinds)
-        return
-    check_not_local(checkpoint, 2, f"{title} checkpoint", "neither a file nor a folder", remedy)
-    if len(path.parts) != 2:
-        raise InputError(
-            f"{title} checkpoint {checkpoint!r} is neither a path nor a name on the hub such as {example}; {remedy}"
-        )
+    title = _title(kinds)
+    path, remedy = Path(checkpoint), _REMEDIES[title]
+    if not (os.path.isfile(path) or os.path.isdir(path)):
+        weights.check_not_local(checkpoint, 2, f"{title} checkpoint", "neither a file nor a folder", remedy)
+    elif (folder := transformers_folder(path)) is not None:
+        with checkpoint_errors(path, title):
+            read_sam_family(folder, kinds)
 
 
 def _title(kinds: Mapping[str, SamFamily]) -> str:
@@ -311,7 +285,8 @@ def transformers_folder(path: Path) -> Path | None:
 
 def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
     """Turn errors of other libraries into an InputError that names the checkpoint."""
-    return third_party_errors(f"{title} checkpoint {path} is damaged or not a checkpoint of {title}", _REMEDIES[title])
+    problem = f"{title} checkpoint {path} is damaged or not a checkpoint of {title}"
+    return weights.third_party_errors(problem, _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
@@ -337,13 +312,13 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
-    local = find_local_sam(checkpoint)
+    local = weights.find_local_sam(checkpoint)
     if local is not None:
         return local
     title, files = _title(kinds), [WEIGHTS_FILE, *more]
     problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
-    with third_party_errors(problem, f"go online once, or {_REMEDIES[title]}", FileNotFoundError):
-        return download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
+    with weights.third_party_errors(problem, f"go online once, or {_REMEDIES[title]}", FileNotFoundError):
+        return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:

@@ -34,27 +34,8 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is not an image, or is truncated.
     """
-    return torch.from_numpy(read_pixels(path, "RGB"))
-
-
-def read_pixels(
-    path: Path, mode: str | None = None, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS
-) -> np.ndarray:
-    """Read the pixels of an image file, [H, W] or [H, W, channels], in a Pillow mode or as stored; raises as
-    `read_image`.
-
-    Args:
-        description: Kind of file, for messages.
-        formats: Accepted formats, by their Pillow names.
-    """
-    with _open_image(path, description, formats) as image:
-        return np.array(image if mode is None else image.convert(mode))
-
-
-def read_size(path: Path, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS) -> tuple[int, int]:
-    """Read width and height of an image file without decoding it; arguments and errors as in `read_pixels`."""
-    with _open_image(path, description, formats) as image:
-        return image.size
+    with _open_image(path, "image", _IMAGE_FORMATS) as image:
+        return torch.from_numpy(np.array(image.convert("RGB")))
 
 
 @contextmanager
@@ -248,7 +229,8 @@ class LabelFiles(RegionDefaults):
         """Return the path, width and height of the label map of an image; raises as `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
-            return path, *read_size(path, description=self.description, formats=_MAP_FORMATS)
+            with _open_image(path, self.description, _MAP_FORMATS) as image:
+                return path, *image.size
         _, height, width = self.values(name).shape
         return path, width, height
 
@@ -264,7 +246,8 @@ class LabelFiles(RegionDefaults):
         if path.suffix == ".npy":
             maps = read_npy(path, self.description)
         else:
-            maps = read_pixels(path, description=self.description, formats=_MAP_FORMATS)
+            with _open_image(path, self.description, _MAP_FORMATS) as image:
+                maps = np.array(image)
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(

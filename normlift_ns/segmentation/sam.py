@@ -599,10 +599,10 @@ class _Candidates(NamedTuple):
     def at(self, index: Tensor) -> _Candidates:
         return _Candidates(*(value[index] for value in self))
 
-    def in_level(self, level: SamLevel) -> Int64[Tensor, " k"]:
-        """Return the indices of the candidates of a level."""
-        selected = torch.ones_like(self.channel) if level == "default" else self.channel == SAM_LEVELS.index(level) - 1
-        return selected.nonzero()[:, 0]
+    def by_level(self) -> dict[SamLevel, Int64[Tensor, " k"]]:
+        """Return the indices of the candidates of every level."""
+        selected = [torch.ones_like(self.channel, dtype=torch.bool), *(self.channel == i for i in range(3))]
+        return {level: flags.nonzero()[:, 0] for level, flags in zip(SAM_LEVELS, selected)}
 
 
 @dataclass(frozen=True)
@@ -644,10 +644,8 @@ class SamMasks(RegionDefaults):
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
     @torch.no_grad()
-    def masks(
-        self, image: UInt8[Tensor, "h w 3"], levels: Sequence[SamLevel] = SAM_LEVELS
-    ) -> dict[SamLevel, Bool[Tensor, "m h w"]]:
-        """Return the masks of some levels, on the device and in their order.
+    def masks(self, image: UInt8[Tensor, "h w 3"]) -> dict[SamLevel, Bool[Tensor, "m h w"]]:
+        """Return the masks of all levels, on the device and in their order.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
@@ -661,11 +659,10 @@ class SamMasks(RegionDefaults):
         crop_images = [on_device[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
         embeddings = self.network.embed(self.network.pixels(crop_images))
         parts: list[_Candidates] = []
-        per_crop: dict[SamLevel, list[Tensor]] = {level: [] for level in levels}
+        per_crop: dict[SamLevel, list[Tensor]] = {level: [] for level in SAM_LEVELS}
         for i, embedding in enumerate(embeddings):
             candidates, before = self._candidates(embedding, crops[i], i, size), sum(len(part.crop) for part in parts)
-            groups: dict[SamLevel, Tensor] = {level: candidates.in_level(level) for level in levels}
-            kept = _distinct(groups, candidates.boxes, candidates.predicted_iou, rules)
+            kept = _distinct(candidates.by_level(), candidates.boxes, candidates.predicted_iou, rules)
             rows = torch.cat(list(kept.values())).unique()
             parts.append(candidates.at(rows))
             for level, index in kept.items():
@@ -673,7 +670,7 @@ class SamMasks(RegionDefaults):
         candidates = _Candidates(*map(torch.cat, zip(*parts)))
         area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=self.device)
         smaller_first = 1 / area[candidates.crop]
-        groups = {level: torch.cat(index) for level, index in per_crop.items()}
+        groups: dict[SamLevel, Tensor] = {level: torch.cat(index) for level, index in per_crop.items()}
         kept = _distinct(groups, candidates.boxes, smaller_first, rules)
         rows = torch.cat(list(kept.values())).unique()
         candidates = candidates.at(rows)
