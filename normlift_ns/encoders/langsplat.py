@@ -155,7 +155,7 @@ def shorten_list(values: Sequence[object]) -> str:
 
 # Features of LangSplat's preprocessing as a source, and export of the features of any source in the same format.
 #
-# `langsplat.files` lists the accepted variants of the files. Images may also lack features, or be larger than their
+# The module docstring lists the accepted variants of the files. Images may also lack features, or be larger than their
 # maps, because LangSplat shrinks large images; maps are then resized by nearest neighbor. The folder may be the
 # dataset with its language_features/, or language_features/ with another such folder inside, as in one published
 # archive.
@@ -374,9 +374,8 @@ def write_langsplat(
     segments = torch.stack(
         [torch.where(labels >= 0, labels + start, -1) for (labels, _), start in zip(levels, offsets)]
     )
-    stem = _stem(name)
     for suffix, array in (
         ("s", segments.float().expand(len(LANGSPLAT_LEVELS), -1, -1)),
         ("f", torch.cat([rows for _, rows in levels])),
     ):
-        write_npy(folder / f"{stem}_{suffix}.npy", array.contiguous().numpy(), overwrite)
+        write_npy(folder / f"{_stem(name)}_{suffix}.npy", array.contiguous().numpy(), overwrite)

@@ -32,7 +32,10 @@ _ALTERNATIVE = (
     "the first SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
 )
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
-_NOT_SIZES = ("auto_map", "quantization_config", "architectures", "dtype", "torch_dtype", "transformers_version")
+_NOT_SIZES = re.compile(
+    r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
+)
+"""Names of entries that are not sizes."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,7 @@ def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> 
         raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
     if isinstance(values, Mapping):
         checked = {key: check_config_sizes(value, str(key), depth + 1) for key, value in values.items()}
-        return {k: x for k, x in checked.items() if not (k in _NOT_SIZES or k.startswith("_") or "attn_impl" in k)}
+        return {key: value for key, value in checked.items() if not _NOT_SIZES.match(key)}
     if isinstance(values, list):
         return [check_config_sizes(value, name, depth + 1) for value in values]
     if isinstance(values, int | float):
@@ -379,7 +382,6 @@ def config_from_weights(state: Mapping[str, Tensor]) -> Any:
     patch = shape["image_encoder.patch_embed.proj.weight"][-1]
     blocks = sum(name.endswith(".attn.rel_pos_h") for name in shape)
     extent, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
-    global_blocks = [i for i in range(blocks) if extent[i] == 2 * grid - 1]
     channels = shape["image_encoder.neck.0.weight"][0]
     layer = "mask_decoder.transformer.layers.0"
     transformers = import_transformers()
@@ -391,7 +393,7 @@ def config_from_weights(state: Mapping[str, Tensor]) -> Any:
         image_size=grid * patch,
         patch_size=patch,
         window_size=(min(extent) + 1) // 2,
-        global_attn_indexes=global_blocks,
+        global_attn_indexes=[i for i in range(blocks) if extent[i] == 2 * grid - 1],
         num_pos_feats=channels // 2,
         mlp_dim=shape["image_encoder.blocks.0.mlp.lin1.weight"][0],
     )
