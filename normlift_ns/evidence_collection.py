@@ -360,7 +360,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
-    maps = maps.regions if isinstance(maps, CachedRegions) else maps
+    maps = maps.inner if isinstance(maps, CachedRegions) else maps
     if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
         return
     file, width, height = maps.size(name)

@@ -23,7 +23,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.transforms import capture_transforms
-from normlift_ns.encoders.registry import LazyTextEncoder
+from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.exports import (
     CloudTransfer,

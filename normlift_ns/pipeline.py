@@ -31,10 +31,9 @@ from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_splat import SplatScene
-from normlift_ns.encoders.base import FeatureSource
+from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.langsplat import check_unique_stems
-from normlift_ns.encoders.precomputed import PrecomputedFeatures, precomputed_features
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import (
     EvidenceCollection,

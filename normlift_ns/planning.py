@@ -30,9 +30,10 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
 from normlift_ns.encoders.build import resolve_regions
-from normlift_ns.encoders.cache import NotCachedError, cached_only
+from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
-from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_weights
+from normlift_ns.encoders.open_clip import has_local_clip_weights
+from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,
@@ -445,7 +446,7 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     missing = []
     if (kind := resolve_regions(options, device)) in ("sam", "sam3"):
         model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
-        if not has_local_sam_weights(model):
+        if find_local_sam(model) is None:
             missing.append(f"those of SAM, {model}")
     family = MODEL_FAMILIES.get(options.encoder)
     if family is not None and find_local_model(resolve_model_name(options, family)) is None:
@@ -588,14 +589,14 @@ def measure_capture(
         return _Observed(block, seconds)
 
     chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
-    observe_cached = partial(observe, source=cached_only(source, cache))
-    cached = _cached_views(chosen if options.reuse_evidence else (), observe_cached)
-    new = [index for index in chosen if index not in cached]
+    observe_cached = partial(observe, source=cached(source, cache, compute=False))
+    known = _cached_views(chosen if options.reuse_evidence else (), observe_cached)
+    new = [index for index in chosen if index not in known]
     batch = segmentation_workers(source)
     encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
     observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
-    cached_s = _per_view(observe_cached(list(cached))) if len(cached) > 0 else None
-    block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
+    cached_s = _per_view(observe_cached(list(known))) if len(known) > 0 else None
+    block = _joined([observed.block, *known.values()], _MAX_VIEWS)
 
     def rasterize(folder: Path) -> Evidence:
         return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
@@ -617,10 +618,10 @@ def measure_capture(
         load_s=load_s,
         features_s=_per_view(observed),
         cached_features_s=cached_s,
-        cached_features_share=len(cached) / len(chosen),
+        cached_features_share=len(known) / len(chosen),
         evidence_s=rasterized.seconds / count,
         cached_evidence_s=rasterized.cached_seconds / count,
-        cached_evidence_share=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
+        cached_evidence_share=_evidence_cached(gaussians, observed, known, len(chosen), options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),

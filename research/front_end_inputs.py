@@ -12,6 +12,7 @@ import torch
 import transformers
 from torch import Tensor
 
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.options import SamPrecision
@@ -86,7 +87,7 @@ def random_siglip2(size: Size, folder: Path, device: str) -> HuggingFaceEncoder:
     tokenizer = transformers.Siglip2Tokenizer(model_input_names=["input_ids"], padding_side="right")
     model.save_pretrained(folder)
     transformers.SiglipProcessor(transformers.SiglipImageProcessor(), tokenizer).save_pretrained(folder)
-    return HuggingFaceEncoder("siglip2", str(folder), device=device)
+    return HuggingFaceEncoder(MODEL_FAMILIES["siglip2"], str(folder), device=device)
 
 
 def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:

@@ -31,7 +31,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import lift
 from normlift_ns.demo.capture import demo_cameras, view_image
 from normlift_ns.encoders.base import RegionFeatures
-from normlift_ns.encoders.color import ColorEncoder, ColorTextEncoder
+from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.options import RefineConfig, RelevancyRule
 from normlift_ns.query.histogram import Histogram, presence_limit, relevancy_histogram
 from normlift_ns.segmentation.regions import Grid, Superpixels
@@ -153,7 +153,7 @@ def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
     """Rows of the plain room, seen by the colour encoder."""
     from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
 
-    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorTextEncoder()
+    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorEncoder()
     names = [name.removeprefix("xkcd:") for name in XKCD_COLORS if "/" not in name]
     classes, survey = texts.text(room.names), texts.text(names)
     others = survey[(survey @ classes.T).amax(1) < NOT_A_COLOUR]

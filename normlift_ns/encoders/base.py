@@ -1,4 +1,4 @@
-"""Protocols of feature sources, regions and encoders, and dense features of patches.
+"""Protocols of feature sources, regions and encoders, dense features of patches, and precomputed features.
 
 The two steps are separate. `Regions` segments an image, an `Encoder` embeds regions and prompts in one space, and
 `RegionFeatures` combines the two into a `FeatureSource`. The rest of the package uses `FeatureSource` only. Code that
@@ -13,20 +13,21 @@ from __future__ import annotations
 import math
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import blake2b
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.batching import AdaptiveBatches, prefetch_map
-from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder
+from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder, check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
 from normlift_ns.segmentation.regions import resample_nearest
 
@@ -177,7 +178,7 @@ class Encoder(TextEncoder, Protocol):
         """Yield `encode` of several views in order; results may differ from `encode` by rounding. The iterator takes a
         view from `views` only when all earlier features have been yielded, or when batching that view with earlier ones
         is faster."""
-        ...
+        return (self.encode(image, labels) for image, labels in views)
 
 
 @dataclass(frozen=True)
@@ -339,7 +340,7 @@ class PatchFeatures:
     """A `FeatureSource` of patches.
 
     Raises:
-        ValueError: If the network has no features of patches, or the count is below 1.
+        ValueError: If the network has no features of patches.
     """
 
     encoder: DenseEncoder
@@ -348,8 +349,6 @@ class PatchFeatures:
     """Approximate number of patches per image, at least 1."""
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise InputError(f"number of regions per image must be at least 1, got {self.count}")
         reason = self.encoder.why_not_dense
         if reason is not None:
             raise InputError(reason)
@@ -409,3 +408,127 @@ def resize_image(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Floa
     return torch.nn.functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False).clamp(
         0, 255
     )
+
+
+# Precomputed features: label maps and vectors from memory.
+
+
+@dataclass(frozen=True)
+class PrecomputedFeatures:
+    """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings, on the CPU."""
+
+    views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
+    """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length > 0."""
+    texts: Mapping[str, Float[Tensor, " d"]]
+    """Embeddings by text."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """A digest of the content of all images."""
+        digest = blake2b(digest_size=16)
+        for name, (labels, vectors) in self.views.items():
+            digest.update(f"{name} {labels.dtype} {tuple(labels.shape)} {vectors.dtype}".encode())
+            digest.update(labels.numpy().tobytes())
+            digest.update(vectors.numpy().tobytes())
+        return {"kind": "given", "content": digest.hexdigest()}
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        unknown = sorted(set(self.views) - set(names))
+        if len(unknown) > 0:
+            raise InputError(
+                f"features were given for {unknown[0]!r}, which is not a training image; there are {len(names)}, from "
+                f"{names[0]!r} to {names[-1]!r}"
+            )
+        return [name for name in names if name in self.views]
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        labels, vectors = self.views[name]
+        if labels.shape != image.shape[:2]:
+            raise InputError(
+                f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
+                "width, undistorted, after lift_downscale); pass labels of that size"
+            )
+        return ViewFeatures(labels.int(), torch.from_numpy(unit_rows(vectors)))
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        check_prompts(prompts)
+        return torch.from_numpy(look_up_embeddings(prompts, self.texts, "the given texts"))
+
+
+def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> PrecomputedFeatures:
+    """Return a source of precomputed features from tensors, arrays or lists.
+
+    Args:
+        features: One pair of labels and vectors per training image, in order; or a mapping from image names to pairs,
+            which may omit images.
+        texts: Vectors by text.
+        names: Names of all training images.
+    Raises:
+        ValueError: If `features` is empty or a list of another length. If vectors are zero, not finite, or not
+            [regions, D] ([D] for a text) with the same D everywhere. Also if labels are not an integer matrix, or name
+            a region without a vector. Also if a text is empty, or cannot be a file name in an archive. The message
+            names the image or the text.
+    """
+    if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
+        raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")
+    if not isinstance(features, Mapping):
+        if len(features) != len(names):
+            raise InputError(
+                f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; pass one "
+                "pair per image in the order of scene.train.names, or a dictionary with those names as keys"
+            )
+        features = dict(zip(names, features))
+    if len(features) == 0:
+        raise InputError("features are empty; pass labels and vectors of at least one training image")
+    if texts is not None and not (isinstance(texts, Mapping) and all(isinstance(text, str) for text in texts)):
+        raise InputError("texts must be a dictionary that maps texts to vectors")
+    views = {name: _convert_view(name, pair) for name, pair in features.items()}
+    vectors = {text: _convert_text(text, vector) for text, vector in (texts or {}).items()}
+    lengths = {rows.shape[1] for _, rows in views.values()} | set(map(len, vectors.values()))
+    if len(lengths) > 1:
+        raise InputError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
+    return PrecomputedFeatures(views, vectors)
+
+
+def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
+    """Return the labels and vectors of one image; raise InputError unless the labels name regions that have a vector
+    with a direction."""
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
+    try:
+        labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
+    except ValueError as error:  # rows of different lengths
+        raise InputError(f"labels of {name} must be a matrix of integers ({error})") from None
+    if labels.dtype.kind not in "iub":
+        raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
+    labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
+    if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
+        raise InputError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
+    low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
+    if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
+        raise InputError(
+            f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
+            f"{tuple(labels.shape)} with values in {low}..{high}"
+        )
+    return labels, vectors
+
+
+def _convert_text(text: str, values: Any) -> Tensor:
+    """Return the vector of a text; raise InputError unless the text can be stored and its vector has a direction."""
+    vector = _to_floats(values)
+    if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
+        raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
+    if text.strip() == "" or text.endswith(".npy") or "\0" in text:
+        raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains NUL characters")
+    return vector
+
+
+def _to_floats(values: Any) -> Tensor:
+    """Return the values as a detached float32 or float64 tensor on the CPU."""
+    try:
+        tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"vectors must be numbers ({error})") from None
+    if tensor.is_complex():
+        raise InputError("vectors must be real, got complex numbers")
+    return tensor if tensor.dtype == torch.float64 else tensor.float()

@@ -1,4 +1,4 @@
-"""Builders of feature sources, encoders and regions from `SourceOptions`."""
+"""Builders of feature sources and regions from `SourceOptions`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from normlift_ns.encoders.base import Encoder, FeatureSource, RegionFeatures, Regions
-from normlift_ns.encoders.plugins import PluginEncoder, PluginRegions
-from normlift_ns.encoders.registry import ENCODERS, absolute_paths, encoder_kind
-from normlift_ns.encoders.text_files import TextEmbeddingFile, TextEncoder
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.plugins import PluginRegions
+from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, make_encoder
 from normlift_ns.errors import InputError
-from normlift_ns.options import FeatureKind, SourceOptions
+from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
 
 
@@ -28,9 +27,6 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             without imported features.
         FileNotFoundError: As those. Also if the folder of features does not exist.
     """
-    if options.features not in get_args(FeatureKind):
-        known = ", ".join(get_args(FeatureKind))
-        raise InputError(f"unknown features {options.features!r}; --features is one of {known}")
     if options.features != "none":
         return _make_masks(options, options.features, device)
     if options.features_dir is not None:
@@ -62,12 +58,8 @@ def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, An
     if options.features == "none":
         options = replace(options, regions=resolve_regions(options, device))
     settings = {**asdict(options), **absolute_paths(options)}
-    settings["sam_model"] = None if options.sam_model is None else _absolute_if_exists(options.sam_model)
+    settings["sam_model"] = None if options.sam_model is None else absolute_if_exists(options.sam_model)
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}
-
-
-def _absolute_if_exists(name: str) -> str:
-    return os.path.abspath(name) if os.path.exists(name) else name
 
 
 def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
@@ -87,7 +79,10 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
             "earlier version lifted it; lift again with: ns-normlift"
         )
     try:
-        options = SourceOptions(**_restore_settings(settings))
+        if not isinstance(settings, Mapping):
+            raise TypeError(f"found {type(settings).__name__}, expected an object")
+        values: Any = {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
+        options = SourceOptions(**values)
     except TypeError as error:
         raise InputError(
             f"the run's manifest has feature options that this version does not know ({error}); lift again "
@@ -101,34 +96,6 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
             "again with: ns-normlift"
         )
     return source
-
-
-def _restore_settings(settings: object) -> dict[str, Any]:
-    """Convert settings from a manifest back to option values."""
-    if not isinstance(settings, Mapping):
-        raise TypeError(f"found {type(settings).__name__}, expected an object")
-    return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
-
-
-def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
-    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
-    return make_encoder(options, device) if options.text_vectors is None else TextEmbeddingFile(options.text_vectors)
-
-
-def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """Return the encoder of the options.
-
-    Args:
-        device: Device of the network, such as "cuda"; results are always on the CPU.
-    Raises:
-        ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
-            rejects the options.
-        FileNotFoundError: If a weight file does not exist.
-    """
-    kind = encoder_kind(options.encoder)
-    if options.encoder in ENCODERS.built_in:
-        return kind.make(options, device)
-    return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:

@@ -10,118 +10,83 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, ViewFeatures
+from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.io.arrays import load_arrays, save_arrays
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
-
-
-def cached(source: FeatureSource, folder: Path) -> FeatureSource:
-    """Return a source that caches expensive results in a folder.
-
-    Raises (later, when a view is requested):
-        OSError: If the folder cannot be written to, as when the disk is full.
-    """
-    if isinstance(source, PatchFeatures):
-        return CachedPatches(source, folder / "features")
-    if not isinstance(source, RegionFeatures):
-        return source
-    regions = CachedRegions(source.regions, folder / "regions")
-    encoder = CachedEncoder(source.encoder, folder / "features")
-    return replace(source, regions=regions, encoder=encoder)
 
 
 class NotCachedError(Exception):
     """A result that is not in the cache."""
 
 
-def cached_only(source: FeatureSource, folder: Path) -> FeatureSource:
-    """Return a source that reads cached results from a folder and never computes any that would be cached.
+def cached(source: FeatureSource, folder: Path, *, compute: bool = True) -> FeatureSource:
+    """Return a source that caches expensive results in a folder; sources without any are returned unchanged.
 
-    Its `view` raises `NotCachedError` if a result for the image is missing. Sources that are not cached are returned
-    unchanged.
+    Args:
+        compute: False: never compute results that would be cached.
+    Raises (later, when a view is requested):
+        OSError: If the folder cannot be written to, as when the disk is full.
+        NotCachedError: If `compute` is False, and a result for the image is missing.
     """
-    result: Any = cached(source, folder)
-    if isinstance(result, CachedPatches):
-        return replace(result, source=cast(Any, _NoPatches(result.source)))
-    if not isinstance(result, RegionFeatures):
-        return result
-    regions, encoder = cast(Any, result.regions), cast(Any, result.encoder)
-    return replace(
-        result,
-        regions=replace(regions, regions=_NoRegions(regions.regions)),
-        encoder=replace(encoder, encoder=_NoEncoder(encoder.encoder)),
-    )
-
-
-class _Stub:
-    """A stand-in with the settings of another object, which computes nothing."""
-
-    def __init__(self, original: Any) -> None:
-        self._original = original
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._original, name)
-
-
-class _NoPatches(_Stub):
-    def features(self, image: Tensor, name: str) -> Tensor:
-        raise NotCachedError
-
-
-class _NoRegions(_Stub):
-    def labels(self, image: Tensor, name: str) -> Tensor:
-        raise NotCachedError
-
-
-class _NoEncoder(_Stub):
-    def encode_each(self, views: Iterable[Any]) -> Iterator[Tensor]:
-        for _ in views:
-            raise NotCachedError
-        yield from ()
+    if isinstance(source, PatchFeatures):
+        return CachedPatches(source, folder / "features", compute)
+    if not isinstance(source, RegionFeatures):
+        return source
+    regions = CachedRegions(source.regions, folder / "regions", compute)
+    return RegionFeatures(regions, CachedEncoder(source.encoder, folder / "features", compute))
 
 
 @dataclass(frozen=True)
-class CachedRegions:
+class _Cached:
+    """A part of a source whose results are cached."""
+
+    inner: Any
+    """Computes the results."""
+    folder: Path
+    """Contains one safetensors file per image, and per level if an encoder computes them; created if it does not
+    exist."""
+    compute: bool = True
+    """See `cached`."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return self.inner.identity
+
+
+@dataclass(frozen=True)
+class CachedRegions(_Cached):
     """`Regions` that cache the label maps of all levels.
 
     The key: the image, its name, the files that are read for it, and the settings except the selected level.
     """
 
-    regions: Regions
-    folder: Path
-    """Contains one safetensors file per image; created if it does not exist."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.regions.identity
-
     @property
     def at_once(self) -> int:
-        return self.regions.at_once
+        return self.inner.at_once
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        return self.regions.chosen
+        return self.inner.chosen
 
     def files(self, name: str) -> tuple[Path, ...]:
-        return self.regions.files(name)
+        return self.inner.files(name)
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
-        labels = _read(path, "labels", lambda labels: _are_labels(labels, image))
+        labels = _read(path, "labels", lambda labels: _are_labels(labels, image), self.compute)
         if labels is None:
-            labels = self.regions.labels(image, name)
+            labels = self.inner.labels(image, name)
             labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
             _write(path, "labels", labels)
         return labels.int()
@@ -133,19 +98,11 @@ class CachedRegions:
 
 
 @dataclass(frozen=True)
-class CachedEncoder:
+class CachedEncoder(_Cached):
     """An `Encoder` that caches region features.
 
     The key: the image, the labels, and the settings.
     """
-
-    encoder: Encoder
-    folder: Path
-    """Contains one safetensors file per image and level; created if it does not exist."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.encoder.identity
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         return next(self.encode_each([(image, labels)]))
@@ -160,12 +117,12 @@ class CachedEncoder:
             for image, labels in views:
                 path = self.path(image, labels)
                 count = int(labels.max()) + 1 if labels.numel() > 0 else 0
-                pending.append(_read(path, "features", partial(_are_units, count=count)))
+                pending.append(_read(path, "features", partial(_are_units, count=count), self.compute))
                 if pending[-1] is None:
                     paths.append(path)
                     yield image, labels
 
-        for features in self.encoder.encode_each(uncached()):
+        for features in self.inner.encode_each(uncached()):
             _write(paths.popleft(), "features", features)
             while (rows := pending.popleft()) is not None:
                 yield rows
@@ -173,7 +130,7 @@ class CachedEncoder:
         yield from (rows for rows in pending if rows is not None)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.encoder.text(prompts)
+        return self.inner.text(prompts)
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Return the cache path of the features of the regions of an image, whether the file exists or not."""
@@ -181,34 +138,26 @@ class CachedEncoder:
 
 
 @dataclass(frozen=True)
-class CachedPatches:
+class CachedPatches(_Cached):
     """A `PatchFeatures` that caches the features of images.
 
     The key: the image, and the settings.
     """
 
-    source: PatchFeatures
-    folder: Path
-    """Contains one safetensors file per image; created if it does not exist."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.source.identity
-
     def available(self, names: Sequence[str]) -> list[str]:
-        return self.source.available(names)
+        return self.inner.available(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = cache_path(self.folder, self.identity, *_key_parts(image))
-        labels = self.source.labels(image)
-        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
+        labels = self.inner.labels(image)
+        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1), self.compute)
         if features is None:
-            features = self.source.features(image, name)
+            features = self.inner.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.source.text(prompts)
+        return self.inner.text(prompts)
 
 
 @dataclass(frozen=True)
@@ -229,7 +178,12 @@ class CachedTextMasks:
         """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.segment`."""
         size = (image.shape[0], image.shape[1])
         paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
-        packed = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
+        expected = torch.Size((size[0], -(-size[1] // 8)))  # packed bits
+
+        def are_bits(bits: Tensor) -> bool:
+            return bits.dtype == torch.uint8 and bits.shape == expected
+
+        packed = {text: _read(path, "bits", are_bits) for text, path in paths.items()}
         new = [text for text, bits in packed.items() if bits is None]
         for text, masks in zip(new, self._network.segment(image, new) if len(new) > 0 else []):
             packed[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
@@ -247,23 +201,21 @@ class CachedTextMasks:
         return Sam3Network.load(self.checkpoint, self.device)
 
 
-def _are_bits(bits: Tensor, size: tuple[int, int]) -> bool:
-    """Return whether a cached tensor has the type and shape of packed masks."""
-    return bits.dtype == torch.uint8 and bits.shape == (size[0], -(-size[1] // 8))
-
-
 def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
     """Return the parts of a cache key that identify a tensor: its type and shape, and its content."""
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
-def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool]) -> Tensor | None:
-    """Return a cached tensor; None if it is missing, damaged, cached under another key, or not valid."""
-    try:
+def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True) -> Tensor | None:
+    """Return a cached tensor; if it is missing, damaged, cached under another key, or not valid, return None, or raise
+    NotCachedError if results must not be computed."""
+    with suppress(FileNotFoundError, ValueError, KeyError):
         tensor = load_arrays(path, key=path.stem, framework="pt").arrays[name] if os.path.isfile(path) else None
-    except (FileNotFoundError, ValueError, KeyError):
-        return None
-    return tensor if tensor is not None and is_valid(tensor) else None
+        if tensor is not None and is_valid(tensor):
+            return tensor
+    if not compute:
+        raise NotCachedError
+    return None
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from normlift_ns.encoders.text_files import check_prompts
+from normlift_ns.encoders.text_files import LazyTextEncoder, check_prompts
 from normlift_ns.errors import InputError, truncate_text
 
 if TYPE_CHECKING:
@@ -53,18 +53,13 @@ _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop",
 
 
 @dataclass(frozen=True)
-class ColorTextEncoder:
-    """Text encoder for color names; formulas in the module docstring."""
+class ColorEncoder(LazyTextEncoder):
+    """Encoder that compares mean CIELAB colors with color names; formulas in the module docstring. Needs neither
+    weights nor a GPU."""
 
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "colour", "sigma": KERNEL_SIGMA}
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.
@@ -81,11 +76,21 @@ class ColorTextEncoder:
             rows.append(embed_colors(np.stack([_names()[name] for name in names])).mean(axis=0))
         return _normalized(np.stack(rows)).astype(np.float32)
 
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        import torch  # noqa: PLC0415 (queries can do without torch)
+        from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 
-def check_no_template(template: str) -> None:
-    """Raise ValueError unless the template is the bare prompt, which is all that color names need."""
-    if template != "{}":
-        raise InputError(f"--text-template {template!r} is for --encoder open_clip; leave it out")
+        labels = labels.cpu()
+        depth, y, x = (labels >= 0).nonzero(as_tuple=True)
+        lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
+        pixels = torch.bincount(region)
+        total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
+        return torch.from_numpy(embed_colors((total / pixels[:, None]).numpy())).float()
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        return (self.encode(image, labels) for image, labels in views)
 
 
 def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"]:
@@ -121,19 +126,7 @@ def find_color_names(prompt: str) -> list[str]:
     >>> find_color_names("dark red shoes on a grey-green floor")
     ['dark red', 'grey green']
     """
-    words = _words(prompt)
-    names = []
-    i = 0
-    while i < len(words):
-        for length in range(min(len(words) - i, _longest_name()), 0, -1):
-            name = " ".join(words[i : i + length])
-            if name in _names():
-                names.append(name)
-                i += length
-                break
-        else:
-            i += 1
-    return names
+    return _name_pattern().findall(" ".join(_words(prompt)))
 
 
 def _words(text: str) -> list[str]:
@@ -160,8 +153,10 @@ def _names() -> dict[str, np.ndarray]:
 
 
 @cache
-def _longest_name() -> int:
-    return max(len(name.split()) for name in _names())
+def _name_pattern() -> re.Pattern[str]:
+    """Return the pattern of all names, the longest first; they consist of whole words."""
+    names = sorted(_names(), key=len, reverse=True)
+    return re.compile(rf"(?<!\S)(?:{'|'.join(map(re.escape, names))})(?!\S)")
 
 
 @cache
@@ -189,28 +184,3 @@ def _no_color_message(prompt: str) -> str:
         f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD "
         f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip for other words"
     )
-
-
-# The color encoder: regions are embedded by their mean colors; see `encoders.color`.
-
-
-@dataclass(frozen=True)
-class ColorEncoder(ColorTextEncoder):
-    """Encoder that compares mean CIELAB colors with color names; formulas above. Needs neither weights nor
-    a GPU."""
-
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        import torch  # noqa: PLC0415 (as above)
-        from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
-
-        labels = labels.cpu()
-        depth, y, x = (labels >= 0).nonzero(as_tuple=True)
-        lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
-        pixels = torch.bincount(region)
-        total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
-        return torch.from_numpy(embed_colors((total / pixels[:, None]).numpy())).float()
-
-    def encode_each(
-        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
-    ) -> Iterator[Float32[Tensor, "r d"]]:
-        return (self.encode(image, labels) for image, labels in views)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, NamedTuple, Protocol, get_args
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
@@ -23,7 +23,6 @@ from torch.nn.functional import normalize
 from normlift_ns.encoders.base import resize_image
 from normlift_ns.encoders.batching import AdaptiveBatches
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
-from normlift_ns.errors import InputError
 from normlift_ns.options import CropFill
 
 _GPU_BATCH, _BATCH = 128, 8
@@ -71,8 +70,6 @@ class NetworkEncoder(ABC):
     """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
     def __post_init__(self) -> None:
-        if self.fill not in get_args(CropFill):
-            raise InputError(f"crop fill must be one of {', '.join(get_args(CropFill))}; got {self.fill!r}")
         check_template(self.template)
         self._check_names()
 
@@ -81,14 +78,19 @@ class NetworkEncoder(ABC):
         """Check the name of the network without loading or downloading anything."""
 
     @property
-    @abstractmethod
     def identity(self) -> dict[str, Any]:
         """Settings of the image features. Files are identified by their content, independent of their path."""
+        return self._identity
+
+    @cached_property
+    @abstractmethod
+    def _identity(self) -> dict[str, Any]:
+        """See `identity`."""
 
     @property
-    @abstractmethod
     def why_not_dense(self) -> str | None:
         """See `DenseEncoder.why_not_dense`."""
+        return None
 
     @cached_property
     @abstractmethod

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
-import json
-import math
 import os
 import re
 import string
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from normlift_ns.encoders import weights
-from normlift_ns.errors import InputError, summarize_error, truncate_text
+from normlift_ns.encoders.weights import CONFIG_FILE, find_in_hub_cache, read_json
+from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
-
-
-def _lowercase(text: str) -> str:
-    """Convert to lower case, which SigLIP 2 was trained on. Not every tokenizer that is published with it does so."""
-    return text.lower()
 
 
 def _canonicalize(text: str) -> str:
@@ -33,11 +26,6 @@ def _canonicalize(text: str) -> str:
     'a red mug on the table'
     """
     return re.sub(r"\s+", " ", text.lower().translate(_PUNCTUATION)).strip()
-
-
-def _unchanged(text: str) -> str:
-    """Return the text unchanged, as MetaCLIP 2 expects it."""
-    return text
 
 
 @dataclass(frozen=True)
@@ -76,7 +64,7 @@ MODEL_FAMILIES = {
             "SigLIP 2",
             ("siglip", "siglip2"),
             "google/siglip2-base-patch16-224",
-            _lowercase,
+            str.lower,  # as in its training; not every tokenizer that is published with it does so
             "<pad>",
             ("Siglip2", "Gemma"),
         ),
@@ -85,7 +73,7 @@ MODEL_FAMILIES = {
             "MetaCLIP 2",
             ("metaclip_2",),
             "facebook/metaclip-2-worldwide-huge-quickgelu",
-            _unchanged,
+            str,  # unchanged, as it expects them
             "<pad>",
             ("XLMRoberta",),
             (0.48145466, 0.4578275, 0.40821073),
@@ -114,12 +102,7 @@ def family_of_tokenizer(name: str) -> ModelFamily | None:
 # because configurations may name code, kernels to download and quantized formats. Needs no torch.
 
 
-CONFIG_FILE, WEIGHTS_FILE, WEIGHTS_INDEX_FILE, TOKENIZER_FILE = (
-    "config.json",
-    "model.safetensors",
-    "model.safetensors.index.json",
-    "tokenizer.json",
-)
+WEIGHTS_FILE, WEIGHTS_INDEX_FILE, TOKENIZER_FILE = "model.safetensors", "model.safetensors.index.json", "tokenizer.json"
 _TOKENIZER_CONFIG, _SPECIAL_TOKENS = "tokenizer_config.json", "special_tokens_map.json"
 _PREPROCESSING_FILES = ("preprocessor_config.json", "processor_config.json")
 """The second file holds the contents of the first under "image_processor", among other entries."""
@@ -131,7 +114,7 @@ METADATA_FILES = (
     _SPECIAL_TOKENS,
     *_PREPROCESSING_FILES,
 )
-_MAX_JSON_BYTES, _MAX_SHARDS = 2**27, 256
+_MAX_SHARDS = 256
 _MAX_SIZES = {
     "vocab_size": 2**21, "hidden_size": 2**14, "intermediate_size": 2**17, "num_hidden_layers": 256,
     "num_attention_heads": 256, "max_position_embeddings": 2**12, "projection_size": 2**14, "projection_dim": 2**14,
@@ -207,10 +190,7 @@ def _read(path: Path, family: ModelFamily) -> ModelFolder:
     config = read_json(path / CONFIG_FILE)
     kind = config.get("model_type")
     if kind not in family.model_types:
-        expected = " or ".join(map(repr, family.model_types))
-        raise InputError(
-            f"{CONFIG_FILE} has the architecture {kind!r:.60}, expected that of {family.title}, {expected}"
-        )
+        raise InputError(_other_architecture(CONFIG_FILE, config, family))
     text, vision = (_sizes(config.get(f"{part}_config"), f"{part}_config") for part in ("text", "vision"))
     whole = {key: value for key, value in _sizes(config, CONFIG_FILE).items() if key == "projection_dim"}
     if vision.pop("vision_use_head", True) is not True:
@@ -219,23 +199,11 @@ def _read(path: Path, family: ModelFamily) -> ModelFolder:
     return ModelFolder(path, kind, text, vision, whole, _pixels(path, family, kind), tokens, _weights(path))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        InputError: If the file does not exist, is not JSON, or holds anything but an object.
-    """
-    if not path.is_file():
-        raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
-    if path.stat().st_size > _MAX_JSON_BYTES:
-        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
-    try:
-        content = json.loads(path.read_text("utf8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
-    return content
+def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFamily) -> str:
+    """Return the message for a network of another family."""
+    expected = " or ".join(map(repr, family.model_types))
+    kind = config.get("model_type")
+    return f"{origin} has the architecture {kind!r:.60}, expected that of {family.title}, {expected}"
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:
@@ -360,19 +328,10 @@ def _is_shard(name: object) -> bool:
     return isinstance(name, str) and name.endswith(".safetensors") and name == os.path.basename(name)
 
 
-def patches_per_side(count: int) -> int:
-    """Return the number of patches along the side of a square image that has at most `count` patches.
-
-    >>> patches_per_side(256), patches_per_side(300)
-    (16, 17)
-    """
-    return max(1, math.isqrt(count))
-
-
 # Location of a network: a local folder, the Hugging Face hub cache, or a download. Needs no torch.
 
 
-_MIN_VERSIONS = {"torch": (2, 6), "transformers": (4, 56)}
+_MIN_VERSIONS = {"torch": "2.6", "transformers": "4.56"}
 
 
 def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
@@ -383,18 +342,7 @@ def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
 
 def check_transformers_version(family: ModelFamily) -> None:
     """Raise InputError if installed packages are missing or too old."""
-    for package, minimum in _MIN_VERSIONS.items():
-        required = ".".join(map(str, minimum))
-        try:
-            installed = version(package)
-        except PackageNotFoundError:
-            installed = "none"
-        numbers = tuple(int(part) for part in installed.split(".")[:2] if part.isdigit())
-        if numbers < minimum:
-            raise InputError(
-                f"--encoder {family.name} needs {package} {required} or later, found {installed} (pip install -U "
-                f'"{package}>={required}"); --encoder open_clip does not'
-            )
+    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "--encoder open_clip does not")
 
 
 def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
@@ -417,10 +365,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     if folder is not None:
         read_model_folder(folder, family)
         return
-    try:
+    with _download_errors(model, family):
         weights.check_hub_access()
-    except OSError as error:
-        raise _unreachable(model, family, error) from None
 
 
 def check_model_name(model: str, family: ModelFamily) -> None:
@@ -432,14 +378,8 @@ def check_model_name(model: str, family: ModelFamily) -> None:
     example = (
         f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default_model}"
     )
-    if os.path.isdir(model):
-        return
-    if os.path.lexists(model):
-        raise InputError(f"{model}, given with --encoder-model, is not a folder; {example}")
-    if weights.is_local_path(model, 2):
-        raise FileNotFoundError(f"{model}, given with --encoder-model, does not exist; {example}")
-    if len(Path(model).parts) != 2:
-        raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
+    if not os.path.isdir(model):
+        weights.check_not_local(model, 2, "--encoder-model", "not a folder", example)
 
 
 def find_local_model(model: str) -> Path | None:
@@ -447,14 +387,9 @@ def find_local_model(model: str) -> Path | None:
     incomplete."""
     if os.path.isdir(model):
         return Path(model).resolve()
-    if not weights.is_in_hub_cache(model, CONFIG_FILE):
-        return None
-    hub = importlib.import_module("huggingface_hub")
-    config, *weight_files = (
-        hub.try_to_load_from_cache(model, name) for name in (CONFIG_FILE, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
-    )
-    complete = isinstance(config, str) and any(isinstance(file, str) for file in weight_files)
-    return Path(config).parent if complete else None
+    config = find_in_hub_cache(model, CONFIG_FILE)
+    found = find_in_hub_cache(model, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
+    return None if config is None or found is None else config.parent
 
 
 def fetch_model(model: str, family: ModelFamily) -> Path:
@@ -464,31 +399,24 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
         InputError: If it has another architecture.
     """
-    check_model_name(model, family)
     local = find_local_model(model)
     if local is not None:
         return local
-    hub = importlib.import_module("huggingface_hub")
-    try:
-        weights.check_hub_access()
-        folder = Path(hub.snapshot_download(model, allow_patterns=[CONFIG_FILE]))
-    except Exception as error:  # download clients raise exceptions without a common base class
-        raise _unreachable(model, family, error) from None
-    kind = read_json(folder / CONFIG_FILE).get("model_type")
-    if kind not in family.model_types:
-        raise InputError(
-            f"{model} has the architecture {kind!r:.60}, expected that of {family.title}, "
-            f"{' or '.join(map(repr, family.model_types))}; give --encoder-model a name such as {family.default_model}"
-        )
-    try:
-        return Path(hub.snapshot_download(model, allow_patterns=[*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]))
-    except Exception as error:  # likewise
-        raise _unreachable(model, family, error) from None
+
+    def choose_files(config: Mapping[str, Any]) -> Sequence[str]:
+        if config.get("model_type") not in family.model_types:
+            remedy = f"give --encoder-model a name such as {family.default_model}"
+            raise InputError(f"{_other_architecture(model, config, family)}; {remedy}")
+        return [*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]
+
+    with _download_errors(model, family):
+        return weights.download_model(model, choose_files)
 
 
-def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
-    return FileNotFoundError(
-        f"the {family.title} network {model} is not on this machine and cannot be downloaded "
-        f"({summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
-        "that needs no weights: --encoder colour"
+def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
+    return weights.third_party_errors(
+        f"the {family.title} network {model} is not on this machine and cannot be downloaded",
+        "go online once, give a folder with --encoder-model, or use the encoder that needs no weights: --encoder "
+        "colour",
+        FileNotFoundError,
     )

@@ -13,8 +13,8 @@ Position embeddings are interpolated as in transformers.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -27,16 +27,15 @@ from torch.nn.functional import linear
 
 from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.huggingface import (
-    MODEL_FAMILIES,
     TOKENIZER_FILE,
     ModelFamily,
     ModelFolder,
     check_model_name,
     fetch_model,
-    patches_per_side,
     read_model_folder,
 )
-from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import CropFill
 
@@ -58,19 +57,15 @@ class HuggingFaceNetwork:
     @property
     def size(self) -> tuple[int, int]:
         """Height and width of the training images."""
-        count = self.folder.pixels.max_patches
-        side = self.model.config.vision_config.image_size if count is None else patches_per_side(count) * self.patch
+        config, count = self.model.config.vision_config, self.folder.pixels.max_patches
+        side = config.image_size if count is None else math.isqrt(count) * config.patch_size
         return side, side
-
-    @property
-    def patch(self) -> int:
-        """Side of a patch, in pixels."""
-        return self.model.config.vision_config.patch_size
 
     @property
     def patch_size(self) -> tuple[int, int]:
         """Height and width of a patch, in pixels."""
-        return self.patch, self.patch
+        side = self.model.config.vision_config.patch_size
+        return side, side
 
     @property
     def width(self) -> int:
@@ -118,7 +113,7 @@ class HuggingFaceNetwork:
 
     def _vision_inputs(self, pixels: Tensor) -> dict[str, Any]:
         """Return the inputs of the vision transformer."""
-        pixels, side = self.normalized(pixels), self.patch
+        pixels, (side, _) = self.normalized(pixels), self.patch_size
         if self.folder.model_type != "siglip2":
             return {"pixel_values": pixels, "interpolate_pos_encoding": pixels.shape[2:] != self.size}
         rows, columns = pixels.shape[2] // side, pixels.shape[3] // side
@@ -146,8 +141,12 @@ class HuggingFaceNetwork:
 
     def _input_of(self, module: Any, pixels: Tensor) -> Tensor:
         """Return the input of a module while the network processes images."""
-        with _record_inputs(module) as recorded:
+        recorded: list[Tensor] = []
+        hook = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0]))
+        try:
             self._pooled(pixels)
+        finally:
+            hook.remove()
         return recorded[0]
 
     @torch.no_grad()
@@ -162,17 +161,6 @@ class HuggingFaceNetwork:
                 f"the network in {self.folder.path} returns vectors that are not finite; download it again"
             )
         return rows
-
-
-@contextmanager
-def _record_inputs(module: Any) -> Iterator[list[Tensor]]:
-    """Collect the first argument of every call of a module."""
-    recorded: list[Tensor] = []
-    hook = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0]))
-    try:
-        yield recorded
-    finally:
-        hook.remove()
 
 
 def _pooled_output(output: Any) -> Tensor:
@@ -191,15 +179,9 @@ def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: s
         f"give another folder with --encoder-model, or a name such as {family.default_model}; or use "
         "--encoder open_clip"
     )
-    try:
+    with third_party_errors(f"{folder.path} is damaged or not a {family.title} network", remedy):
         model = _build_model(folder)
         tokenizer = _load_tokenizer(folder, model.config.text_config)
-    except MemoryError:
-        raise
-    except Exception as error:  # transformers and tokenizers define their own exceptions
-        raise InputError(
-            f"{folder.path} is damaged or not a {family.title} network ({summarize_error(error)}); {remedy}"
-        ) from None
     half = torch.device(device).type == "cuda"
     model = model.to(device, torch.float16 if half else torch.float32).eval().requires_grad_(False)
     mean, std = (torch.tensor(x, device=device)[:, None, None] for x in (folder.pixels.mean, folder.pixels.std))
@@ -249,13 +231,11 @@ class HuggingFaceEncoder(NetworkEncoder):
     """SigLIP, SigLIP 2 or MetaCLIP 2 features; see `NetworkEncoder`.
 
     Raises:
-        ValueError: If the model is neither a folder nor a hub name, the fill is unknown, or the template has no
-            placeholder for the text.
+        ValueError: If the model is neither a folder nor a hub name, or the template has no placeholder for the text.
         FileNotFoundError: If the folder does not exist.
     """
 
-    kind: str
-    """siglip, siglip2 or metaclip2."""
+    family: ModelFamily
     model: str
     """Folder, or name on the hub."""
     fill: CropFill = "black"
@@ -265,20 +245,11 @@ class HuggingFaceEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         check_model_name(self.model, self.family)
 
-    @property
-    def family(self) -> ModelFamily:
-        """The family of the network."""
-        return MODEL_FAMILIES[self.kind]
-
-    @property
-    def identity(self) -> dict[str, Any]:
+    @cached_property
+    def _identity(self) -> dict[str, Any]:
         """Settings of the image features. The network is identified by the content of its files, which are downloaded
         if missing."""
-        return {"kind": self.kind, "weights": self._digest, "fill": self.fill}
-
-    @property
-    def why_not_dense(self) -> None:
-        """None, because all networks of these families have patches."""
+        return {"kind": self.family.name, "weights": file_digest(*self._folder.files), "fill": self.fill}
 
     @cached_property
     def network(self) -> HuggingFaceNetwork:
@@ -298,7 +269,3 @@ class HuggingFaceEncoder(NetworkEncoder):
     @cached_property
     def _folder(self) -> ModelFolder:
         return read_model_folder(fetch_model(self.model, self.family), self.family)
-
-    @cached_property
-    def _digest(self) -> str:
-        return file_digest(*self._folder.files)

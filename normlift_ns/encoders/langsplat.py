@@ -15,10 +15,11 @@ import io
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -154,7 +155,7 @@ def shorten_list(values: Sequence[object]) -> str:
 
 # Features of LangSplat's preprocessing as a source, and export of the features of any source in the same format.
 #
-# `langsplat.files` lists the accepted variants of the files. Images may also lack features, or be larger than their
+# The module docstring lists the accepted variants of the files. Images may also lack features, or be larger than their
 # maps, because LangSplat shrinks large images; maps are then resized by nearest neighbor. The folder may be the
 # dataset with its language_features/, or language_features/ with another such folder inside, as in one published
 # archive.
@@ -179,7 +180,6 @@ class LangSplat:
     """A `FeatureSource` of preprocessed images.
 
     Raises:
-        ValueError: If the level or `missing` is unknown.
         FileNotFoundError: If the folder does not exist, or contains no features.
     """
 
@@ -196,14 +196,6 @@ class LangSplat:
     """Accept maps of any size, not only those of the same image at another resolution."""
 
     def __post_init__(self) -> None:
-        for flag, value, known in (
-            ("--level", self.level, LangSplatLevel),
-            ("--features-missing", self.missing, MissingFeatures),
-        ):
-            if value not in get_args(known):
-                raise InputError(
-                    f"{flag} must be one of {', '.join(get_args(known))} with --features langsplat; got {value!r}"
-                )
         _ = self.folder
 
     @cached_property
@@ -231,7 +223,10 @@ class LangSplat:
             ValueError: If a file is damaged or has another shape, tables have rows of different lengths, or two images
                 share their files.
         """
-        files_of = {name: files for name in names if (files := self._files(name)) is not None}
+        files_of: dict[str, _Files] = {}
+        for name in names:
+            with suppress(FileNotFoundError):
+                files_of[name] = self._files(name)
         absent = [name for name in names if name not in files_of]
         if len(absent) > 0:
             problem = f"{len(absent)} of {len(names)} images have no features in {self.folder}: {', '.join(absent)}"
@@ -257,7 +252,7 @@ class LangSplat:
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         """Return the regions and features of an image; raises as `available`, and ValueError if ids are not
         integers."""
-        files = self._require_files(name)
+        files = self._files(name)
         table, valid = read_feature_table(files.features)
         valid = torch.cat([valid, valid.new_zeros(1)])  # row -1
         maps = read_segment_map(files.segments, len(table))
@@ -280,20 +275,14 @@ class LangSplat:
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.texts.text(prompts)
 
-    def _files(self, name: str) -> _Files | None:
+    def _files(self, name: str) -> _Files:
         """Return the files of an image. LangSplat cuts names at the first dot, other programs at the last one."""
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")
             if stem != "" and all(map(os.path.isfile, files)):
                 return files
-        return None
-
-    def _require_files(self, name: str) -> _Files:
-        files = self._files(name)
-        if files is None:
-            raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
-        return files
+        raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
 
     def _fit(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
         """Return maps of the size of the image; raise InputError if they may show another crop."""
@@ -311,7 +300,7 @@ class LangSplat:
 
     def size(self, name: str) -> tuple[Path, int, int]:
         """Return the path, width and height of the segment map of an image; raises as `view`."""
-        files = self._require_files(name)
+        files = self._files(name)
         _, height, width = open_segment_map(files.segments).shape
         return files.segments, width, height
 
@@ -347,14 +336,9 @@ def check_unique_stems(names: Sequence[str]) -> None:
     Raises:
         ValueError: If the files of two images would have the same name.
     """
-    owner: dict[str, str] = {}
-    for name in names:
-        other = owner.setdefault(_stem(name), name)
-        if other != name:
-            raise InputError(
-                f"images {other} and {name} would both be exported as {_stem(name)}_s.npy, as LangSplat names its "
-                "files; rename the images such that they differ before the first dot, or lift without the export"
-            )
+    files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
+    remedy = "by renaming the images such that they differ before the first dot, or lift without the export"
+    check_files_distinct(files, "exported file", remedy)
 
 
 def _stem(name: str) -> str:
@@ -390,9 +374,8 @@ def write_langsplat(
     segments = torch.stack(
         [torch.where(labels >= 0, labels + start, -1) for (labels, _), start in zip(levels, offsets)]
     )
-    stem = _stem(name)
     for suffix, array in (
         ("s", segments.float().expand(len(LANGSPLAT_LEVELS), -1, -1)),
         ("f", torch.cat([rows for _, rows in levels])),
     ):
-        write_npy(folder / f"{stem}_{suffix}.npy", array.contiguous().numpy(), overwrite)
+        write_npy(folder / f"{_stem(name)}_{suffix}.npy", array.contiguous().numpy(), overwrite)

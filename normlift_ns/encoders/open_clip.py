@@ -6,6 +6,7 @@ transformers, and only networks need it.
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
 import json
@@ -17,12 +18,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from normlift_ns.encoders.weights import check_server, find_in_hub_cache, is_local_path
-from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.encoders.weights import check_hub_access, check_not_local, find_in_hub_cache, third_party_errors
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
 _PARTIAL_PACKAGE = "_normlift_ns_open_clip"
 _REQUIRED_KEYS = {"embed_dim", "vision_cfg", "text_cfg"}
+_WEIGHT_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
+"""Names of the weight files of OpenCLIP models in hub repositories."""
 
 
 def import_open_clip_module(name: str) -> ModuleType:
@@ -85,6 +88,60 @@ OPEN_CLIP_REMEDY = (
 )
 
 
+def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
+    """Return whether the weights of an OpenCLIP model are on this machine.
+
+    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
+    Face hub.
+
+    >>> has_local_clip_weights("ViT-B-16", __file__)
+    True
+    """
+    if os.path.isfile(pretrained):
+        return True
+    location = _hub_location(model, pretrained)
+    return find_cached_clip_weights(location) is not None if location else None
+
+
+def find_cached_clip_weights(location: str) -> Path | None:
+    """Return the path of the weights of an OpenCLIP model in the hub cache, or None.
+
+    Args:
+        location: "OWNER/NAME/" or "OWNER/NAME/FILE", as in open_clip's table of pretrained weights.
+    """
+    repository, name = os.path.split(location)
+    return find_in_hub_cache(repository, *([name] if name else _WEIGHT_FILES))
+
+
+def _hub_location(model: str, tag: str) -> str | None:
+    """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
+
+    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
+    hub, or the source has an unexpected form.
+    """
+    try:
+        source = (_folder() / "pretrained.py").read_text("utf8")
+        tables = {
+            node.targets[0].id: node.value
+            for node in ast.parse(source).body
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+        }
+        models = tables["_PRETRAINED"]
+        assert isinstance(models, ast.Dict)
+        names = [ast.literal_eval(key) for key in models.keys if key is not None]
+        entry = models.values[names.index(model.removesuffix("-quickgelu"))]
+        entry = tables[entry.id] if isinstance(entry, ast.Name) else entry
+        call = _argument(entry, tag.lower().replace("-", "_"))
+        return ast.literal_eval(_argument(call, "hf_hub"))
+    except (OSError, ValueError, LookupError, AttributeError, TypeError, AssertionError, SyntaxError, StopIteration):
+        return None
+
+
+def _argument(call: ast.AST, name: str) -> ast.expr:
+    """Return the value of a keyword argument of a call."""
+    return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
+
+
 def import_open_clip() -> Any:
     """Import open_clip, which takes seconds, at its first use.
 
@@ -125,15 +182,9 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
             f"{timm.__version__} does not have (nerfstudio pins an old version); use a model that open_clip builds "
             f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or install another timm at your own risk"
         )
-    path = Path(pretrained)
-    if os.path.isfile(path) or tags.is_pretrained_cfg(model, pretrained):
+    if os.path.isfile(pretrained) or tags.is_pretrained_cfg(model, pretrained):
         return
-    if os.path.lexists(path):
-        raise InputError(
-            f"{pretrained} is not a weight file of an OpenCLIP model (--encoder-pretrained); {OPEN_CLIP_REMEDY}"
-        )
-    if is_local_path(pretrained, 1):
-        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {OPEN_CLIP_REMEDY}")
+    check_not_local(pretrained, 1, "--encoder-pretrained", "not a weight file of an OpenCLIP model", OPEN_CLIP_REMEDY)
     known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
     raise InputError(
         f"unknown weights {pretrained!r} of OpenCLIP model {model}; known tags: {known}. Otherwise, {OPEN_CLIP_REMEDY}"
@@ -150,23 +201,28 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
     """
-    table, local = import_open_clip_module("pretrained"), Path(pretrained)
-    if os.path.isfile(local):
+    path, published = find_local_clip_weights(model, pretrained)
+    if path is not None:
+        return path, published
+    origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
+    problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
+    remedy = f"go online once, {OPEN_CLIP_REMEDY}"
+    with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
+        return _download(published), published
+
+
+def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
+    """Return the weight file, None if it is not on this machine, and the description of `find_open_clip_weights`."""
+    table = import_open_clip_module("pretrained")
+    if os.path.isfile(pretrained):
         tags = table.list_pretrained_tags_by_model(model)
         published = table.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
-        return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
+        return Path(pretrained), {key: published[key] for key in ("mean", "std") if key in published}
     published = table.get_pretrained_cfg(model, pretrained)
-    try:
-        return find_in_hub_cache(published, import_open_clip_module("constants")) or _download(published), published
-    except Exception as error:  # download clients raise exceptions without a common base class
-        origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
-        raise FileNotFoundError(
-            f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache and cannot be "
-            f"downloaded ({summarize_error(error)}); go online once, {OPEN_CLIP_REMEDY}"
-        ) from None
+    return find_cached_clip_weights(published.get("hf_hub", "")), published
 
 
 def _download(published: dict[str, Any]) -> Path:
     if published.get("hf_hub"):
-        check_server(importlib.import_module("huggingface_hub").constants.ENDPOINT)
+        check_hub_access()
     return Path(import_open_clip_module("pretrained").download_pretrained(published))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,7 @@ from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.open_clip import (
     OPEN_CLIP_REMEDY,
     check_open_clip_names,
+    find_local_clip_weights,
     find_open_clip_weights,
     import_open_clip,
     import_open_clip_module,
@@ -26,8 +26,7 @@ from normlift_ns.encoders.open_clip import (
     open_clip_model_config,
 )
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
-from normlift_ns.encoders.weights import THIRD_PARTY_ERRORS, find_in_hub_cache
-from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.encoders.weights import third_party_errors
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
 
@@ -75,7 +74,10 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
     """
     open_clip = import_open_clip()
     path, training = find_open_clip_weights(model, pretrained)
-    try:
+    with third_party_errors(
+        f"OpenCLIP model {model} cannot be built with the packages installed here",
+        f"choose another with --encoder-model, such as {DEFAULT_MODEL}",
+    ):
         network = open_clip.create_model(
             model,
             pretrained_hf=False,
@@ -83,26 +85,18 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
             force_quick_gelu=training.get("quick_gelu", False),
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
-    except THIRD_PARTY_ERRORS as error:
-        raise InputError(
-            f"OpenCLIP model {model} cannot be built with the packages installed here ({summarize_error(error)}); "
-            f"choose another with --encoder-model, such as {DEFAULT_MODEL}"
-        ) from None
-    try:
+    with third_party_errors(
+        f"weight file {path} is damaged or not of OpenCLIP model {model}",
+        f"give its architecture with --encoder-model, or {OPEN_CLIP_REMEDY}",
+    ):
         open_clip.load_checkpoint(network, str(path), weights_only=True)
-    except THIRD_PARTY_ERRORS as error:
-        raise InputError(
-            f"weight file {path} is damaged or not of OpenCLIP model {model} ({summarize_error(error)}); give its "
-            f"architecture with --encoder-model, or {OPEN_CLIP_REMEDY}"
-        ) from None
-    try:
+    with third_party_errors(
+        f"the tokenizer of OpenCLIP model {model} cannot be loaded",
+        f"go online once, use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that "
+        "needs none: --encoder colour",
+        FileNotFoundError,
+    ):
         tokenizer = open_clip.get_tokenizer(model)
-    except Exception as error:  # download clients raise exceptions without a common base class
-        raise FileNotFoundError(
-            f"the tokenizer of OpenCLIP model {model} cannot be loaded ({summarize_error(error)}); go online once, "
-            f"use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that needs "
-            "none: --encoder colour"
-        ) from None
     settings = open_clip.get_model_preprocess_cfg(network)
     size = settings["size"]
     mean, std = (torch.tensor(settings[key], device=device)[:, None, None] for key in ("mean", "std"))
@@ -154,7 +148,7 @@ class OpenClipEncoder(NetworkEncoder):
 
     Raises:
         ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
-            tag. Also if the fill is unknown, or the template has no placeholder for the text.
+            tag. Also if the template has no placeholder for the text.
         FileNotFoundError: If a weight file does not exist.
     """
 
@@ -169,9 +163,11 @@ class OpenClipEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         check_open_clip_names(self.model, self.pretrained)
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
+    @cached_property
+    def _identity(self) -> dict[str, Any]:
+        path = Path(self.pretrained)
+        weights = file_digest(path) if path.is_file() else self.pretrained
+        return {"kind": "open_clip", "model": self.model, "pretrained": weights, "fill": self.fill}
 
     @property
     def why_not_dense(self) -> str | None:
@@ -189,11 +185,6 @@ class OpenClipEncoder(NetworkEncoder):
 
     def _width(self) -> int:
         return cast(Any, open_clip_model_config(self.model))["embed_dim"]
-
-    @cached_property
-    def _weights_identity(self) -> str:
-        path = Path(self.pretrained)
-        return file_digest(path) if path.is_file() else self.pretrained
 
 
 # The CLIP text tower in plain torch, for prompts that are not cached.
@@ -266,16 +257,17 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     try:
         config = open_clip_model_config(model) or {}
         sizes = config["text_cfg"]
-        local = _find_local_weights(model, pretrained)
-        if local is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
+        path, published = find_local_clip_weights(model, pretrained)
+        if path is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
             return None
-        path, published = local
         shapes = _shapes(config["embed_dim"], **sizes)
         weights = _read(path, shapes)
         check_template(template)
         templates = prompt_templates(template)
         tokenizer = import_open_clip_module("tokenizer").SimpleTokenizer(context_length=sizes["context_length"])
-    except THIRD_PARTY_ERRORS:
+    except MemoryError:
+        raise
+    except Exception:  # torch, safetensors and open_clip raise many kinds for a bad file or name
         return None
     if {name: weight.shape for name, weight in weights.items()} != shapes:
         return None
@@ -284,17 +276,8 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
 
 
-def _find_local_weights(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
-    """Return the weight file and open_clip's description of its training; None if it is not on this machine."""
-    if os.path.isfile(pretrained):
-        return Path(pretrained), {}
-    published = import_open_clip_module("pretrained").get_pretrained_cfg(model, pretrained)
-    path = find_in_hub_cache(published, import_open_clip_module("constants")) if published else None
-    return None if path is None else (path, published)
-
-
 def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Read the named tensors of a weight file and nothing else. Raises exceptions in `THIRD_PARTY_ERRORS`."""
+    """Read the named tensors of a weight file and nothing else. Raises any exception for a bad file."""
     if path.suffix == ".safetensors":
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in names}

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float32, Int32, UInt8
@@ -16,9 +15,11 @@ from normlift_ns.encoders.base import Encoder
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, check_prompts
 from normlift_ns.errors import InputError, summarize_error
 
+_Result = TypeVar("_Result")
+
 
 @dataclass(frozen=True)
-class PluginEncoder:
+class PluginEncoder(Encoder):
     """An encoder of another package. The wrapped object needs only `identity`, `encode` and `text`; if it has
     `patches`, so does the adapter. Error messages name the encoder that failed.
 
@@ -32,30 +33,20 @@ class PluginEncoder:
     @classmethod
     def made(cls, name: str, make: Callable[[], Encoder]) -> PluginEncoder:
         """Make an encoder, and check that it has the required attributes."""
-        with _attribute_errors("encoder", name):
-            encoder = make()
-        _check_attributes("encoder", name, encoder, ("identity", "encode", "text"))
+        encoder = _make("encoder", name, make, ("identity", "encode", "text"))
         return DensePluginEncoder(name, encoder) if hasattr(encoder, "patches") else cls(name, encoder)
 
     @property
     def identity(self) -> dict[str, Any]:
-        with _attribute_errors("encoder", self.name):
-            return {"kind": self.name, **self.encoder.identity}
+        return _call("encoder", self.name, lambda: {"kind": self.name, **self.encoder.identity})
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        with _attribute_errors("encoder", self.name):
-            rows = self.encoder.encode(image, labels)
+        rows = _call("encoder", self.name, lambda: self.encoder.encode(image, labels))
         return self._check_rows(rows, int(labels.max()) + 1, "regions")
-
-    def encode_each(
-        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
-    ) -> Iterator[Float32[Tensor, "r d"]]:
-        return (self.encode(image, labels) for image, labels in views)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
-        with _attribute_errors("encoder", self.name):
-            rows = self.encoder.text(prompts)
+        rows = _call("encoder", self.name, lambda: self.encoder.text(prompts))
         return self._check_rows(rows, len(prompts), "texts")
 
     def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
@@ -86,8 +77,8 @@ class DensePluginEncoder(PluginEncoder):
         return getattr(self.encoder, "why_not_dense", None)
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        with _attribute_errors("encoder", self.name):
-            features = self.encoder.patches(image, rows, columns)  # type: ignore[attr-defined]
+        encoder: Any = self.encoder
+        features = _call("encoder", self.name, lambda: encoder.patches(image, rows, columns))
         return self._check_rows(features, rows * columns, "patches")
 
 
@@ -106,15 +97,11 @@ class PluginRegions:
     @classmethod
     def made(cls, name: str, make: Callable[[], object]) -> PluginRegions:
         """Make a mask source, and check that it has the required attributes."""
-        with _attribute_errors("mask source", name):
-            regions = make()
-        _check_attributes("mask source", name, regions, ("identity", "labels"))
-        return cls(name, regions)
+        return cls(name, _make("mask source", name, make, ("identity", "labels")))
 
     @property
     def identity(self) -> dict[str, Any]:
-        with _attribute_errors("mask source", self.name):
-            return {"kind": self.name, **self.regions.identity}
+        return _call("mask source", self.name, lambda: {"kind": self.name, **self.regions.identity})
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -125,12 +112,11 @@ class PluginRegions:
         return getattr(self.regions, "at_once", 1)
 
     def files(self, name: str) -> tuple[Path, ...]:
-        with _attribute_errors("mask source", self.name):
-            return tuple(self.regions.files(name)) if hasattr(self.regions, "files") else ()
+        find = getattr(self.regions, "files", lambda name: ())
+        return _call("mask source", self.name, lambda: tuple(find(name)))
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        with _attribute_errors("mask source", self.name):
-            returned = torch.as_tensor(self.regions.labels(image, name))
+        returned = _call("mask source", self.name, lambda: torch.as_tensor(self.regions.labels(image, name)))
         labels = returned[None, None] if returned.ndim == 2 else returned
         fits = labels.ndim == 4 and labels.shape[2:] == image.shape[:2] and labels.numel() > 0
         if not fits or labels.is_floating_point() or labels.is_complex():
@@ -150,18 +136,19 @@ class PluginRegions:
         return labels.int()
 
 
-def _check_attributes(noun: str, name: str, plugin: object, needed: Sequence[str]) -> None:
-    """Raise InputError if an object of another package lacks an attribute."""
+def _make(noun: str, name: str, make: Callable[[], Any], needed: Sequence[str]) -> Any:
+    """Make an object of another package; raise InputError if it lacks an attribute."""
+    plugin = _call(noun, name, make)
     missing = [x for x in needed if not hasattr(plugin, x)]
     if len(missing) > 0:
         raise InputError(f"{noun} {name!r} of another package has no {' and no '.join(missing)}; fix that package")
+    return plugin
 
 
-@contextmanager
-def _attribute_errors(noun: str, name: str) -> Iterator[None]:
-    """Attribute exceptions to the plugin of another package."""
+def _call(noun: str, name: str, function: Callable[[], _Result]) -> _Result:
+    """Call a function of another package; attribute exceptions to it."""
     try:
-        yield
+        return function()
     except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:  # a third-party module may raise anything

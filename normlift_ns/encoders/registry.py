@@ -1,4 +1,4 @@
-"""Encoders by their `--encoder` names.
+"""Encoders by their `--encoder` names, with the built-in ones.
 
 Every encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. Imports nothing
 heavy.
@@ -7,46 +7,29 @@ heavy.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
+from normlift_ns.encoders import open_clip
+from normlift_ns.encoders.huggingface import (
+    MODEL_FAMILIES,
+    ModelFamily,
+    check_huggingface_options,
+    check_transformers_version,
+    resolve_model_name,
+)
+from normlift_ns.encoders.weights import check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
 from normlift_ns.registry import Registry
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float32
-    from torch import Tensor
-
     from normlift_ns.encoders.base import Encoder
-
-
-class LazyTextEncoder(Protocol):
-    """A text encoder that imports torch only if it has to run a network."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """Every setting that changes the vectors, as JSON-serializable values."""
-        ...
-
-    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
-        ...
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        ...
-
-
-def accept_all_options(options: SourceOptions) -> None:
-    """Accept all options."""
-
-
-def _no_patches(options: SourceOptions) -> bool:
-    return False
+    from normlift_ns.encoders.color import ColorEncoder
+    from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEncoder
 
 
 @dataclass(frozen=True)
@@ -68,13 +51,13 @@ class EncoderKind:
     """Negative prompts of queries that set none; (): no negatives."""
     threshold: float | Literal["auto"] = 0.5
     """Relevancy by `rule` above which a Gaussian is selected; "auto": chosen from the histogram."""
-    check: Callable[[SourceOptions], None] = accept_all_options
+    check: Callable[[SourceOptions], None] = lambda options: None
     """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
     texts: Callable[[SourceOptions, str, Path | None, Mapping[str, Any]], LazyTextEncoder] | None = None
     """Makes the text encoder of a lifted run. Its arguments: the options, the device, the folder in which to cache
     embeddings, and the encoder's identity recorded at the lift ({} if unknown). None: the encoder itself embeds the
     prompts, and the embeddings are cached."""
-    has_patches: Callable[[SourceOptions], bool] = _no_patches
+    has_patches: Callable[[SourceOptions], bool] = lambda options: False
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
@@ -82,14 +65,141 @@ class EncoderKind:
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
 
+# The built-in encoders.
+
+
+_DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
+"""Prefixes of weight identities that are digests of file contents rather than tags."""
+
+
+def _make_encoder(options: SourceOptions, device: str) -> Encoder:
+    from normlift_ns.encoders.open_clip_network import OpenClipEncoder  # noqa: PLC0415 (needs torch)
+
+    model, pretrained = options.encoder_model, options.encoder_pretrained
+    return OpenClipEncoder(model, pretrained, options.crop_fill, device, options.text_template)
+
+
+def _make_texts(
+    options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
+) -> CachedTextEncoder:
+    """Make the text encoder of a lifted run, see `EncoderKind.texts`. A weight file is read completely at every use."""
+    from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
+
+    model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.text_template
+    _check_unchanged(pretrained, recorded.get("pretrained"))
+
+    def network() -> TextEncoder:
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415 (needs torch)
+        from normlift_ns.encoders.open_clip_network import load_text_tower  # noqa: PLC0415
+
+        text_device = "cpu" if device == "auto" else choose_device(device)  # faster than initializing a GPU
+        tower: Any = load_text_tower(model, pretrained, template, text_device)
+        if tower is not None:
+            return tower
+        return _make_encoder(options, choose_device(device))  # imports all of open_clip
+
+    return CachedTextEncoder(lambda: open_clip_text_identity(model, pretrained, template), network, cache)
+
+
+def _check_unchanged(pretrained: str, expected: object) -> None:
+    """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
+    remedy = (
+        "restore the file of the lift, give embeddings of your texts by the same network with --text-vectors, or lift "
+        "again with: ns-normlift"
+    )
+    if not isinstance(expected, str):
+        return
+    from normlift_ns.io.atomic import file_digest  # noqa: PLC0415 (only queries need it)
+
+    path, identity = Path(pretrained), pretrained
+    if path.is_file():
+        identity = file_digest(path, compare_to=expected)
+    elif expected.startswith(_DIGEST_PREFIXES) and os.path.lexists(path):
+        raise InputError(f"weight file {path}, which the run was lifted with, is not a file anymore; {remedy}")
+    elif expected.startswith(_DIGEST_PREFIXES):
+        raise FileNotFoundError(f"weight file {path}, which the run was lifted with, does not exist; {remedy}")
+    if identity != expected:
+        raise InputError(
+            f"{path} differs from the weights that the run was lifted with, and would give other results: it is "
+            f"{identity}, expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+        )
+
+
+def _check_weights(options: SourceOptions) -> None:
+    """Raise FileNotFoundError if the weights are neither on this machine nor available for download."""
+    model, pretrained, remedy = options.encoder_model, options.encoder_pretrained, open_clip.OPEN_CLIP_REMEDY
+    if Path(pretrained).is_file():
+        return
+    if is_local_path(pretrained, 1):
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
+    if open_clip.has_local_clip_weights(model, pretrained) is False:
+        problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
+        with third_party_errors(problem, f"go online once, {remedy}", FileNotFoundError):
+            check_hub_access()
+
+
+OPEN_CLIP = EncoderKind(
+    _make_encoder,
+    check=_check_weights,
+    texts=_make_texts,
+    has_patches=lambda options: open_clip.missing_patches_reason(options.encoder_model) is None,
+    paths=("encoder_pretrained",),
+)
+"""CLIP features of masked crops, or of patches."""
+
+
+# Registration of `--encoder siglip`, `siglip2` and `metaclip2`, without torch.
+#
+# SigLIP is trained with a sigmoid. The match of a text and an image is sigmoid(scale * cosine + bias), with one scale
+# > 0 and one bias for all pairs. Of two texts, the one with the larger cosine also has the larger sigmoid, whatever
+# scale and bias are. LERF's comparison with negatives therefore applies as with a softmax, and its tie, 0.5, is where
+# the sigmoids of text and negative are equal. That rule and that threshold are the defaults.
+#
+# The sigmoid itself is not a suitable default. Its 0.5 stands for one right caption among the tens of thousands of a
+# batch, odds that crops of regions hardly ever reach.
+
+
+def _make_kind(family: ModelFamily) -> EncoderKind:
+    def make(options: SourceOptions, device: str) -> Encoder:
+        from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder  # noqa: PLC0415 (needs torch)
+
+        check_transformers_version(family)
+        model = resolve_model_name(options, family)
+        return HuggingFaceEncoder(family, model, options.crop_fill, device, options.text_template)
+
+    check = partial(check_huggingface_options, family=family)
+    return EncoderKind(make, check=check, has_patches=lambda options: True, paths=("encoder_model",))
+
+
+SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))
+
+
+# Registration of `--encoder colour`, without torch.
+
+
+def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
+    from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
+
+    if options.text_template != "{}":
+        raise InputError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
+    return ColorEncoder()
+
+
+COLOR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_make_color_encoder, learned=False)
+"""Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""
+
+
+# Encoders by name.
+
+
 ENCODERS = Registry(
     "normlift_ns.encoders",
     {
-        "open_clip": "normlift_ns.encoders.builtin:OPEN_CLIP",
-        "siglip": "normlift_ns.encoders.builtin:SIGLIP",
-        "siglip2": "normlift_ns.encoders.builtin:SIGLIP2",
-        "metaclip2": "normlift_ns.encoders.builtin:METACLIP2",
-        "colour": "normlift_ns.encoders.builtin:COLOR",
+        "open_clip": "normlift_ns.encoders.registry:OPEN_CLIP",
+        "siglip": "normlift_ns.encoders.registry:SIGLIP",
+        "siglip2": "normlift_ns.encoders.registry:SIGLIP2",
+        "metaclip2": "normlift_ns.encoders.registry:METACLIP2",
+        "colour": "normlift_ns.encoders.registry:COLOR",
     },
     EncoderKind,
     "encoder",
@@ -115,5 +225,34 @@ def find_encoder_kind(name: object) -> EncoderKind | None:
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
     """Return the encoder's options that may be paths. The path of an existing file or folder is made absolute."""
     kind = find_encoder_kind(options.encoder)
-    values = {name: getattr(options, name) for name in (() if kind is None else kind.paths)}
-    return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
+    return {name: absolute_if_exists(getattr(options, name)) for name in (() if kind is None else kind.paths)}
+
+
+def absolute_if_exists(name: str) -> str:
+    """Return a name, as an absolute path if it is one of an existing file or folder."""
+    return os.path.abspath(name) if os.path.exists(name) else name
+
+
+def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
+    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
+    from normlift_ns.encoders.text_files import TextEmbeddingFile  # noqa: PLC0415 (needs numpy)
+
+    return make_encoder(options, device) if options.text_vectors is None else TextEmbeddingFile(options.text_vectors)
+
+
+def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
+    """Return the encoder of the options.
+
+    Args:
+        device: Device of the network, such as "cuda"; results are always on the CPU.
+    Raises:
+        ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
+            rejects the options.
+        FileNotFoundError: If a weight file does not exist.
+    """
+    from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)
+
+    kind = encoder_kind(options.encoder)
+    if options.encoder in ENCODERS.built_in:
+        return kind.make(options, device)
+    return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))

@@ -41,6 +41,20 @@ class TextEncoder(Protocol):
         ...
 
 
+class LazyTextEncoder(TextEncoder, Protocol):
+    """A text encoder that imports torch only if it has to run a network."""
+
+    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
+        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
+        ...
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return `rows` as a torch tensor."""
+        import torch  # noqa: PLC0415 (queries can do without torch)
+
+        return torch.from_numpy(self.rows(prompts))
+
+
 UNIT_TOLERANCE = 1e-3
 """Largest deviation from length 1 of a unit vector; half precision leaves 5e-4."""
 
@@ -109,7 +123,7 @@ _COMMENT_PREFIX = b"normlift_ns "
 
 
 @dataclass(frozen=True)
-class TextEmbeddingFile:
+class TextEmbeddingFile(LazyTextEncoder):
     """Text embeddings from an NPZ file that holds one vector [D] per text, with the text as the name of the array.
 
     Raises:
@@ -143,21 +157,15 @@ class TextEmbeddingFile:
 
     @property
     def dimension(self) -> int | None:
-        """Length D of the embeddings; None for an empty file. Raises as `names`."""
+        """Length D of the embeddings; None for an empty file. Raises as `texts`."""
         return next((len(vector) for vector in self._vectors.values()), None)
 
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `names`.
+            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `texts`.
         """
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
-
-    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return `text` as a NumPy array, without torch."""
         check_prompts(prompts)
         return look_up_embeddings(prompts, self._vectors, str(self.file))
 
@@ -264,7 +272,7 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 
 @dataclass(frozen=True)
-class CachedTextEncoder:
+class CachedTextEncoder(LazyTextEncoder):
     """A text encoder that caches its embeddings. The key: the text, and the settings that change its vector."""
 
     make_identity: Callable[[], dict[str, Any]]
@@ -276,12 +284,6 @@ class CachedTextEncoder:
     """Contains one safetensors file per text; created if it does not exist. If the folder is None or cannot be written
     to, nothing is cached."""
 
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        return torch.from_numpy(self.rows(prompts))
-
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt.
 
@@ -292,9 +294,10 @@ class CachedTextEncoder:
         rows = {prompt: self._load(prompt) for prompt in prompts}
         new = [prompt for prompt, row in rows.items() if row is None]
         for prompt, row in zip(new, self._encoder.text(new).numpy() if len(new) > 0 else []):
-            rows[prompt] = row
-            with suppress(OSError):
-                self._save(prompt, row)
+            rows[prompt], path = row, self._path(prompt)
+            if path is not None:
+                with suppress(OSError):
+                    save_arrays(path, {_ARRAY: row}, key=path.stem, overwrite=True)
         return np.stack([row for prompt in prompts if (row := rows[prompt]) is not None])
 
     @cached_property
@@ -323,11 +326,6 @@ class CachedTextEncoder:
         if row is None or row.dtype != np.float32 or row.ndim != 1 or row.size == 0:
             return None
         return row if abs(float(np.linalg.norm(row)) - 1) < UNIT_TOLERANCE else None
-
-    def _save(self, prompt: str, row: Float32[np.ndarray, " d"]) -> None:
-        path = self._path(prompt)
-        if path is not None:
-            save_arrays(path, {_ARRAY: row}, key=path.stem, overwrite=True)
 
 
 def open_clip_text_identity(model: str, pretrained: str, template: str) -> dict[str, Any]:

@@ -2,124 +2,72 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
+import json
 import os
-import pickle
-import struct
 import urllib.error
 import urllib.request
-import zipfile
-import zlib
-from collections.abc import Mapping
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
+from normlift_ns.errors import InputError, summarize_error
 
+CONFIG_FILE = "config.json"
+_MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
-"""Names of the weight files of OpenCLIP models in hub repositories."""
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 """Names of the weight files of SAM in the format of transformers."""
-THIRD_PARTY_ERRORS = (
-    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
-    ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
-    SafetensorError,
-)  # fmt: skip
-"""Exceptions that torch, safetensors and open_clip raise for a bad file or name. Out-of-memory errors are not among
-them."""
 
 
-def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
-    """Return whether the weights of an OpenCLIP model are on this machine.
+@contextmanager
+def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = InputError) -> Iterator[None]:
+    """Turn exceptions of other libraries, which have no common base class, into an error with a problem and a remedy.
 
-    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
-    Face hub.
-
-    >>> has_local_clip_weights("ViT-B-16", __file__)
-    True
+    Args:
+        error_type: InputError, or FileNotFoundError for downloads; the latter passes on InputErrors.
     """
-    if os.path.isfile(pretrained):
-        return True
-    repository = _hub_location(model, pretrained)
-    if not repository:
-        return None
-    owner_and_name, _, file = repository.rpartition("/")
-    return any(is_in_hub_cache(owner_and_name, name) for name in ([file] if file else _CLIP_FILES))
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        if isinstance(error, InputError) and error_type is not InputError:
+            raise
+        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
+        raise error_type(f"{problem} ({reason}); {remedy}") from None
 
 
-def has_local_sam_weights(checkpoint: str) -> bool:
-    """Return whether a SAM checkpoint, given as a path or a hub name, is on this machine."""
-    cached = is_in_hub_cache(checkpoint, "config.json") and any(
-        is_in_hub_cache(checkpoint, name) for name in SAM_WEIGHT_FILES
-    )
-    return os.path.exists(checkpoint) or cached
+def find_local_sam(checkpoint: str) -> Path | None:
+    """Return the path of a SAM checkpoint on this machine, given as a path or a hub name; None if there is none."""
+    if os.path.exists(checkpoint):
+        return Path(checkpoint).resolve()
+    config, weights = find_in_hub_cache(checkpoint, CONFIG_FILE), find_in_hub_cache(checkpoint, *SAM_WEIGHT_FILES)
+    return None if config is None or weights is None else weights.parent
 
 
-def is_in_hub_cache(repository: str, file: str) -> bool:
-    """Return whether the Hugging Face hub cache holds a file in its main revision. Needs no network."""
+def find_in_hub_cache(repository: str, *names: str) -> Path | None:
+    """Return the path of the first of these files that the Hugging Face hub cache holds in the main revision of a
+    repository, or None. Needs no network."""
     constants = importlib.import_module("huggingface_hub.constants")
     folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
     try:
-        revision = (folder / "refs" / "main").read_text("utf8").strip()
-        return os.path.isfile(folder / "snapshots" / revision / file)
+        snapshot = folder / "snapshots" / (folder / "refs" / "main").read_text("utf8").strip()
+        return next((snapshot / name for name in names if os.path.isfile(snapshot / name)), None)
     except (OSError, ValueError):
-        return False
-
-
-def find_in_hub_cache(published: Mapping[str, Any], constants: Any) -> Path | None:
-    """Return the path of the weights in the Hugging Face hub cache, or None. Needs no network.
-
-    Args:
-        published: Entry of open_clip's table of pretrained weights.
-        constants: open_clip's module of file names.
-    """
-    hub = importlib.import_module("huggingface_hub")
-    repository, name = os.path.split(published.get("hf_hub", ""))
-    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
-        path = hub.try_to_load_from_cache(repository, file) if repository else None
-        if isinstance(path, str):
-            return Path(path)
-    return None
-
-
-def _hub_location(model: str, tag: str) -> str | None:
-    """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
-
-    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
-    hub, or the source has an unexpected form.
-    """
-    try:
-        spec = find_spec("open_clip")  # does not import the package
-        assert spec is not None and spec.origin is not None
-        source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
-        tables = {
-            node.targets[0].id: node.value
-            for node in ast.parse(source).body
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-        }
-        models = tables["_PRETRAINED"]
-        assert isinstance(models, ast.Dict)
-        names = [ast.literal_eval(key) for key in models.keys if key is not None]
-        entry = models.values[names.index(model.removesuffix("-quickgelu"))]
-        entry = tables[entry.id] if isinstance(entry, ast.Name) else entry
-        call = _argument(entry, tag.lower().replace("-", "_"))
-        return ast.literal_eval(_argument(call, "hf_hub"))
-    except (OSError, ValueError, LookupError, AttributeError, TypeError, AssertionError, SyntaxError, StopIteration):
         return None
 
 
-def _argument(call: ast.AST, name: str) -> ast.expr:
-    """Return the value of a keyword argument of a call."""
-    return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
-
-
-def check_server(address: str) -> None:
-    """Raise OSError if a server does not respond; the hub's own client would retry for most of a minute."""
+def check_hub_access() -> None:
+    """Raise OSError if the Hugging Face hub is not available for downloads; its own client would retry for most of a
+    minute."""
+    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
+        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
+    address = os.environ.get("HF_ENDPOINT", _HUB)
     try:
         urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
     except urllib.error.HTTPError:  # the server responded
@@ -128,11 +76,18 @@ def check_server(address: str) -> None:
         raise ConnectionError(f"{address} cannot be reached: {error}") from error
 
 
-def check_hub_access() -> None:
-    """Raise OSError if the Hugging Face hub is not available for downloads."""
-    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
-    check_server(os.environ.get("HF_ENDPOINT", _HUB))
+def download_model(name: str, choose_files: Callable[[dict[str, Any]], Sequence[str]]) -> Path:
+    """Download a model from the hub and return its folder: config.json first, then the files chosen by its content.
+
+    Args:
+        choose_files: Returns patterns of further files; errors that it raises are passed on.
+    Raises:
+        Exception: See `third_party_errors`.
+    """
+    check_hub_access()
+    download = importlib.import_module("huggingface_hub").snapshot_download
+    config = read_json(Path(download(name, allow_patterns=[CONFIG_FILE])) / CONFIG_FILE)
+    return Path(download(name, allow_patterns=[CONFIG_FILE, *choose_files(config)]))
 
 
 def is_local_path(name: str, parts: int) -> bool:
@@ -146,3 +101,53 @@ def is_local_path(name: str, parts: int) -> bool:
     """
     path = Path(name)
     return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: If the file does not exist, is not JSON, or holds anything but an object.
+    """
+    if not path.is_file():
+        raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
+    try:
+        content = json.loads(path.read_text("utf8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
+    return content
+
+
+def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: str) -> None:
+    """Raise unless a name can be of another kind than local paths; for a name that is not the path of usable weights.
+
+    Args:
+        parts: As in `is_local_path`; 2: names on the hub, OWNER/NAME.
+        subject: What the name is, for the message.
+        problem: What a path is if it exists, for the message.
+    """
+    if os.path.lexists(name):
+        raise InputError(f"{subject} {name} is {problem}; {remedy}")
+    if is_local_path(name, parts):
+        raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
+    if parts == 2 and len(Path(name).parts) != parts:
+        raise InputError(f"{subject} {name!r} is neither a path nor a name on the hub; {remedy}")
+
+
+def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:
+    """Raise InputError if installed packages are missing or older than "MAJOR.MINOR"."""
+    for package, minimum in minimums.items():
+        try:
+            installed = version(package)
+        except PackageNotFoundError:
+            installed = "none"
+        found, needed = (tuple(int(x) for x in text.split(".")[:2] if x.isdigit()) for text in (installed, minimum))
+        if found < needed:
+            raise InputError(
+                f"{subject} needs {package} {minimum} or later, found {installed} (pip install -U "
+                f'"{package}>={minimum}"); {alternative}'
+            )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.field import SemanticField
-from normlift_ns.encoders.registry import LazyTextEncoder
+from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.io.run_dir import text_cache_folder
 from normlift_ns.nerfstudio_plugin.panel_view import (

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
-from normlift_ns.encoders.registry import LazyTextEncoder
+from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.field import SCALAR_NAMES, FieldArrays, read_field
 from normlift_ns.io.run_dir import check_run, field_folder, resolve_manifest_paths, text_cache_folder

@@ -12,8 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
-from normlift_ns.encoders.registry import EncoderKind, LazyTextEncoder, absolute_paths, encoder_kind, find_encoder_kind
-from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile
+from normlift_ns.encoders.registry import (
+    EncoderKind,
+    absolute_paths,
+    encoder_kind,
+    find_encoder_kind,
+    make_encoder,
+)
+from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import RelevancyRule, SourceOptions
@@ -128,7 +134,6 @@ def _cached_texts(
 
     def network() -> Any:
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (needs torch)
-        from normlift_ns.encoders.build import make_encoder  # noqa: PLC0415
 
         encoder = make_encoder(options, choose_device(device))
         if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):

@@ -6,12 +6,11 @@ Only the sizes of the parts are read from config.json, so it cannot name code, k
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.weights import SAM_WEIGHT_FILES, check_server, is_local_path
+from normlift_ns.encoders import weights
+from normlift_ns.encoders.weights import CONFIG_FILE, SAM_WEIGHT_FILES, read_json
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
@@ -27,12 +27,15 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
-_MIN_TORCH = (2, 6)
+_MIN_TORCH = "2.6"
 _ALTERNATIVE = (
     "the first SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
 )
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
-_NOT_SIZES = ("auto_map", "quantization_config", "architectures", "dtype", "torch_dtype", "transformers_version")
+_NOT_SIZES = re.compile(
+    r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
+)
+"""Names of entries that are not sizes."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,8 @@ class SamFamily:
     """Network that transformers implements."""
 
     name: str
-    model: str
-    """Name of its model class in transformers."""
-    config: str
-    """Name of its config class in transformers."""
+    prefix: str
+    """Prefix of the names of its classes in transformers."""
     config_parts: tuple[str, ...]
     """Names of the configs in its config."""
     nested_types: tuple[tuple[str, str], ...] = ()
@@ -58,20 +59,19 @@ _SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
 _SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "detr_encoder_config",
                  "detr_decoder_config", "mask_decoder_config")  # fmt: skip
 _SAM3_NESTED = (("vision_config.backbone_config", "sam3_vit_model"), ("text_config", "clip_text_model"))
-SAM = SamFamily("SAM", "SamModel", "SamConfig", _SAM_CONFIGS)
-_SAM2 = SamFamily("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, min_transformers="4.56")
+SAM = SamFamily("SAM", "Sam", _SAM_CONFIGS)
+_SAM2 = SamFamily("SAM 2", "Sam2", _SAM_CONFIGS, _SAM2_NESTED, min_transformers="4.56")
 POINT_PROMPT_FAMILIES: dict[str, SamFamily] = {
     "sam": SAM,
     "sam2": _SAM2,
     "sam2_video": _SAM2,  # in the checkpoints of SAM 2 and 2.1, which contain the image model
-    "sam_hq": SamFamily("HQ-SAM", "SamHQModel", "SamHQConfig", _SAM_CONFIGS, min_transformers="4.52"),
+    "sam_hq": SamFamily("HQ-SAM", "SamHQ", _SAM_CONFIGS, min_transformers="4.52"),
 }
 """Networks that turn points into masks, by the model type of config.json."""
+_SAM3 = SamFamily("SAM 3", "Sam3", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0")
 TEXT_PROMPT_FAMILIES: dict[str, SamFamily] = {
-    "sam3": SamFamily("SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0"),
-    "sam3_video": SamFamily(
-        "SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, "detector_config", min_transformers="5.0"
-    ),
+    "sam3": _SAM3,
+    "sam3_video": replace(_SAM3, config_key="detector_config"),
 }
 """Networks that turn text prompts into masks, by the model type of config.json."""
 
@@ -95,10 +95,10 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If it is not one of `kinds`, or if the installed torch or transformers cannot run it.
-        OSError: If config.json is missing.
+        ValueError: If config.json is missing or not of one of `kinds`, or if the installed torch or transformers cannot
+            run it.
     """
-    model_type = _config(folder).get("model_type")
+    model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
         other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
@@ -106,26 +106,9 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
         hint = "" if other is None else f" ({other.name} takes {prompts}: --regions {regions})"
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
-    _check_supported(kind)
+    if kind is not SAM:
+        weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
     return kind
-
-
-def _check_supported(kind: SamFamily) -> None:
-    """Raise InputError if the installed torch or transformers cannot run a network."""
-    if kind is SAM:
-        return
-    installed = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    if installed < _MIN_TORCH:
-        raise InputError(
-            f"{kind.name} needs torch {'.'.join(map(str, _MIN_TORCH))} or newer, found {torch.__version__}; "
-            f"{_ALTERNATIVE}"
-        )
-    transformers = import_transformers()
-    if not hasattr(transformers, kind.model):
-        raise InputError(
-            f"{kind.name} needs transformers {kind.min_transformers} or newer, found {transformers.__version__}; "
-            f"{_ALTERNATIVE}"
-        )
 
 
 def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
@@ -138,9 +121,9 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     transformers = import_transformers()
     if not (folder / WEIGHTS_FILE).is_file():
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = getattr(transformers, kind.config)(**_sizes(_config(folder), kind))
+    config = getattr(transformers, f"{kind.prefix}Config")(**_sizes(read_json(folder / CONFIG_FILE), kind))
     with _quiet(transformers):
-        model, report = getattr(transformers, kind.model).from_pretrained(
+        model, report = getattr(transformers, f"{kind.prefix}Model").from_pretrained(
             None,
             config=config,
             state_dict=load_file(folder / WEIGHTS_FILE),
@@ -169,13 +152,6 @@ def _quiet(transformers: Any) -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _config(folder: Path) -> dict[str, Any]:
-    config = json.loads((folder / "config.json").read_text("utf8"))
-    if not isinstance(config, dict):
-        raise InputError(f"config.json holds {type(config).__name__}, expected an object")
-    return config
-
-
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     """Return the parts of a config without the entries that are not sizes."""
     own = config if kind.config_key is None else config.get(kind.config_key)
@@ -183,8 +159,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     for name, part in parts.items():
         if not isinstance(part, Mapping):
             raise InputError(f"{name} of config.json is {type(part).__name__}, expected an object")
-    check_config_sizes(parts)
-    sizes = _drop_other_entries(parts)
+    sizes = check_config_sizes(parts)
     for path, expected in kind.nested_types:
         part: Any = sizes
         for name in path.split("."):
@@ -195,41 +170,33 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     return sizes
 
 
-def _drop_other_entries(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        dropped = [name for name in value if str(name).startswith("_") or "attn_impl" in str(name)]
-        return {name: _drop_other_entries(x) for name, x in value.items() if name not in (*_NOT_SIZES, *dropped)}
-    return [_drop_other_entries(x) for x in value] if isinstance(value, list) else value
-
-
-def check_config_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
-    """Raise InputError for implausible sizes, because transformers builds a network of any size from its config."""
+def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
+    """Return values of a config without the entries that are not sizes; raise InputError for implausible sizes, because
+    transformers builds a network of any size from its config."""
     if depth > _MAX_DEPTH or (isinstance(values, Mapping | list) and len(values) > _MAX_PARTS):
         raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
     if isinstance(values, Mapping):
-        for key, value in values.items():
-            check_config_sizes(value, str(key), depth + 1)
-    elif isinstance(values, list):
-        for value in values:
-            check_config_sizes(value, name, depth + 1)
-    elif isinstance(values, int | float):
+        checked = {key: check_config_sizes(value, str(key), depth + 1) for key, value in values.items()}
+        return {key: value for key, value in checked.items() if not _NOT_SIZES.match(key)}
+    if isinstance(values, list):
+        return [check_config_sizes(value, name, depth + 1) for value in values]
+    if isinstance(values, int | float):
         limit = _MAX_PARTS if name.startswith("num_") or name.endswith("depth") else _MAX_SIZE
         if not -1 <= values <= limit:
             raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {limit:,}")
+    return values
 
 
 # SAM checkpoints: a folder in the format of transformers, a file published by Meta, or a name on the hub.
 
 
-SAM_REMEDY = (
-    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
-    "as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel"
-)
-SAM3_REMEDY = (
-    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
-    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment"
-)
-_REMEDIES = {"SAM": SAM_REMEDY, "SAM 3": SAM3_REMEDY}
+_REMEDIES = {
+    "SAM": f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file "
+    "such as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel",
+    "SAM 3": f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
+    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment",
+}
+"""What to do about a checkpoint, by the name of the networks."""
 _FIRST = "the first SAM, ViT-B, -L or -H"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
@@ -275,42 +242,18 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
         FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
-    title, example = _title(kinds), DEFAULT_SAM if kinds is POINT_PROMPT_FAMILIES else DEFAULT_SAM3
-    remedy = _REMEDIES[title]
-    path = Path(checkpoint)
-    if os.path.isfile(path) or os.path.isdir(path):
-        folder = transformers_folder(path)
-        if folder is not None and not (folder / "config.json").is_file():
-            raise InputError(f"{title} checkpoint {path} is a folder without config.json; {remedy}")
-        if folder is not None:
-            with checkpoint_errors(path, title):
-                read_sam_family(folder, kinds)
-        return
-    if os.path.lexists(path):
-        raise InputError(f"{title} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
-    if is_local_path(checkpoint, 2):
-        raise FileNotFoundError(f"{title} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
-    if len(path.parts) != 2:
-        raise InputError(
-            f"{title} checkpoint {checkpoint!r} is neither a path nor a name on the hub such as {example}; {remedy}"
-        )
+    title = _title(kinds)
+    path, remedy = Path(checkpoint), _REMEDIES[title]
+    if not (os.path.isfile(path) or os.path.isdir(path)):
+        weights.check_not_local(checkpoint, 2, f"{title} checkpoint", "neither a file nor a folder", remedy)
+    elif (folder := transformers_folder(path)) is not None:
+        with checkpoint_errors(path, title):
+            read_sam_family(folder, kinds)
 
 
 def _title(kinds: Mapping[str, SamFamily]) -> str:
     """Return the name of the networks in messages."""
     return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
-
-
-def _find_local_sam(checkpoint: str) -> Path | None:
-    """Return the path of a checkpoint on this machine, including the cache of the hub; None if there is none."""
-    if os.path.exists(checkpoint):
-        return Path(checkpoint).resolve()
-    hub = importlib.import_module("huggingface_hub")
-    for file in SAM_WEIGHT_FILES:
-        config, weights = (hub.try_to_load_from_cache(checkpoint, name) for name in ("config.json", file))
-        if isinstance(config, str) and isinstance(weights, str):
-            return Path(weights).parent
-    return None
 
 
 def sam_identity(checkpoint: str) -> str:
@@ -343,30 +286,10 @@ def transformers_folder(path: Path) -> Path | None:
     return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
 
 
-@contextmanager
-def checkpoint_errors(path: Path, title: str = "SAM") -> Iterator[None]:
+def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
     """Turn errors of other libraries into an InputError that names the checkpoint."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:  # the configs of transformers raise their own exception types for invalid values
-        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
-        raise InputError(
-            f"{title} checkpoint {path} is damaged or not a checkpoint of {title} ({reason}); {_REMEDIES[title]}"
-        ) from None
-
-
-def load_sam(checkpoint: str) -> Any:
-    """Return the SamModel of transformers with the weights of a checkpoint of the first SAM, in float32 on the CPU.
-
-    Raises:
-        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-        ValueError: If the checkpoint is damaged or not of the first SAM.
-    """
-    path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
-    with checkpoint_errors(path):
-        return _load_first_sam(path)
+    problem = f"{title} checkpoint {path} is damaged or not a checkpoint of {title}"
+    return weights.third_party_errors(problem, _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
@@ -392,22 +315,13 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
-    local = _find_local_sam(checkpoint)
+    local = weights.find_local_sam(checkpoint)
     if local is not None:
         return local
-    hub = importlib.import_module("huggingface_hub")
-    try:
-        check_server(hub.constants.ENDPOINT)
-        folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
-        known = json.loads((folder / "config.json").read_text("utf8")).get("model_type") in kinds
-        patterns = ["config.json", WEIGHTS_FILE, *more] if known else ["config.json"]
-        return Path(hub.snapshot_download(checkpoint, allow_patterns=patterns))
-    except Exception as error:  # the download client raises unrelated exception types
-        title = _title(kinds)
-        raise FileNotFoundError(
-            f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded "
-            f"({summarize_error(error)}); go online once, or {_REMEDIES[title]}"
-        ) from None
+    title, files = _title(kinds), [WEIGHTS_FILE, *more]
+    problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
+    with weights.third_party_errors(problem, f"go online once, or {_REMEDIES[title]}", FileNotFoundError):
+        return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
@@ -416,7 +330,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     files = _weight_files(folder)
     if len(files) == 0:
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = json.loads((folder / "config.json").read_text())
+    config = read_json(folder / CONFIG_FILE)
     check_config_sizes(config)
     return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
 
@@ -468,7 +382,6 @@ def config_from_weights(state: Mapping[str, Tensor]) -> Any:
     patch = shape["image_encoder.patch_embed.proj.weight"][-1]
     blocks = sum(name.endswith(".attn.rel_pos_h") for name in shape)
     extent, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
-    global_blocks = [i for i in range(blocks) if extent[i] == 2 * grid - 1]
     channels = shape["image_encoder.neck.0.weight"][0]
     layer = "mask_decoder.transformer.layers.0"
     transformers = import_transformers()
@@ -480,7 +393,7 @@ def config_from_weights(state: Mapping[str, Tensor]) -> Any:
         image_size=grid * patch,
         patch_size=patch,
         window_size=(min(extent) + 1) // 2,
-        global_attn_indexes=global_blocks,
+        global_attn_indexes=[i for i in range(blocks) if extent[i] == 2 * grid - 1],
         num_pos_feats=channels // 2,
         mlp_dim=shape["image_encoder.blocks.0.mlp.lin1.weight"][0],
     )

@@ -34,27 +34,8 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
         FileNotFoundError: If the file does not exist.
         ValueError: If the file is not an image, or is truncated.
     """
-    return torch.from_numpy(read_pixels(path, "RGB"))
-
-
-def read_pixels(
-    path: Path, mode: str | None = None, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS
-) -> np.ndarray:
-    """Read the pixels of an image file, [H, W] or [H, W, channels], in a Pillow mode or as stored; raises as
-    `read_image`.
-
-    Args:
-        description: Kind of file, for messages.
-        formats: Accepted formats, by their Pillow names.
-    """
-    with _open_image(path, description, formats) as image:
-        return np.array(image if mode is None else image.convert(mode))
-
-
-def read_size(path: Path, *, description: str = "image", formats: tuple[str, ...] = _IMAGE_FORMATS) -> tuple[int, int]:
-    """Read width and height of an image file without decoding it; arguments and errors as in `read_pixels`."""
-    with _open_image(path, description, formats) as image:
-        return image.size
+    with _open_image(path, "image", _IMAGE_FORMATS) as image:
+        return torch.from_numpy(np.array(image.convert("RGB")))
 
 
 @contextmanager
@@ -92,35 +73,16 @@ def gray_bit_depth(path: Path) -> int | None:
 _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file."""
+_COMPACTNESS = 10.0
+"""Weight of spatial distance against color distance in superpixels; higher values give squarer regions."""
 _WORKERS = min(4, os.cpu_count() or 1)
 """Number of images that are segmented concurrently; superpixels need many times the memory of their image."""
 
 
-@dataclass(frozen=True)
-class Superpixels:
-    """Regions of similar size that follow image edges: SLIC on CIELAB color and position.
+class RegionDefaults:
+    """The members of `Regions` of methods with one level and without files, which segment one image at a time."""
 
-    Raises:
-        ValueError: If the count is below 1, or the compactness is not positive.
-    """
-
-    count: int = 256
-    """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
-    compactness: float = 10.0
-    """Weight of spatial distance against color distance, > 0; higher values give squarer regions."""
-
-    def __post_init__(self) -> None:
-        _check_count(self.count)
-        if not self.compactness > 0:
-            raise InputError(f"compactness of superpixels must be positive, got {self.compactness}")
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return {"kind": "superpixel", "count": self.count, "compactness": self.compactness}
-
-    @property
-    def at_once(self) -> int:
-        return _WORKERS
+    at_once = 1
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -128,42 +90,38 @@ class Superpixels:
 
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
+
+
+@dataclass(frozen=True)
+class Superpixels(RegionDefaults):
+    """Regions of similar size that follow image edges: SLIC on CIELAB color and position."""
+
+    count: int = 256
+    """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
+
+    at_once = _WORKERS
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "superpixel", "count": self.count, "compactness": _COMPACTNESS}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
 
-        segments = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
+        segments = slic(image.numpy(), n_segments=self.count, compactness=_COMPACTNESS, start_label=0)
         return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Square cells of one size; the image border cuts off those at the right and lower edges.
-
-    Raises:
-        ValueError: If the count is below 1.
-    """
+class Grid(RegionDefaults):
+    """Square cells of one size; the image border cuts off those at the right and lower edges."""
 
     count: int = 256
     """Approximate number of cells per image, at least 1. The side of a cell is a whole number of pixels."""
 
-    def __post_init__(self) -> None:
-        _check_count(self.count)
-
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "grid", "count": self.count}
-
-    @property
-    def at_once(self) -> int:
-        return 1
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        return ()
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         height, width = image.shape[:2]
@@ -173,7 +131,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class LabelFiles:
+class LabelFiles(RegionDefaults):
     """Label maps from a folder, one per image and of the size of the image. A PNG is grayscale with 1, 8 or 16 bits, or
     indexed, with palette indices as labels. An NPY file holds any integer type, and may hold several levels, [levels,
     H, W].
@@ -198,12 +156,13 @@ class LabelFiles:
     flag: str = "--regions-dir"
     """Name, in messages, of the option that sets the folder."""
 
+    at_once = _WORKERS
+
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
                 f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
-                "PNG or NPY "
-                "file per image"
+                "PNG or NPY file per image"
             )
 
     @property
@@ -211,23 +170,16 @@ class LabelFiles:
         return {"kind": "files", "background": self.background, "resample": self.resample}
 
     @property
-    def at_once(self) -> int:
-        return _WORKERS
-
-    @property
     def chosen(self) -> tuple[int, ...]:
         return () if self.level is None else (self.level,)
 
     def files(self, name: str) -> tuple[Path, ...]:
         path = self.path(name)
+        what = f"{self.description} {path}"
         if not path.is_file():
-            raise InputError(
-                f"{self.description} {path} is not a file; expected a PNG or NPY file with one value per pixel"
-            )
+            raise InputError(f"{what} is not a file; expected a PNG or NPY file with one value per pixel")
         if path.stat().st_size > _MAX_MAP_BYTES:
-            raise InputError(
-                f"{self.description} {path} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}"
-            )
+            raise InputError(f"{what} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}")
         return (path,)
 
     def path(self, name: str) -> Path:
@@ -267,10 +219,8 @@ class LabelFiles:
             if not self.resample:
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
-                    f"{name} is "
-                    f"{width}x{height}; make {self.description}s of the size of the image (undistortion crops "
-                    "images), or "
-                    "resample them by nearest neighbor: --regions-resample True"
+                    f"{name} is {width}x{height}; make {self.description}s of the size of the image (undistortion "
+                    "crops images), or resample them by nearest neighbor: --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
@@ -279,7 +229,8 @@ class LabelFiles:
         """Return the path, width and height of the label map of an image; raises as `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
-            return path, *read_size(path, description=self.description, formats=_MAP_FORMATS)
+            with _open_image(path, self.description, _MAP_FORMATS) as image:
+                return path, *image.size
         _, height, width = self.values(name).shape
         return path, width, height
 
@@ -291,37 +242,29 @@ class LabelFiles:
             ValueError: If a map cannot be read, or has color channels or fractional values.
         """
         path = self.path(name)
+        what = f"{self.description} {path}"
         if path.suffix == ".npy":
             maps = read_npy(path, self.description)
         else:
-            maps = read_pixels(path, description=self.description, formats=_MAP_FORMATS)
+            with _open_image(path, self.description, _MAP_FORMATS) as image:
+                maps = np.array(image)
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{self.description} {path} is a grayscale PNG with {bits} bits, whose values readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits, whose values readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{self.description} {path} has {maps.shape[2]} color channels; expected one value per pixel: save "
-                "it as an "
-                "8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
+                f"{what} has {maps.shape[2]} color channels; expected one value per pixel: save "
+                "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(
-                f"{self.description} {path} holds {maps.dtype}; expected an integer type: save it with "
-                ".astype(numpy.int32)"
-            )
+            raise InputError(f"{what} holds {maps.dtype}; expected an integer type: save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
-            raise InputError(f"{self.description} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         return maps.reshape(-1, *maps.shape[-2:])
-
-
-def _check_count(count: int) -> None:
-    """Raise InputError unless the count is positive."""
-    if count < 1:
-        raise InputError(f"number of regions per image must be at least 1, got {count}")
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Mask sources by their `--regions` and `--features` names: how each is made, and which options it takes.
+"""Mask sources by their `--regions` and `--features` names: how each is made, and which options it takes; with the
+built-in ones.
 
 Every mask source, built-in or from another package, is an entry point of the group `normlift_ns.masks`. Imports nothing
 heavy.
@@ -6,15 +7,16 @@ heavy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from normlift_ns.encoders.registry import accept_all_options, encoder_kind
-from normlift_ns.encoders.weights import has_local_sam_weights
+from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts
+from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.errors import InputError
-from normlift_ns.options import DEFAULT_SAM, MASK_GROUP, FeatureKind, SourceOptions
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, MASK_GROUP, FeatureKind, SourceOptions, short_repr
 from normlift_ns.registry import Registry
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ class MaskSource:
 
     make: Callable[[SourceOptions, str], Regions | FeatureSource]
     """Makes the regions from the options and a device such as "cuda". It should load weights at their first use."""
-    check: Callable[[SourceOptions], None] = accept_all_options
+    check: Callable[[SourceOptions], None] = lambda options: None
     """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
     options: tuple[str, ...] = ()
     """Those of `MASK_OPTIONS` that it takes."""
@@ -45,16 +47,147 @@ class MaskSource:
     """True if `make` returns a `FeatureSource`, which needs no encoder of regions."""
 
 
+# The built-in mask sources.
+
+
+_COUNT, _PATCH_COUNT = 256, 1024
+"""Default number of regions and of patches per image."""
+_LEVELS = ("s", "m", "l", "default")
+
+
+def _check_level(options: SourceOptions, name: str, levels: Sequence[str]) -> None:
+    if options.level is not None and options.level not in levels:
+        raise InputError(f"--level must be one of {', '.join(levels)} for {name}, got {short_repr(options.level)}")
+
+
+def _make_sam(options: SourceOptions, device: str) -> Regions:
+    from normlift_ns.segmentation.sam import SamMasks  # noqa: PLC0415 (needs torch)
+
+    level: Any = options.level or "l"
+    return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
+
+
+SAM_MASKS = MaskSource(
+    _make_sam, partial(_check_level, name="sam", levels=_LEVELS), ("sam_model", "sam_precision", "level")
+)
+"""Masks of SAM, SAM 2 or HQ-SAM for a grid of points."""
+
+
+def _make_sam3(options: SourceOptions, device: str) -> Regions:
+    from normlift_ns.segmentation.sam3 import Sam3Masks  # noqa: PLC0415 (needs torch)
+
+    return Sam3Masks(options.region_texts, options.sam_model or DEFAULT_SAM3, device, options.sam_precision)
+
+
+def _check_sam3(options: SourceOptions) -> None:
+    if len(options.region_texts) == 0:
+        raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
+
+
+SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "region_texts"))
+"""Masks of SAM 3 for text prompts."""
+
+
+def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
+    from normlift_ns.encoders.base import PatchFeatures  # noqa: PLC0415 (needs torch)
+
+    encoder: Any = make_encoder(options, device)
+    if not hasattr(encoder, "patches"):
+        raise InputError(
+            f"--regions patches needs an encoder with patch features; --encoder {options.encoder} has none. Use "
+            "--regions superpixel or --encoder open_clip"
+        )
+    return PatchFeatures(encoder, options.region_count or _PATCH_COUNT)
+
+
+PATCHES = MaskSource(_make_patches, has_features=True)
+"""Patches of the encoder's vision transformer."""
+
+
+def _make_superpixels(options: SourceOptions, device: str) -> Regions:
+    from normlift_ns.segmentation.regions import Superpixels  # noqa: PLC0415 (needs torch)
+
+    return Superpixels(options.region_count or _COUNT)
+
+
+SUPERPIXEL = MaskSource(_make_superpixels)
+"""SLIC superpixels."""
+
+
+def _make_grid(options: SourceOptions, device: str) -> Regions:
+    from normlift_ns.segmentation.regions import Grid  # noqa: PLC0415 (needs torch)
+
+    return Grid(options.region_count or _COUNT)
+
+
+GRID = MaskSource(_make_grid)
+"""Square cells."""
+
+
+def _make_files(options: SourceOptions, device: str) -> Regions:
+    from normlift_ns.segmentation.regions import LabelFiles  # noqa: PLC0415 (needs torch)
+
+    assert options.regions_dir is not None  # checked below
+    level = None if options.level is None else int(options.level)
+    return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
+
+
+def _check_files(options: SourceOptions) -> None:
+    if options.regions_dir is None:
+        raise InputError(
+            'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
+        )
+    if options.level is not None and not (options.level.isascii() and options.level.isdigit()):
+        raise InputError(
+            f"--level must be the number of a map, 0, 1, ..., for --regions files; got {short_repr(options.level)}"
+        )
+
+
+FILES = MaskSource(_make_files, _check_files, ("regions_dir", "level"))
+"""Label maps from a folder."""
+
+
+def _make_langsplat(options: SourceOptions, device: str) -> FeatureSource:
+    from normlift_ns.encoders.langsplat import LangSplat  # noqa: PLC0415 (needs torch)
+
+    assert options.features_dir is not None  # checked below
+    level: Any = options.level or "l"
+    texts = make_texts(options, device)
+    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+
+
+def _check_langsplat(options: SourceOptions) -> None:
+    if options.features_dir is None:
+        raise InputError("features 'langsplat' need their folder: give --features langsplat --features-dir FOLDER")
+    _check_level(options, "langsplat", (*_LEVELS, "sum"))
+    if options.regions != "auto" or options.regions_dir is not None:
+        raise InputError(
+            "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
+        )
+    if not encoder_kind(options.encoder).learned and options.text_vectors is None:
+        raise InputError(
+            f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
+            "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+
+
+LANGSPLAT = MaskSource(_make_langsplat, _check_langsplat, MASK_OPTIONS, has_features=True)
+"""Masks and features of LangSplat's preprocessing."""
+
+
+# Mask sources by name.
+
+
 MASK_SOURCES = Registry(
     MASK_GROUP,
     {
-        "sam": "normlift_ns.segmentation.builtin:SAM_MASKS",
-        "sam3": "normlift_ns.segmentation.builtin:SAM3_MASKS",
-        "patches": "normlift_ns.segmentation.builtin:PATCHES",
-        "superpixel": "normlift_ns.segmentation.builtin:SUPERPIXEL",
-        "grid": "normlift_ns.segmentation.builtin:GRID",
-        "files": "normlift_ns.segmentation.builtin:FILES",
-        "langsplat": "normlift_ns.segmentation.builtin:LANGSPLAT",
+        "sam": "normlift_ns.segmentation.registry:SAM_MASKS",
+        "sam3": "normlift_ns.segmentation.registry:SAM3_MASKS",
+        "patches": "normlift_ns.segmentation.registry:PATCHES",
+        "superpixel": "normlift_ns.segmentation.registry:SUPERPIXEL",
+        "grid": "normlift_ns.segmentation.registry:GRID",
+        "files": "normlift_ns.segmentation.registry:FILES",
+        "langsplat": "normlift_ns.segmentation.registry:LANGSPLAT",
     },
     MaskSource,
     "mask source",
@@ -81,7 +214,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
     kind = encoder_kind(options.encoder)
     if not kind.learned:
         return "superpixel"
-    if device.startswith("cuda") and find_spec("transformers") is not None and has_local_sam_weights(DEFAULT_SAM):
+    if device.startswith("cuda") and find_spec("transformers") is not None and find_local_sam(DEFAULT_SAM) is not None:
         return "sam"
     return "patches" if kind.has_patches(options) else "superpixel"
 
@@ -99,18 +232,9 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
         value = getattr(options, option)
         if option not in source.options and value != getattr(default, option):
             shown = " ".join(value) if isinstance(value, tuple) else value
-            takers = " or ".join(x for x in sorted(MASK_SOURCES.built_in) if _takes(x, option))
-            raise InputError(
-                f'{_flag(option)} {shown} is for --regions {takers}, not for "{name}"; leave one of them out'
-            )
+            regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
+            takers = " or ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
+            flag = f"--{option.replace('_', '-')}"
+            raise InputError(f'{flag} {shown} is for --regions {takers}, not for "{name}"; leave one of them out')
     source.check(options)
     return source
-
-
-def _takes(name: str, option: str) -> bool:
-    """Return whether regions take an option."""
-    return name not in get_args(FeatureKind) and option in MASK_SOURCES.load(name).options
-
-
-def _flag(option: str) -> str:
-    return f"--{option.replace('_', '-')}"

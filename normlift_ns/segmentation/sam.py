@@ -10,11 +10,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -24,12 +22,10 @@ from torch.nn.functional import gelu, interpolate, layer_norm, linear, pad, scal
 
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.encoders.batching import AdaptiveBatches
-from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, SamPrecision
 from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,
     import_transformers,
-    load_sam,
     load_sam_checkpoint,
     sam_identity,
 )
@@ -42,6 +38,7 @@ from normlift_ns.segmentation.mask_filtering import (
     remove_small_regions,
     stack_masks,
 )
+from normlift_ns.segmentation.regions import RegionDefaults
 
 _BITS = 22
 
@@ -357,6 +354,9 @@ class PromptedNetwork(ABC):
         parts.extend(self.masks(lambda batch: measure_logits(self.enlarge(batch, size), offset), logits))
         return MaskMeasurements(*map(torch.cat, zip(*parts)))
 
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32)
+
     def _bilinear_weights(self, count: int, size: tuple[int, int], axis: int) -> tuple[Tensor, Tensor]:
         first, weights = bilinear_weights(count, self._side, self._input_size(size)[axis], size[axis])
         return first.to(self._device), weights.to(self._device)
@@ -377,11 +377,6 @@ class SamNetwork(PromptedNetwork):
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         super().__init__(model, device, precision)
         self._decoder = MaskDecoder(self._model, self._dtype)
-
-    @classmethod
-    def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> SamNetwork:
-        """Load the network of a checkpoint; raises like `load_sam`."""
-        return cls(load_sam(checkpoint), device, precision)
 
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
         """Return network inputs: each image is scaled until its longer side fills the input, and padded with 0."""
@@ -409,7 +404,7 @@ class SamNetwork(PromptedNetwork):
 
     @torch.no_grad()
     def _embed(self, pixels: Tensor) -> list[Any]:
-        with torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32):
+        with self._autocast():
             return list(self._model.get_image_embeddings(pixels).float().split(1))
 
 
@@ -467,11 +462,6 @@ class _LibraryNetwork(PromptedNetwork):
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:
         raise NotImplementedError
-
-    @contextmanager
-    def _autocast(self) -> Iterator[None]:
-        with torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32):
-            yield
 
     _processor: Any
 
@@ -609,19 +599,18 @@ class _Candidates(NamedTuple):
     def at(self, index: Tensor) -> _Candidates:
         return _Candidates(*(value[index] for value in self))
 
-    def in_level(self, level: SamLevel) -> Int64[Tensor, " k"]:
-        """Return the indices of the candidates of a level."""
-        selected = torch.ones_like(self.channel) if level == "default" else self.channel == SAM_LEVELS.index(level) - 1
-        return selected.nonzero()[:, 0]
+    def by_level(self) -> dict[SamLevel, Int64[Tensor, " k"]]:
+        """Return the indices of the candidates of every level."""
+        selected = [torch.ones_like(self.channel, dtype=torch.bool), *(self.channel == i for i in range(3))]
+        return {level: flags.nonzero()[:, 0] for level, flags in zip(SAM_LEVELS, selected)}
 
 
 @dataclass(frozen=True)
-class SamMasks:
+class SamMasks(RegionDefaults):
     """Regions of one level of SAM's automatic masks. The weights are loaded at the first use.
 
     Raises:
-        ValueError: If the level or the precision is unknown, transformers is not installed, or the checkpoint is not a
-            valid name.
+        ValueError: If transformers is not installed, or the checkpoint is not a valid name.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -636,11 +625,6 @@ class SamMasks:
     rules: MaskRules = field(default_factory=MaskRules)
 
     def __post_init__(self) -> None:
-        if self.level not in SAM_LEVELS:
-            raise InputError(f"unknown level {self.level!r} of SAM; --level is one of {', '.join(SAM_LEVELS)}")
-        if self.precision not in get_args(SamPrecision):
-            known = ", ".join(get_args(SamPrecision))
-            raise InputError(f"unknown precision {self.precision!r} of SAM; --sam-precision is one of {known}")
         check_sam_checkpoint(self.checkpoint)
 
     @property
@@ -650,15 +634,8 @@ class SamMasks:
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
     @property
-    def at_once(self) -> int:
-        return 1
-
-    @property
     def chosen(self) -> tuple[int, ...]:
         return (SAM_LEVELS.index(self.level),)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device; raises like `masks`."""
@@ -667,10 +644,8 @@ class SamMasks:
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
     @torch.no_grad()
-    def masks(
-        self, image: UInt8[Tensor, "h w 3"], levels: Sequence[SamLevel] = SAM_LEVELS
-    ) -> dict[SamLevel, Bool[Tensor, "m h w"]]:
-        """Return the masks of some levels, on the device and in their order.
+    def masks(self, image: UInt8[Tensor, "h w 3"]) -> dict[SamLevel, Bool[Tensor, "m h w"]]:
+        """Return the masks of all levels, on the device and in their order.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
@@ -684,11 +659,10 @@ class SamMasks:
         crop_images = [on_device[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
         embeddings = self.network.embed(self.network.pixels(crop_images))
         parts: list[_Candidates] = []
-        per_crop: dict[SamLevel, list[Tensor]] = {level: [] for level in levels}
+        per_crop: dict[SamLevel, list[Tensor]] = {level: [] for level in SAM_LEVELS}
         for i, embedding in enumerate(embeddings):
             candidates, before = self._candidates(embedding, crops[i], i, size), sum(len(part.crop) for part in parts)
-            groups: dict[SamLevel, Tensor] = {level: candidates.in_level(level) for level in levels}
-            kept = _distinct(groups, candidates.boxes, candidates.predicted_iou, rules)
+            kept = _distinct(candidates.by_level(), candidates.boxes, candidates.predicted_iou, rules)
             rows = torch.cat(list(kept.values())).unique()
             parts.append(candidates.at(rows))
             for level, index in kept.items():
@@ -696,7 +670,7 @@ class SamMasks:
         candidates = _Candidates(*map(torch.cat, zip(*parts)))
         area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=self.device)
         smaller_first = 1 / area[candidates.crop]
-        groups = {level: torch.cat(index) for level, index in per_crop.items()}
+        groups: dict[SamLevel, Tensor] = {level: torch.cat(index) for level, index in per_crop.items()}
         kept = _distinct(groups, candidates.boxes, smaller_first, rules)
         rows = torch.cat(list(kept.values())).unique()
         candidates = candidates.at(rows)

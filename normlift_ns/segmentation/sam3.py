@@ -16,7 +16,7 @@ from torch import Tensor
 from normlift_ns.encoders.batching import AdaptiveBatches
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
-from normlift_ns.options import DEFAULT_SAM3, SamPrecision, check_prompt_list, short_repr
+from normlift_ns.options import DEFAULT_SAM3, SamPrecision, short_repr
 from normlift_ns.segmentation.checkpoint import (
     TEXT_PROMPT_FAMILIES,
     WEIGHTS_FILE,
@@ -29,6 +29,7 @@ from normlift_ns.segmentation.checkpoint import (
     transformers_folder,
 )
 from normlift_ns.segmentation.mask_filtering import stack_masks
+from normlift_ns.segmentation.regions import RegionDefaults
 from normlift_ns.segmentation.sam import resolve_precision
 
 SCORE_THRESHOLD = 0.5
@@ -149,14 +150,13 @@ def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto"
 
 
 @dataclass(frozen=True)
-class Sam3Masks:
+class Sam3Masks(RegionDefaults):
     """Regions that SAM 3 finds for text prompts; every instance is a region. The weights are loaded at the first use.
 
     If instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If no prompt is given, a prompt is empty or given twice, transformers is not installed, or the
-            checkpoint is of another network.
+        ValueError: If transformers is not installed, or the checkpoint is of another network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -168,26 +168,12 @@ class Sam3Masks:
     """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
 
     def __post_init__(self) -> None:
-        if len(self.texts) == 0:
-            raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
-        check_prompt_list("queries", self.texts)
         check_sam_checkpoint(self.checkpoint, TEXT_PROMPT_FAMILIES)
 
     @property
     def identity(self) -> dict[str, Any]:
         """Result of `sam3_identity` plus the prompts."""
         return {**self._network_identity, "texts": list(self.texts)}
-
-    @property
-    def at_once(self) -> int:
-        return 1
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        return ()
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
         """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.segment`."""

@@ -58,9 +58,9 @@ def test_every_thing_has_texture_and_is_seen_in_a_color_of_its_own(room: DemoRoo
     from matplotlib.colors import to_rgb  # noqa: PLC0415
     from skimage.color import rgb2lab  # noqa: PLC0415
 
-    from normlift_ns.encoders.color import ColorTextEncoder, shading_coordinates  # noqa: PLC0415
+    from normlift_ns.encoders.color import ColorEncoder, shading_coordinates  # noqa: PLC0415
 
-    vectors = ColorTextEncoder().rows(room.names)
+    vectors = ColorEncoder().rows(room.names)
     assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72  # the encoder tells them apart
     own = shading_coordinates(rgb2lab(np.array([to_rgb(f"xkcd:{name}") for name in room.names])))
     cameras, lightness = demo_cameras(6, 160, 120), rgb2lab(room.colors.numpy())[:, 0]

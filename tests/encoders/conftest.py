@@ -13,7 +13,7 @@ import pytest
 
 from normlift_ns.encoders.open_clip import import_open_clip
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
-from normlift_ns.segmentation.checkpoint import load_sam
+from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
 from tests.encoders.tiny import CLIP, HUB, write_clip, write_sam
 from tests.encoders.tiny_library import write_tiny
 
@@ -49,7 +49,7 @@ def sam_weights(made_once: Callable[..., Path]) -> Path:
     def make(folder: Path) -> None:
         for name, gain in (("tiny", 1.0), ("eager", 6.0)):
             write_sam(folder / f"sam_{name}.pth", seed=1, gain=gain)
-            load_sam(str(folder / f"sam_{name}.pth")).save_pretrained(folder / name)
+            load_sam_checkpoint(str(folder / f"sam_{name}.pth"))[1].save_pretrained(folder / name)
 
     return made_once("sam", make)
 

@@ -15,9 +15,10 @@ pytestmark = [pytest.mark.slow, needs_shared]
 SEE_ALL = """
 import sys
 from pathlib import Path
-from normlift_ns.encoders import RegionFeatures, cached, read_image
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
-from normlift_ns.encoders.base import PatchFeatures
+from normlift_ns.encoders.base import PatchFeatures, RegionFeatures
+from normlift_ns.segmentation.regions import read_image
 from normlift_ns.segmentation.sam import MaskRules, SamMasks
 from normlift_ns.progress import peak_gib
 from tests.encoders.tiny import write_clip, write_sam

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.encoders import color as space
-from normlift_ns.encoders.color import KERNEL_SIGMA, ColorEncoder, ColorTextEncoder, find_color_names
+from normlift_ns.encoders.color import KERNEL_SIGMA, ColorEncoder, find_color_names
 from tests.encoders.tiny import refused
 
 COLOUR = ColorEncoder()
@@ -47,7 +47,7 @@ def test_every_name_of_the_survey_is_understood(survey):
 
 
 def test_coarse_names_are_understood_but_not_offered():
-    colour = ColorTextEncoder()
+    colour = ColorEncoder()
     assert colour.rows(["shit brown"]).shape == (1, 343)
     for text in ("wooden shield", "pupe", "shift", "vomitt"):
         message = refused(lambda text=text: colour.rows([text]), text)

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.encoders.build import make_encoder
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
+from normlift_ns.encoders.registry import make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
 from tests.encoders.tiny import CLIP, HUB, Largest, copied, needs_cuda, noise, refused
@@ -79,7 +80,7 @@ def test_what_else_is_in_the_batch_changes_nothing(encoder: Any) -> None:
 @pytest.mark.parametrize("name", HUB)
 def test_half_precision_costs_little(name: str, hub_weights: Path) -> None:
     """As on a GPU, which open_clip's test needs (test_open_clip.py); what overflows is found again in float32."""
-    exact, half = (HuggingFaceEncoder(HUB[name], str(hub_weights / name)) for _ in range(2))
+    exact, half = (HuggingFaceEncoder(MODEL_FAMILIES[HUB[name]], str(hub_weights / name)) for _ in range(2))
     half.network.model.half()
     for found, expected in (
         (half.encode(IMAGE, FEW), exact.encode(IMAGE, FEW)),

@@ -23,7 +23,7 @@ from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.encoders.open_clip_network import load_open_clip
 from normlift_ns.encoders.text_files import TextEmbeddingFile, write_text_embeddings
 from normlift_ns.io.arrays import load_arrays, read_npy, save_arrays
-from normlift_ns.segmentation.checkpoint import load_sam
+from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
 from normlift_ns.segmentation.regions import Grid, LabelFiles, read_image
 from tests.encoders.test_regions import grey_png
 from tests.encoders.tiny import CLIP, copied, noise, refused
@@ -218,7 +218,7 @@ def test_damaged_weights(clip_weights: Path, sam_weights: Path, tmp_path: Path) 
         given = folder if source.parent == folder else path
 
         def load(given: Path = given, clip: bool = source.parent == clip_weights) -> object:
-            return load_open_clip(CLIP, str(given), "cpu") if clip else load_sam(str(given))
+            return load_open_clip(CLIP, str(given), "cpu") if clip else load_sam_checkpoint(str(given))[1]
 
         fuzz(4, damaged(whole), path, load)
         if source.suffix == ".json":

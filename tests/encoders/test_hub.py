@@ -10,6 +10,7 @@ import torch
 
 from normlift_ns.encoders.base import PatchFeatures, resize_image
 from normlift_ns.encoders.crops import masked_crops, region_boxes
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from tests.encoders.tiny import HUB, noise
 
@@ -25,7 +26,7 @@ class Both:
     """An encoder of ours in float64, and the library's own model and processor."""
 
     def __init__(self, name: str, folder: Path, transformers: Any) -> None:
-        self.name, self.encoder = name, HuggingFaceEncoder(HUB[name], str(folder))
+        self.name, self.encoder = name, HuggingFaceEncoder(MODEL_FAMILIES[HUB[name]], str(folder))
         self.network = self.encoder.network
         self.network.model.double()
         self.network.mean, self.network.std = self.network.mean.double(), self.network.std.double()

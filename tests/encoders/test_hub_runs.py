@@ -14,6 +14,7 @@ import torch
 
 from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.build import make_source, resolve_regions, source_settings
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.text_encoder import default_rule, encoder_settings, text_encoder_for
@@ -35,7 +36,7 @@ def lifted(folder: Path, regions: Any) -> Any:
 def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = SourceOptions(encoder="siglip2", encoder_model=str(folder), region_count=12)
     assert resolve_regions(options) == "patches"
-    assert make_source(options) == PatchFeatures(HuggingFaceEncoder("siglip2", str(folder)), 12)
+    assert make_source(options) == PatchFeatures(HuggingFaceEncoder(MODEL_FAMILIES["siglip2"], str(folder)), 12)
     monkeypatch.chdir(folder.parent)
     assert source_settings(SourceOptions(encoder="siglip2", encoder_model="net"))["encoder_model"] == str(folder)
 
@@ -46,7 +47,8 @@ def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> Non
     assert default_rule(field) == ("lerf", ("object", "things", "stuff", "texture"), 0.5)
     expected = texts.rows(["red mug", "table"])
     assert torch.equal(
-        torch.from_numpy(expected), HuggingFaceEncoder("siglip2", str(folder)).text(["red mug", "table"])
+        torch.from_numpy(expected),
+        HuggingFaceEncoder(MODEL_FAMILIES["siglip2"], str(folder)).text(["red mug", "table"]),
     )
     assert len(text_encoder_for(of_grid, cache=tmp_path / "texts").rows(["mug"])) == 1
     config = folder / "tokenizer_config.json"  # other weights in the same place answer nothing new

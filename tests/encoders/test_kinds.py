@@ -17,13 +17,14 @@ import torch
 
 from normlift_ns.cli.preflight import check_source_options
 from normlift_ns.data.open_splat import SPLAT_READERS
-from normlift_ns.encoders.build import make_encoder, make_source
+from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
 from normlift_ns.encoders.registry import (
     ENCODERS,
     encoder_kind,
     find_encoder_kind,
+    make_encoder,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.exports import EXPORTERS
@@ -93,13 +94,13 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         install(tmp_path / str(number), "worse", f"[{ENCODERS.group}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
-            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.builtin"
+            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.registry"
             assert ENCODERS.names() == ["bad", *OURS]
 
 
 WRONG = """
 import torch
-from normlift_ns.encoders import EncoderKind
+from normlift_ns.encoders.registry import EncoderKind
 class Wrong:
     identity = {{}}
     def encode(self, image, labels): return {rows}
@@ -162,7 +163,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = {"torch": "2.6.0", "transformers": "5.0.0"}
-    monkeypatch.setattr("normlift_ns.encoders.huggingface.version", lambda package: versions[package])
+    monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: versions[package])
     options = SourceOptions(encoder="siglip2", encoder_model="/nowhere")
     for package, found, least in (("torch", "2.5.1", "2.6"), ("transformers", "4.49.0", "4.56")):
         versions[package], enough = found, versions[package]

@@ -270,8 +270,9 @@ def test_broken_files_are_named_before_the_lift(folder, tmp_path):
     (folder / "b_f.npy").write_bytes(npy("<f4", (1, 768), b"\0" * 4 * 768))
     parts = ("frame_00001_f.npy", "512", "b_f.npy have 768")  # of two encoders
     refused(lambda: source(folder).available([NAME, "b.jpg"]), *parts)
-    refused(lambda: source(folder, "xl"), "--level", "default, s, m, l, sum", "'xl'")
-    refused(lambda: source(folder, missing="maybe"), "--features-missing", "error, skip", "'maybe'")
+    options = {"features": "langsplat", "features_dir": folder}
+    refused(lambda: make_source(SourceOptions(**options, level="xl")), "--level", "s, m, l, default, sum", "'xl'")
+    refused(lambda: SourceOptions(**options, features_missing="maybe"), "features_missing", "error, skip", "'maybe'")
     refused(lambda: source(tmp_path / "nowhere"), "--features-dir", "*_s.npy", error=FileNotFoundError)
 
 

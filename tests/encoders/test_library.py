@@ -8,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.segmentation import checkpoint
 from normlift_ns.segmentation.mask_filtering import Suppression
 from normlift_ns.segmentation.sam import MaskRules, SamMasks, load_sam_network
 from tests.encoders.tiny import copied, refused
@@ -72,15 +71,13 @@ def test_checkpoints_for_video_hold_the_model_for_images(tmp_path: Path) -> None
     assert all(torch.equal(value, state[name]) for name, value in mine.items())
 
 
-def test_old_versions_are_refused_with_what_works(library_weights: Path, transformers: Any, monkeypatch: Any) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(torch, "__version__", "2.5.1+cu121")
-        for kind, name in (("sam2", "SAM 2"), ("sam_hq", "HQ-SAM")):
-            parts = (name, "torch 2.6", "2.5.1", "sam_vit_h_4b8939.pth")
-            refused(lambda kind=kind: SamMasks(str(library_weights / kind)), *parts)
-    monkeypatch.delattr(transformers.models.sam2, "Sam2Model", raising=False)
-    old = type("Old", (), {"__version__": "4.50.0"})
-    monkeypatch.setattr(checkpoint, "import_transformers", lambda: old)
+def test_old_versions_are_refused_with_what_works(library_weights: Path, monkeypatch: Any) -> None:
+    versions = {"torch": "2.5.1+cu121", "transformers": "4.50.0"}
+    monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: versions[package])
+    for kind, name in (("sam2", "SAM 2"), ("sam_hq", "HQ-SAM")):
+        parts = (name, "torch 2.6", "2.5.1", "sam_vit_h_4b8939.pth")
+        refused(lambda kind=kind: SamMasks(str(library_weights / kind)), *parts)
+    versions["torch"] = "2.6.0"
     refused(lambda: SamMasks(str(library_weights / "sam2")), "SAM 2", "transformers 4.56", "4.50.0")
 
 

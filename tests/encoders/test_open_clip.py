@@ -14,10 +14,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from normlift_ns.encoders.build import make_encoder
 from normlift_ns.encoders.crops import masked_crops, region_boxes
 from normlift_ns.encoders.open_clip import import_open_clip
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.registry import make_encoder
 from normlift_ns.encoders.text_files import open_clip_text_identity
 from normlift_ns.options import SourceOptions
 from tests.encoders.test_weights import put

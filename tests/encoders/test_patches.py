@@ -8,6 +8,7 @@ import torch
 
 from normlift_ns.encoders.base import PatchFeatures, patch_grid
 from normlift_ns.encoders.open_clip_network import patch_embeddings
+from normlift_ns.options import SourceOptions
 from tests.encoders.tiny import CLIP, noise, refused
 
 IMAGE = noise(48, 80)
@@ -82,4 +83,4 @@ def test_what_has_no_patches_is_refused(clip):
         ("coca_ViT-B-32", "pools by attention"),
     ):
         refused(lambda model=model: PatchFeatures(replace(clip, model=model)), model, reason)
-    refused(lambda: PatchFeatures(clip, 0), "1", "0")
+    refused(lambda: SourceOptions(region_count=0), "1", "0")

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
-from normlift_ns.segmentation.checkpoint import load_sam
-from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, resolve_precision
+from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
+from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, load_sam_network, resolve_precision
 from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
@@ -21,7 +22,7 @@ def checkpoint(sam_weights):
 
 @pytest.fixture(scope="module")
 def embedding(checkpoint):
-    network = SamNetwork.load(str(checkpoint), "cpu")
+    network = load_sam_network(str(checkpoint), "cpu")
     return network.embed(network.pixels([noise(96, 128)]))[0]
 
 
@@ -33,7 +34,9 @@ def expected(checkpoint, embedding):
 
 def by_transformers(path: str, embedding: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.no_grad():
-        found = load_sam(path).to(dtype)(image_embeddings=embedding.to(dtype), input_points=POINTS[None, :, None])
+        found = load_sam_checkpoint(path)[1].to(dtype)(
+            image_embeddings=embedding.to(dtype), input_points=POINTS[None, :, None]
+        )
     return found.pred_masks[0], found.iou_scores[0]
 
 
@@ -46,13 +49,13 @@ def close(found, expected, bound: float) -> None:
 def test_answers_in_each_precision(checkpoint, embedding, expected):
     assert float(expected[0].std(dim=0).mean()) > 0.01 * float(expected[0].abs().max())  # masks depend on their point
     for precision, bound in BOUNDS.items():
-        found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
+        found = load_sam_network(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
         close(found, expected, bound)
         assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
 
 
 def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
-    network = SamNetwork.load(str(checkpoint), "cpu", "float16")
+    network = load_sam_network(str(checkpoint), "cpu", "float16")
     huge = 1e6 * embedding  # beyond float16
     masks, ious = network.decode(huge, POINTS)
     assert masks.dtype == torch.float32
@@ -65,7 +68,7 @@ def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
     assert sam.identity == SamMasks(str(checkpoint), precision="float32").identity
     assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
     wrong: Any = "half"
-    refused(lambda: SamMasks(str(checkpoint), precision=wrong), "'half'", "--sam-precision", "auto, float32")
+    refused(lambda: SourceOptions(sam_precision=wrong), "'half'", "sam_precision", "auto, float32")
     rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
     labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
     assert labels.shape[0] == 4 and int(labels.max()) >= 0
@@ -74,7 +77,7 @@ def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
 @needs_cuda
 def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
     for precision, bound in {**BOUNDS, "float32": 1e-4}.items():
-        network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
+        network = SamNetwork(load_sam_checkpoint(str(checkpoint))[1], "cuda", precision)
         close(network.decode(embedding.cuda(), POINTS), expected, bound)
 
 

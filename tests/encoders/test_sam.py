@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns.segmentation.checkpoint import config_from_weights, load_sam, transformers_name
+from normlift_ns.segmentation.checkpoint import config_from_weights, load_sam_checkpoint, transformers_name
 from normlift_ns.segmentation.mask_filtering import Suppression
-from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamMasks, SamNetwork, point_grid
+from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamMasks, SamNetwork, load_sam_network, point_grid
 from tests.encoders.test_masks import nms_by_hand, pixels
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import SIDE, copied, needs_cuda, noise, refused, tiny_sam
@@ -21,7 +21,7 @@ LOOSE = MaskRules(points_per_side=6, predicted_iou=0.5, stability=0.3, suppressi
 
 
 def test_the_network_is_that_of_meta(sam_weights):
-    meta, network = tiny_sam(seed=1), SamNetwork.load(str(sam_weights / "sam_tiny.pth"), "cpu")
+    meta, network = tiny_sam(seed=1), load_sam_network(str(sam_weights / "sam_tiny.pth"), "cpu")
     for size in ((96, 54), (128, 128), (40, 200)):
         image, predictor = noise(*size), import_module("segment_anything").SamPredictor(meta)
         predictor.set_image(image.numpy())
@@ -41,9 +41,9 @@ def test_the_network_is_that_of_meta(sam_weights):
 def test_a_folder_a_file_and_a_download_of_the_same_weights_agree(sam_weights, empty_hub):
     for file in (sam_weights / "tiny").iterdir():
         put(empty_hub, "someone/tiny", file.name, file.read_bytes())
-    expected = load_sam(str(sam_weights / "sam_tiny.pth")).state_dict()
+    expected = load_sam_checkpoint(str(sam_weights / "sam_tiny.pth"))[1].state_dict()
     for place in (sam_weights / "tiny", sam_weights / "tiny" / "model.safetensors", "someone/tiny"):
-        found = load_sam(str(place)).state_dict()
+        found = load_sam_checkpoint(str(place))[1].state_dict()
         assert set(found) == set(expected) and all(torch.equal(found[name], expected[name]) for name in found)
 
 
@@ -104,7 +104,7 @@ def test_the_masks_are_those_of_metas_generator(sam_weights, monkeypatch, size):
 @needs_cuda
 def test_a_gpu_finds_what_the_cpu_finds(sam_weights, monkeypatch):
     image, path = noise(160, 120), str(sam_weights / "tiny")
-    networks = [SamNetwork.load(path, device) for device in ("cpu", "cuda")]
+    networks = [load_sam_network(path, device) for device in ("cpu", "cuda")]
     exact, half = (network.embed(network.pixels([image]))[0].cpu() for network in networks)
     assert 0 < float((half - exact).norm() / exact.norm()) < 0.01 and half.dtype == torch.float32
 
@@ -154,7 +154,6 @@ def test_what_is_no_checkpoint(sam_weights, empty_hub, tmp_path, monkeypatch):
     refused(lambda: SamMasks("/nowhere/sam_vit_h.pth"), "/nowhere/sam_vit_h.pth", "--regions", error=missing)
     refused(lambda: SamMasks("sam_vit_h.pth"), "sam_vit_h.pth does not exist", error=missing)
     refused(lambda: SamMasks("vit_h"), "'vit_h'", "facebook/sam-vit-huge")
-    refused(lambda: SamMasks(str(sam_weights / "tiny"), level="xl"), "default, s, m, l", "'xl'", "--level")
     parts = ("facebook/sam-vit-huge", "Name or service not known", "--sam-model", "--regions patches")
     refused(lambda: SamMasks().masks(noise(30, 40)), *parts, error=missing)
     monkeypatch.setitem(sys.modules, "transformers", None)
@@ -194,7 +193,7 @@ def test_weights_of_another_network_are_not_downloaded(empty_hub, monkeypatch, t
         (tmp_path / "config.json").write_text(json.dumps({"model_type": "edgetam_video"}))
         return str(tmp_path)
 
-    monkeypatch.setattr("normlift_ns.segmentation.checkpoint.check_server", lambda address: None)
+    monkeypatch.setattr("normlift_ns.encoders.weights.check_hub_access", lambda: None)
     monkeypatch.setattr(import_module("huggingface_hub"), "snapshot_download", download)
     refused(lambda: SamMasks("someone/edgetam").masks(noise(30, 40)), "'edgetam_video'", "'sam', ")
     assert len(asked) > 0 and all(patterns == ["config.json"] for _, patterns in asked)

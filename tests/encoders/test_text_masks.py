@@ -8,6 +8,8 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
+from normlift_ns.encoders.build import make_source
+from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation import sam3
 from normlift_ns.segmentation.sam3 import Sam3Masks, Sam3Network, TextMasks
 from tests.encoders.test_library import photograph
@@ -86,7 +88,7 @@ def test_identity_holds_texts_and_words(written, tmp_path):
 
 
 def test_what_is_refused(written, tmp_path, monkeypatch):
-    refused(lambda: Sam3Masks((), str(written)), "--queries")
+    refused(lambda: make_source(SourceOptions(regions="sam3", sam_model=str(written))), "--queries")
     network = Sam3Network.load(str(written), "cpu")
     refused(lambda: network.segment(photograph(20, 20), ["bowl " * 40]), "32 tokens", "has ")
     copied(written, tmp_path)
@@ -95,5 +97,5 @@ def test_what_is_refused(written, tmp_path, monkeypatch):
     refused(lambda: Sam3Network.load(str(tmp_path), "cpu"), str(tmp_path), "no tokenizer.json")
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2"}))
     refused(lambda: Sam3Masks(("mug",), str(tmp_path)), "'sam2'", "--regions sam)", "'sam3'")
-    monkeypatch.setattr(torch, "__version__", "2.5.0")
+    monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: "2.5.0")
     refused(lambda: Sam3Masks(("mug",), str(written)), "SAM 3", "torch 2.6", "2.5.0")

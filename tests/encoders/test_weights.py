@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.open_clip import check_open_clip_names
-from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_weights, is_in_hub_cache
+from normlift_ns.encoders.open_clip import check_open_clip_names, has_local_clip_weights
+from normlift_ns.encoders.weights import find_in_hub_cache, find_local_sam
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, DEFAULT_SAM
 from normlift_ns.segmentation.checkpoint import check_sam_checkpoint
 from tests.encoders.tiny import refused
@@ -48,17 +48,17 @@ def test_all_published_weights_are_known(empty_hub: Path, open_clip: Any) -> Non
 
 def test_weights_of_sam_and_a_broken_cache(empty_hub: Path, tmp_path: Path) -> None:
     for file in ("config.json", "model.safetensors"):
-        assert not has_local_sam_weights(DEFAULT_SAM)
+        assert find_local_sam(DEFAULT_SAM) is None
         put(empty_hub, DEFAULT_SAM, file)
-    assert has_local_sam_weights(DEFAULT_SAM)
-    assert has_local_sam_weights(str(tmp_path))
-    assert not has_local_sam_weights("a/b")
+    assert find_local_sam(DEFAULT_SAM) is not None
+    assert find_local_sam(str(tmp_path)) == tmp_path
+    assert find_local_sam("a/b") is None
     # A broken cache holds nothing
     put(empty_hub, REPOSITORY, "config.json")
-    assert is_in_hub_cache(REPOSITORY, "config.json")
+    assert find_in_hub_cache(REPOSITORY, "config.json") is not None
     for content in (b"\xff\xfe", b"a\0b", b"x" * 5000, b""):
         (empty_hub / f"models--{REPOSITORY.replace('/', '--')}" / "refs" / "main").write_bytes(content)
-        assert not is_in_hub_cache(REPOSITORY, "config.json")
+        assert find_in_hub_cache(REPOSITORY, "config.json") is None
 
 
 def test_what_is_no_weight_file_is_never_opened(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -75,7 +76,7 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_p
 
 
 def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, trained, tmp_path, capsys) -> None:
-    monkeypatch.setattr("normlift_ns.encoders.weights.check_server", lambda address: None)
+    monkeypatch.setattr("urllib.request.urlopen", lambda request, timeout: io.BytesIO())
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
     assert code == 0 and states(found)["weights"] == "warning" and found["plan"] is None

@@ -10,7 +10,7 @@ import pytest
 from normlift_ns.cli import evaluate, export, lift, query, view
 from normlift_ns.cli.preflight import check_unused_options
 from normlift_ns.data.nerfstudio.config import read_config_paths
-from normlift_ns.encoders import weights
+from normlift_ns.encoders import open_clip
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 from tests.scripts.conftest import run_entry, said
@@ -205,10 +205,10 @@ def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_e
 
 
 def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsys):
-    def unreachable(address: str) -> None:
-        raise ConnectionError(f"{address} cannot be reached")
+    def unreachable(request: object, timeout: float) -> None:
+        raise OSError("no route")
 
-    monkeypatch.setattr(weights, "check_server", unreachable)
+    monkeypatch.setattr("urllib.request.urlopen", unreachable)
     monkeypatch.setenv("HF_ENDPOINT", "https://hub")
     for there in (False, True, None):
         asked: list[tuple[str, ...]] = []
@@ -217,7 +217,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
             asked.append(name)
             return there
 
-        monkeypatch.setattr(weights, "has_local_clip_weights", at_hand, raising=False)
+        monkeypatch.setattr(open_clip, "has_local_clip_weights", at_hand, raising=False)
         code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, "--timestamp", "old")
         assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
         text = said(capsys)
