@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -66,18 +66,10 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     Raises:
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
-    gaussians = lifted.scene.gaussians.to(device)
-    rasterize = partial(
-        rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
-    )
-    parts, tables = [], []
-    for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(_CELL_EVIDENCE[name](rasterize, gaussians, block), block))
-        tables += block.features
-    evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+    evidence, features, _ = _evidence_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
     scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.map(Tensor.cpu)
-    own, manifest = torch.arange(len(gaussians), dtype=torch.int32), {"dimension": features.shape[1]}
+    own, manifest = torch.arange(evidence.num_gaussians, dtype=torch.int32), {"dimension": features.shape[1]}
     if name != "vala":
         return SemanticField(scalars, own, StoredEvidence(evidence.to("cpu"), features.cpu()), manifest)
     rows = torch.cat([medians.half().cpu() for _, medians in iter_medians(evidence, features)])
@@ -98,29 +90,38 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     options = manifest.get("options", {})
     if options.get("consensus", False) == enabled:
         return lifted
-    power = options.get("weight_power", 1)
-    gaussians = lifted.scene.gaussians.to(device)
-    rasterize = partial(
-        rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
-    )
-    parts, tables, levels = [], [], []
-    for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(_plain(rasterize, gaussians, block, power=power), block))
-        tables += block.features
-        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
-    evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+    cells = partial(_plain, power=options.get("weight_power", 1))
+    evidence, features, level = _evidence_again(lifted, device, cells)
     lift_kwargs = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
     result = lift(evidence, features, **lift_kwargs)
     if enabled:
         kwargs = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
         kwargs = {key: value for key, value in kwargs.items() if value is not None}
-        table = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
+        table = consensus(evidence, features, level=level, **kwargs).features
         after = lift(evidence, table, **lift_kwargs)
         result = replace(after, scalars=with_original_reliability(after.scalars, result.scalars))
-    own = torch.arange(len(gaussians), dtype=torch.int32)
+    own = torch.arange(evidence.num_gaussians, dtype=torch.int32)
     store = StoredEvidence(evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": enabled}}
     return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
+
+
+def _evidence_again(
+    lifted: EvaluatedRun, device: str, cells: Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]
+) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
+    """Return evidence, features and levels of the regions of the lift, from the evidence of the cells."""
+    gaussians = lifted.scene.gaussians.to(device)
+    parts, tables, levels = [], [], []
+    for block in lifted_batches(lifted, device):
+        parts.append(cells_to_regions(cells(_rasterize(lifted, gaussians), gaussians, block), block))
+        tables += block.features
+        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
+    return Evidence.merge(*parts), torch.cat(tables).to(device), torch.cat(levels)
+
+
+def _rasterize(lifted: EvaluatedRun, gaussians: GaussianScene) -> Rasterize:
+    mode, settings = lifted.scene.rasterize_mode, lifted.settings
+    return partial(rasterize_evidence, gaussians, rasterize_mode=mode, settings=settings)
 
 
 def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None = None) -> Iterator[ViewBatch]:
@@ -345,27 +346,33 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)
-    timed = {"dense": lambda: _dense(job, blocks), "ours": lambda: _sparse(lifted, job, blocks)}
-    seconds = {name: _median_seconds(run) for name, run in timed.items()}
+    rasterize = _rasterize(lifted, job.scene)
+
+    def dense() -> None:
+        for block in blocks:
+            maps = feature_maps(block, job.scene.means.device)
+            dense_sums(job, block.cameras, maps, block.features[0].shape[1])
+
+    def ours() -> None:
+        for block in blocks:
+            evidence = cells_to_regions(_plain(rasterize, job.scene, block), block)
+            lift(evidence, torch.cat(block.features).to(job.scene.means)).directions(dtype=torch.float16)
+
+    dense_seconds, our_seconds = _median_seconds(dense), _median_seconds(ours)
     views = sum(len(block.cameras) for block in blocks)
     all_views = lifted.field.manifest.get("statistics", {}).get("views", views)
     return {
         "timed_views": float(views),
-        "dense512_s": seconds["dense"],
-        "evidence_lift_s": seconds["ours"],
-        "dense512_over_evidence_lift": seconds["dense"] / seconds["ours"],
-        "dense512_all_views_s": seconds["dense"] * all_views / views,
+        "dense512_s": dense_seconds,
+        "evidence_lift_s": our_seconds,
+        "dense512_over_evidence_lift": dense_seconds / our_seconds,
+        "dense512_all_views_s": dense_seconds * all_views / views,
     }
 
 
 def _job(lifted: EvaluatedRun, device: str) -> RasterJob:
     antialiased = lifted.scene.rasterize_mode == "antialiased"
     return RasterJob(lifted.scene.gaussians.to(device), antialiased, lifted.settings, torch.float32)
-
-
-def _dense(job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
-    for block in blocks:
-        dense_sums(job, block.cameras, feature_maps(block, job.scene.means.device), block.features[0].shape[1])
 
 
 def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float[Tensor, "h w d"]]:
@@ -375,21 +382,6 @@ def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float
         cells = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)
         rows = torch.nn.functional.pad(cells, (0, 0, 1, 0))
         yield rows[labels.to(device).long().clamp(min=-1) + 1]
-
-
-def _sparse(lifted: EvaluatedRun, job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
-    for block in blocks:
-        cells = rasterize_evidence(
-            job.scene,
-            block.cameras,
-            block.labels,
-            num_regions=[regions.shape[1] for regions in block.regions],
-            rasterize_mode=lifted.scene.rasterize_mode,
-            settings=lifted.settings,
-        )
-        lift(cells_to_regions(cells, block), torch.cat(block.features).to(job.scene.means)).directions(
-            dtype=torch.float16
-        )
 
 
 def _median_seconds(run: Callable[[], Any]) -> float:

@@ -1,4 +1,4 @@
-"""Evaluation on ScanNet as OpenGaussian does it."""
+"""3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh."""
 
 from __future__ import annotations
 
@@ -12,77 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
+from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
+from normlift_ns.data.splat import check_ply_header
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import Evaluation, mean
 from normlift_ns.options import WithoutDirection
-
-_MAX_HEADER = 2**16
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-
-
-def read_column(path: Path, name: str) -> np.ndarray:
-    """Read a property of all vertices.
-
-    Raises:
-        ValueError: the file is not a PLY file, does not begin with vertices, lacks the property, or is shorter than its
-            header says.
-        OSError: the file cannot be read.
-    """
-    with path.open("rb") as file:
-        start = file.read(_MAX_HEADER)
-        end = start.find(b"end_header")
-        body = start.find(b"\n", end) + 1
-        if not start.startswith(b"ply") or end < 0 or body == 0:
-            raise InputError("it has no PLY header")
-        encoding, count, table = _header(start[:end].decode("ascii"))
-        if name not in (table.names or ()):
-            raise InputError(f"its vertices have no property {name} (found {', '.join(table.names or ['none'])})")
-        size, least = os.fstat(file.fileno()).st_size - body, table.itemsize
-        if encoding == "ascii":
-            least = 2 * len(table.names or ())  # a digit and a separator
-        if not 0 < count <= (size + 1) // least:
-            raise InputError(f"its header declares {count:,} vertices, which does not fit its size of {size:,} bytes")
-        file.seek(body)
-        if encoding != "ascii":
-            return np.fromfile(file, table, count)[name]
-        column = np.loadtxt(file, ndmin=2, max_rows=count, usecols=(table.names or ()).index(name))[:, 0]
-        if len(column) != count:
-            raise InputError(f"its header declares {count:,} vertices, but it has {len(column):,}")
-        return column
-
-
-def _header(text: str) -> tuple[str, int, np.dtype]:
-    """Return the encoding, the number of vertices and the type of a vertex."""
-    encoding, count, fields = "", -1, []
-    for line in text.splitlines()[1:]:
-        match line.split():
-            case ["format", name, *_] if name in _BYTE_ORDERS:
-                encoding = name
-            case ["element", _, _] if count >= 0:
-                break  # the elements after the vertices
-            case ["element", "vertex", digits] if digits.isdigit() and len(digits) < 16:
-                count = int(digits)
-            case ["property", kind, name] if kind in _TYPES and count >= 0 and encoding != "":
-                fields.append((name, _BYTE_ORDERS[encoding] + _TYPES[kind]))
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                raise InputError(f"its header has the line {line[:80]!r}, expected vertices with numbers first")
-    if count < 0 or len(fields) == 0:
-        raise InputError("its header declares no vertices, or vertices without numbers")
-    return encoding, count, np.dtype(fields)
-
-
-# 3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh.
-
 
 NYU40 = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
@@ -129,11 +66,18 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
             "registration, under its license"
         )
     try:
-        column = read_column(path, "label")
+        check_ply_header(path)
+        data = PlyData.read(str(path), mmap="c")
+        vertex = data["vertex"].data if "vertex" in data else np.empty(0, [])
+        if len(vertex) == 0:
+            raise InputError("its header declares no vertices")
+        if "label" not in vertex.dtype.names:
+            raise InputError(f"its vertices have no property label (found {', '.join(vertex.dtype.names)})")
+        column = vertex["label"]
         labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
         if (labels != column).any():
             raise InputError("its labels are not 32-bit integers")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, PlyParseError, EOFError, MemoryError, OverflowError) as error:
         raise InputError(
             f"{path} is damaged, or not a PLY file with labeled vertices ({error}); download the scene's "
             "*_vh_clean_2.labels.ply again"
@@ -209,7 +153,11 @@ def evaluate_scannet(
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
             for rule in (without_direction, other)
         }
-        _check_scored(scores[without_direction], names, classes, min_opacity)
+        if all(math.isnan(score.miou) for score in scores[without_direction]):
+            raise InputError(
+                f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among "
+                f"them and an opacity of at least {min_opacity:g} (--min-opacity)"
+            )
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])
@@ -223,15 +171,6 @@ def evaluate_scannet(
     }  # fmt: skip
     share = mean([float((~scene.valid).double().mean()) for scene in scenes])
     return Evaluation({**results, "without_direction_share": share}, rows, settings, by_scene)
-
-
-def _check_scored(scores: Sequence[ClassScores], names: Sequence[str], classes: int, min_opacity: float) -> None:
-    """Raise InputError if no scene has a score."""
-    if all(math.isnan(score.miou) for score in scores):
-        raise InputError(
-            f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among them "
-            f"and an opacity of at least {min_opacity:g} (--min-opacity)"
-        )
 
 
 def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
