@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -108,17 +109,15 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
         ValueError: as `lifted_names`.
     """
     used, unusable = lifted_names(scene, manifest)
-    lifted: list[tuple[str, Camera]] = []
-    others: list[tuple[str, Camera, LeftOutReason]] = []
-    for name, camera in zip(scene.train.names, scene.train.cameras):
-        if name in used:
-            lifted.append((name, camera))
-        else:
-            why: LeftOutReason = "no features" if name in unusable else "max_views"
-            others.append((name, camera, why))
-    for name, camera in zip(scene.held_out.names, scene.held_out.cameras):
-        others.append((name, camera, "held out"))
-    reasons: list[LeftOutReason] = [why for *_, why in others]
+    photos = list(zip(scene.train.names, scene.train.cameras))
+    lifted = [(name, camera) for name, camera in photos if name in used]
+    others: list[tuple[str, Camera, LeftOutReason]] = [
+        (name, camera, "no features" if name in unusable else "max_views")
+        for name, camera in photos
+        if name not in used
+    ]
+    others += [(name, camera, "held out") for name, camera in zip(scene.held_out.names, scene.held_out.cameras)]
+    left_out = Counter(why for *_, why in others)
     lifted = [lifted[i] for i in sample_evenly(len(lifted), MAX_IMAGES)]
     others = [others[i] for i in sample_evenly(len(others), MAX_IMAGES)]
     return StudyImages(
@@ -126,7 +125,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
         [name for name, *_ in (*lifted, *others)],
         [camera for _, camera, *_ in (*lifted, *others)],
         [why for *_, why in others],
-        {why: reasons.count(why) for why in dict.fromkeys(reasons)},
+        dict(left_out),
     )
 
 
@@ -378,23 +377,35 @@ def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Ten
     return _ratio(rise, model.surface.sum())
 
 
-def choose_views(model: ReliabilityModel, views: SparseRows, count: int, max_views: int) -> list[tuple[int, float]]:
+def choose_views(
+    model: ReliabilityModel,
+    views: SparseRows,
+    count: int,
+    max_views: int,
+    *,
+    candidates: Bool[Tensor, " views"] | None = None,
+    accept: Callable[[int], bool] = lambda view: True,
+) -> list[tuple[int, float]]:
     """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
 
     Views without any gain are not returned.
 
     Args:
         views: W_jv of the candidates, [N, count].
+        candidates: views to choose from; None: all.
+        accept: whether a view may be chosen, asked only of those with the largest gain.
     """
+    left = torch.ones(count, dtype=torch.bool) if candidates is None else candidates.clone()
     chosen: list[tuple[int, float]] = []
-    for _ in range(min(max_views, count)):
-        gain = gains(model, views, count)
-        gain[[view for view, _ in chosen]] = 0.0
+    while len(chosen) < max_views and bool(left.any()):
+        gain = gains(model, views, count).cpu().where(left, 0.0)
         best = int(gain.argmax())
         if not float(gain[best]) > 0:
             break
-        chosen.append((best, float(gain[best])))
-        model = model.with_view(views, best)
+        left[best] = False
+        if accept(best):
+            chosen.append((best, float(gain[best])))
+            model = model.with_view(views, best)
     return chosen
 
 
@@ -525,9 +536,14 @@ def mean_depth(drawn: RasterInputs, camera: Camera) -> Float64[Tensor, "h w"]:
     """Return the mean depth at each pixel of a camera; infinite if less than half of the pixel is covered."""
     pose = camera.world_to_camera.to(drawn.gaussians.means)
     z = (drawn.gaussians.means @ pose[2, :3] + pose[2, 3])[:, None]
-    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
-    values, alpha = render(drawn.gaussians, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), **kwargs)
-    return torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.inf).double().cpu()
+    return _mean_of_pixels(drawn, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), torch.inf).double().cpu()
+
+
+def _mean_of_pixels(
+    drawn: RasterInputs, camera: Camera, values: Float[Tensor, "n 1"], empty: float
+) -> Float[Tensor, "h w"]:
+    image, alpha = render(drawn.gaussians, camera, values, rasterize_mode=drawn.rasterize_mode, settings=drawn.settings)
+    return torch.where(alpha > 0.5, image[:, :, 0] / alpha, empty)
 
 
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
@@ -599,21 +615,21 @@ def suggest_poses(
     inside[torch.cat(list(parts))] = 1
     share = float((inside * model.surface).sum() / model.surface.sum())
     lacking = replace(model, surface=inside * model.surface)
-    available = shown.amax(0) >= MIN_SHOWN_SHARE
-    poses: list[Pose] = []
-    while len(poses) < MAX_SUGGESTED_POSES and bool(available.any()):
-        gain = gains(lacking, weights, len(candidates)).cpu()
-        gain[~available] = 0.0
-        best = int(gain.argmax())
-        if not float(gain[best]) > 0:
-            break
-        available[best] = False
-        if _near_depth(drawn, candidates[best]) < _MIN_DEPTH * space.depth:
-            continue
-        numbers = [i for i, x in enumerate(shown[:, best].tolist(), 1) if x >= MIN_SHOWN_SHARE]
-        poses.append(Pose(candidates[best], share * float(gain[best]), numbers, float(shown[:, best].max())))
-        lacking = lacking.with_view(weights, best)
-    return poses
+    near = _MIN_DEPTH * space.depth
+    chosen = choose_views(
+        lacking,
+        weights,
+        len(candidates),
+        MAX_SUGGESTED_POSES,
+        candidates=shown.amax(0) >= MIN_SHOWN_SHARE,
+        accept=lambda view: _near_depth(drawn, candidates[view]) >= near,
+    )
+    return [Pose(candidates[v], share * gain, _regions_shown(shown, v), float(shown[:, v].max())) for v, gain in chosen]
+
+
+def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
+    """Return the numbers of the regions that a view shows, from 1."""
+    return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
 
 
 def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
@@ -641,10 +657,9 @@ class PoseRender(NamedTuple):
 def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
     """Render the trained scene from a new pose, with the mean R at every pixel."""
     camera = downscale_camera(pose.camera, _MAX_RENDER_PIXELS)
-    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
     image = render_image(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
-    values, alpha = render(drawn.gaussians, camera, reliability[:, None].to(drawn.gaussians.means), **kwargs)
-    return PoseRender(image, torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.nan).cpu())
+    values = reliability[:, None].to(drawn.gaussians.means)
+    return PoseRender(image, _mean_of_pixels(drawn, camera, values, torch.nan).cpu())
 
 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
@@ -700,12 +715,10 @@ def write_poses(
 
 def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     """Save the scene next to its reliability, with a color scale."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (only drawing needs it)
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
 
     height, width = picture.reliability.shape
     figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     left.imshow(picture.image.numpy())
     left.set_title(title, parse_math=False)
@@ -717,8 +730,7 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     scale.set_label("R")
     right.set_title("reliability")
     for axes in (left, right):
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
     figure.savefig(path)
 
 
@@ -863,12 +875,7 @@ def _suggest_images(
     names, count = images.names[images.lifted :], len(images.reasons)
     shown = visible_shares(unused, count, model.surface, parts)
     return [
-        SuggestedImage(
-            names[view],
-            images.reasons[view],
-            gain,
-            [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE],
-        )
+        SuggestedImage(names[view], images.reasons[view], gain, _regions_shown(shown, view))
         for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
     ]
 
