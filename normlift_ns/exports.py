@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
-from normlift_ns.analysis.catalogue import SimilarityTransform
-from normlift_ns.analysis.objects import Instances, find_instances
+from normlift_ns.analysis.objects import Instances, SimilarityTransform, find_instances
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors

@@ -16,7 +16,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, open_run
-from normlift_ns.analysis.catalogue import csv_columns, view_shares
+from normlift_ns.analysis.objects import csv_columns, view_shares
 from normlift_ns.cli import export, query
 from normlift_ns.cli.answers import print_catalog
 from normlift_ns.cli.common import CONSOLE
