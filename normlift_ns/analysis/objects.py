@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -161,15 +161,20 @@ def find_objects(
     Raises:
         ValueError: `min_gaussians` is less than 1, or as in `connected_components`.
     """
-    check_number("min_size", min_gaussians, int)
-    labels = connected_components(means, selected, reach=max_gap)
-    sizes = torch.bincount(labels[labels >= 0].long())
-    count = int((sizes >= min_gaussians).sum())  # sizes are in descending order
+    labels, count = _large_components(means, selected, max_gap, min_gaussians)
     return Objects(
         gaussians=int(selected.sum()),
-        in_smaller_parts=int(selected.sum() - sizes[:count].sum()),
+        in_smaller_parts=int(selected.sum() - (labels >= 0).sum()),
         objects=[describe_object(field, means, labels == i) for i in range(count)],
     )
+
+
+def _large_components(means: Tensor, selected: Tensor, reach: float, min_size: int) -> tuple[Int32[Tensor, " n"], int]:
+    """Return `connected_components` with -1 for those that are too small, and the number of the others."""
+    check_number("min_size", min_size, int)
+    labels = connected_components(means, selected, reach=reach)
+    count = int((torch.bincount(labels[labels >= 0].long()) >= min_size).sum())  # sizes are in descending order
+    return labels.where(labels < count, -1), count
 
 
 def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"]) -> SceneObject:
@@ -296,16 +301,12 @@ def find_instances(
     >>> instances.class_id.tolist(), instances.instance_id.tolist(), instances.classes
     ([1, 1, 2, 0], [1, 1, 2, 0], (1, 2))
     """
-    check_number("min_size", min_size, int)
     class_id = best_prompt(relevancy, selected) + 1
     instance_id = torch.zeros_like(class_id)
     classes: list[int] = []
     for number in range(1, len(texts) + 1):
-        labels = connected_components(means, class_id == number, reach=reach)
-        sizes = torch.bincount(labels[labels >= 0].long())
-        count = int((sizes >= min_size).sum())  # sizes are in descending order
-        listed = (labels >= 0) & (labels < count)
-        instance_id = torch.where(listed, labels + 1 + len(classes), instance_id)
+        labels, count = _large_components(means, class_id == number, reach, min_size)
+        instance_id = torch.where(labels >= 0, labels + 1 + len(classes), instance_id)
         classes += [number] * count
     return Instances(texts, class_id, instance_id, tuple(classes))
 
@@ -489,7 +490,7 @@ def view_shares(
     count = len(instances.classes)
     if count == 0:
         return torch.zeros(count, len(cameras))
-    small = [_downscaled(camera) for camera in cameras]
+    small = [camera.downscaled(_RENDER_SIZE / max(camera.width, camera.height)) for camera in cameras]
     maps = [torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small]
     options = {"rasterize_mode": rasterize_mode, "settings": settings, "num_regions": [1] * len(small)}
     rows = rasterize_evidence(gaussians, small, maps, **options).rows  # pyright: ignore[reportArgumentType]
@@ -510,13 +511,6 @@ def _inside(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
         pixels = pixels[:, :2] / depth
         fractions.append(((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1).mean())
     return np.array(fractions)
-
-
-def _downscaled(camera: Camera) -> Camera:
-    factor = min(1.0, _RENDER_SIZE / max(camera.width, camera.height))
-    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
-    return Camera(camera.K * scale, camera.world_to_camera, width, height)
 
 
 def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = None) -> Placement:
@@ -599,10 +593,8 @@ def csv_rows(catalogue: Catalogue) -> Iterator[list[Any]]:
     """Yield the rows of the CSV table."""
     for item in catalogue.objects:
         best = [*item.best_views, *[""] * (MAX_BEST_VIEWS - len(item.best_views))]
-        places = (
-            (x.centroid, x.extent, x.box.center, x.box.size, x.box.axes.ravel()) for x in (item.capture, item.scene)
-        )
-        numbers = np.concatenate(list(chain.from_iterable(places))).tolist()
+        places = [(x.centroid, x.extent, x.box.center, x.box.size, *x.box.axes) for x in (item.capture, item.scene)]
+        numbers = np.array(places).ravel().tolist()
         yield [item.id, item.text, item.class_id, item.gaussians, item.reliability, item.views, *best, *numbers]
 
 

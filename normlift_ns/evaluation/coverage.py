@@ -301,23 +301,14 @@ class ReliabilityModel:
         )
 
 
-def downscale_camera(camera: Camera, pixels: int = PIXELS) -> Camera:
-    """Return the camera with about `pixels` pixels, but never more than it has.
-
-    >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), torch.eye(4), width=160, height=120)
-    >>> small = downscale_camera(camera, 1200)
-    >>> small.width, small.height, small.K[0].tolist()
-    (40, 30, [25.0, 0.0, 20.0])
-    """
-    factor = min(1.0, (pixels / (camera.width * camera.height)) ** 0.5)
-    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
-    return Camera(camera.K * scale.to(camera.K.device), camera.world_to_camera, width, height)
+def _with_pixels(camera: Camera, pixels: int) -> Camera:
+    """Return the camera with about `pixels` pixels, but never more than it has."""
+    return camera.downscaled((pixels / (camera.width * camera.height)) ** 0.5)
 
 
 def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int = PIXELS) -> SparseRows:
     """Return W_jv, [N, views]: the weight of Gaussian j in view v, as a share of the image."""
-    small = [downscale_camera(camera, pixels) for camera in cameras]
+    small = [_with_pixels(camera, pixels) for camera in cameras]
     with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
         warnings.filterwarnings("ignore", message=".*are not drawn")
         rows = rasterize_evidence(
@@ -524,7 +515,7 @@ class FreeSpace:
 
 def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
     """Compute the depths of some of the images."""
-    chosen = [downscale_camera(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
+    chosen = [_with_pixels(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
     to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
     up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
     if not bool(up.norm() > 0):  # cameras with all kinds of roll
@@ -634,7 +625,7 @@ def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
 
 def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
     """Return the depth that all but a few pixels exceed."""
-    depth = mean_depth(drawn, downscale_camera(camera, _DEPTH_PIXELS))
+    depth = mean_depth(drawn, _with_pixels(camera, _DEPTH_PIXELS))
     return float(depth.flatten().sort().values[int(_NEAR_SHARE * depth.numel())])
 
 
@@ -656,7 +647,7 @@ class PoseRender(NamedTuple):
 
 def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
     """Render the trained scene from a new pose, with the mean R at every pixel."""
-    camera = downscale_camera(pose.camera, _MAX_RENDER_PIXELS)
+    camera = _with_pixels(pose.camera, _MAX_RENDER_PIXELS)
     image = render_image(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
     values = reliability[:, None].to(drawn.gaussians.means)
     return PoseRender(image, _mean_of_pixels(drawn, camera, values, torch.nan).cpu())

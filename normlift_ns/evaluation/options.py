@@ -168,10 +168,8 @@ def mean(values: Sequence[float]) -> float:
 def write_evaluation(
     path: Path,
     evaluation: Evaluation,
+    runs: Sequence[tuple[str, str]],
     *,
-    experiment_name: str,
-    method_name: str,
-    checkpoint: str,
     studies: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -180,19 +178,16 @@ def write_evaluation(
 
     NaN is written as null.
 
+    Args:
+        runs: name and checkpoint of every run.
     Raises:
         FileExistsError: the file exists and `overwrite` is False.
     """
-    document = {
-        "experiment_name": experiment_name,
-        "method_name": method_name,
-        "checkpoint": checkpoint,
-        "results": evaluation.results,
-        "settings": evaluation.settings,
-        **({"scenes": evaluation.scenes} if evaluation.scenes else {}),
-        "rows": evaluation.rows,
-        **({"studies": studies} if studies else {}),
-    }
+    names, checkpoints = (", ".join(values) for values in zip(*runs))
+    document: dict[str, Any] = {"experiment_name": names, "method_name": "normlift", "checkpoint": checkpoints}
+    document |= {"results": evaluation.results, "settings": evaluation.settings}
+    document |= {"scenes": evaluation.scenes} if evaluation.scenes else {}
+    document |= {"rows": evaluation.rows} | ({"studies": studies} if studies else {})
     write_text_file(path, json.dumps(_to_json(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
 
 
