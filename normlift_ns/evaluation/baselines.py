@@ -26,7 +26,7 @@ from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.protocols import EvaluatedRun
+from normlift_ns.evaluation.protocols import EvaluatedRun, Rasterize, rasterizer
 from normlift_ns.evidence_collection import (
     ViewBatch,
     cells_to_regions,
@@ -38,7 +38,6 @@ from normlift_ns.evidence_collection import (
 from normlift_ns.options import LiftOptions
 from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
-from normlift_ns.rasterization.rasterize import rasterize_evidence
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
@@ -56,8 +55,6 @@ _RAYS = 2**17
 """Number of rays that are processed together."""
 _BLOCK = 2**12
 """Number of Gaussians whose medians are computed together."""
-Rasterize = Callable[..., Evidence]
-"""`rasterize_evidence` with the arguments that are the same in all calls."""
 
 
 def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> SemanticField:
@@ -111,17 +108,13 @@ def _evidence_again(
 ) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
     """Return evidence, features and levels of the regions of the lift, from the evidence of the cells."""
     gaussians = lifted.scene.gaussians.to(device)
+    rasterize = rasterizer(lifted.scene, lifted.settings, gaussians)
     parts, tables, levels = [], [], []
     for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(cells(_rasterize(lifted, gaussians), gaussians, block), block))
+        parts.append(cells_to_regions(cells(rasterize, gaussians, block), block))
         tables += block.features
         levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
     return Evidence.merge(*parts), torch.cat(tables).to(device), torch.cat(levels)
-
-
-def _rasterize(lifted: EvaluatedRun, gaussians: GaussianScene) -> Rasterize:
-    mode, settings = lifted.scene.rasterize_mode, lifted.settings
-    return partial(rasterize_evidence, gaussians, rasterize_mode=mode, settings=settings)
 
 
 def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None = None) -> Iterator[ViewBatch]:
@@ -153,20 +146,11 @@ def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch, *, 
     return rasterize(block.cameras, block.labels, num_regions=counts, weight_power=power)
 
 
-def _centers(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
-    cells = _plain(rasterize, gaussians, block)
-    return center_evidence(gaussians.means, block.cameras, _columns(block), cells)
-
-
-def _heaviest(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
-    return top_evidence(rasterize, block.cameras, _columns(block), _plain(rasterize, gaussians, block))
-
-
 _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]] = {
     "sfs": partial(_plain, power=2),
-    "occam": _centers,
+    "occam": lambda r, g, block: center_evidence(g.means, block.cameras, _columns(block), _plain(r, g, block)),
     "vala": _plain,
-    "drsplat": _heaviest,
+    "drsplat": lambda r, g, block: top_evidence(r, block.cameras, _columns(block), _plain(r, g, block)),
 }
 """Functions that compute the evidence of the cells in some views."""
 
@@ -346,7 +330,7 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)
-    rasterize = _rasterize(lifted, job.scene)
+    rasterize = rasterizer(lifted.scene, lifted.settings, job.scene)
 
     def dense() -> None:
         for block in blocks:

@@ -32,7 +32,7 @@ from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files, refuse_run_files
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import OBJECT_MAX_GAP, RasterizeMode, check_number, check_path
-from normlift_ns.rasterization.rasterize import rasterize_evidence, render, render_image
+from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
 # Images of a scene: which were lifted, and why others were not.
@@ -109,24 +109,15 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
         ValueError: as `lifted_names`.
     """
     used, unusable = lifted_names(scene, manifest)
-    photos = list(zip(scene.train.names, scene.train.cameras))
-    lifted = [(name, camera) for name, camera in photos if name in used]
-    others: list[tuple[str, Camera, LeftOutReason]] = [
-        (name, camera, "no features" if name in unusable else "max_views")
-        for name, camera in photos
-        if name not in used
-    ]
-    others += [(name, camera, "held out") for name, camera in zip(scene.held_out.names, scene.held_out.cameras)]
-    left_out = Counter(why for *_, why in others)
-    lifted = [lifted[i] for i in sample_evenly(len(lifted), MAX_IMAGES)]
-    others = [others[i] for i in sample_evenly(len(others), MAX_IMAGES)]
-    return StudyImages(
-        len(lifted),
-        [name for name, *_ in (*lifted, *others)],
-        [camera for _, camera, *_ in (*lifted, *others)],
-        [why for *_, why in others],
-        dict(left_out),
-    )
+    train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
+    lifted = [view for view in train if view[0] in used]
+    unused = [view for view in train if view[0] not in used]
+    reasons: list[LeftOutReason] = ["no features" if name in unusable else "max_views" for name, _ in unused]
+    reasons += ["held out"] * len(held_out)
+    chosen, left = (sample_evenly(count, MAX_IMAGES) for count in (len(lifted), len(reasons)))
+    images = [*(lifted[i] for i in chosen), *([*unused, *held_out][i] for i in left)]
+    names, cameras = [name for name, _ in images], [camera for _, camera in images]
+    return StudyImages(len(chosen), names, cameras, [reasons[i] for i in left], dict(Counter(reasons)))
 
 
 # Regions without reliable evidence: spatially connected parts of what the images show.
@@ -268,6 +259,11 @@ class RasterInputs(NamedTuple):
     settings: RasterSettings
     weight_power: int
 
+    @property
+    def options(self) -> RasterOptions:
+        """The settings as keywords of `rasterize_evidence`."""
+        return RasterOptions(rasterize_mode=self.rasterize_mode, settings=self.settings, weight_power=self.weight_power)
+
 
 @dataclass(frozen=True)
 class ReliabilityModel:
@@ -311,15 +307,8 @@ def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int 
     small = [_with_pixels(camera, pixels) for camera in cameras]
     with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
         warnings.filterwarnings("ignore", message=".*are not drawn")
-        rows = rasterize_evidence(
-            drawn.gaussians,
-            small,
-            (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small),
-            num_regions=[1] * len(small),
-            rasterize_mode=drawn.rasterize_mode,
-            settings=drawn.settings,
-            weight_power=drawn.weight_power,
-        ).rows
+        labels = (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small)
+        rows = rasterize_evidence(drawn.gaussians, small, labels, num_regions=[1] * len(small), **drawn.options).rows
     area = torch.tensor([float(c.width * c.height) for c in small], dtype=torch.float64, device=rows.weight.device)
     return SparseRows(rows.offsets, rows.column, rows.weight.double() / area[rows.column.long()])
 
@@ -840,8 +829,8 @@ def coverage_of(
     surface = max_weights(weights)
     if not float(surface.sum()) > 0:
         raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
-    split = images.lifted
-    lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
+    columns = torch.arange(count, device=device).tensor_split([images.lifted])
+    lifted, unused = (weights.select_columns(part, count) for part in columns)
     model = model_of_lift(scalars, lifted, surface, beta=vote.beta)
     reliability = model.reliability(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
@@ -869,10 +858,6 @@ def _suggest_images(
         SuggestedImage(names[view], images.reasons[view], gain, _regions_shown(shown, view))
         for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
     ]
-
-
-def _columns(weights: SparseRows, views: range, count: int) -> SparseRows:
-    return weights.select_columns(torch.tensor(list(views), dtype=torch.int64, device=weights.weight.device), count)
 
 
 def _remarks(

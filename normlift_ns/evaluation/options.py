@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import msgspec
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
+from normlift_ns.io.manifest import read_text
 from normlift_ns.options import WithoutDirection, check_options
 
 Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]
@@ -101,8 +101,6 @@ class MaskOptions:
 
 PromptText = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
 """Text that can be used as a prompt: not blank, and without lone surrogates."""
-_MAX_BYTES = 2**26
-"""Maximum file size in bytes; label files have some thousands."""
 _Document = TypeVar("_Document")
 
 
@@ -112,14 +110,9 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     Raises:
         ValueError: the file is missing, too large or not valid JSON, a key occurs twice, or a value has another type.
     """
-    if not os.path.isfile(path):
-        raise InputError("it is not a file")
     try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise InputError(f"it has more than {_MAX_BYTES:,} bytes")
-        document = json.loads(content.decode("utf8"), object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
+        text = read_text(path)
+        document = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
         return msgspec.convert(document, kind)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{type(error).__name__}: {error}") from None

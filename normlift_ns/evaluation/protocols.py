@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED, Evidence
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.metrics import NO_CLASS, class_scores, classify, confusion
 from normlift_ns.core.relevancy import relevancy
 from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.base import check_files_distinct
@@ -88,7 +89,10 @@ def read_names(path: Path) -> Names:
     try:
         document = read_document(path, dict[str, Any])
         named = msgspec.convert(document if "labels" in document else {"labels": document}, _NamesFile)
-        name_of = _by_value(named.labels)
+        wrong = [key for key in named.labels if _VALUE.fullmatch(key) is None]
+        if len(wrong) > 0:
+            raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
+        name_of = {int(value): name for value, name in named.labels.items()}
         if named.background is not None and named.background in name_of:
             raise InputError(f"value {named.background} is the background, but has a name")
         if len(name_of) == 0:
@@ -97,13 +101,6 @@ def read_names(path: Path) -> Names:
         raise InputError(f"{path} is not a valid file of mask names ({error}); {expected}") from error
     classes = tuple(dict.fromkeys(name_of.values()))
     return Names(classes, {value: classes.index(name) for value, name in name_of.items()})
-
-
-def _by_value(labels: Mapping[str, str]) -> dict[int, str]:
-    wrong = [key for key in labels if _VALUE.fullmatch(key) is None]
-    if len(wrong) > 0:
-        raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
-    return {int(value): name for value, name in labels.items()}
 
 
 def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
@@ -171,15 +168,12 @@ def evaluate_masks(
         "gaussians_with_truth_share": float(scored.double().mean()),
         "zero_evidence_share": float((reliability == 0).double().mean()),
     }
-    rows = [
-        {"class": name, "gaussians": int((truth == c).sum()), **_row(of_gaussians, c, "3d"), **_row(of_pixels, c, "2d")}
-        for c, name in enumerate(names)
-    ]
+    rows: list[dict[str, Any]] = []
+    for c, name in enumerate(names):
+        rows.append({"class": name, "gaussians": int((truth == c).sum())})
+        for suffix, scores in (("3d", of_gaussians), ("2d", of_pixels)):
+            rows[-1] |= {f"iou_{suffix}": float(scores.iou[c]), f"accuracy_{suffix}": float(scores.accuracy[c])}
     return Evaluation(results, rows, {"protocol": "masks", **settings})
-
-
-def _row(scores: ClassScores, c: int, suffix: str) -> dict[str, float]:
-    return {f"iou_{suffix}": float(scores.iou[c]), f"accuracy_{suffix}": float(scores.accuracy[c])}
 
 
 # The three evaluation protocols on lifted runs: from files and options to metrics.
@@ -240,6 +234,16 @@ class EvaluatedRun:
         return {name: camera for views in splits for name, camera in zip(views.names, views.cameras)}
 
 
+Rasterize = Callable[..., Evidence]
+"""`rasterize_evidence` with the arguments that are the same in all calls."""
+
+
+def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
+    """Return `rasterize_evidence` for a scene, or for its Gaussians on another device."""
+    gaussians = scene.gaussians if gaussians is None else gaussians
+    return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)
+
+
 def scene_names(labels: Sequence[Path]) -> list[str]:
     """Return scene names for label files or folders: the name of the file or folder, or the whole path if names are
     equal.
@@ -276,9 +280,7 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
     truths = [read_labels(path) for path in labels]
     inputs = zip(runs, scene_names(labels), labels, truths)
     scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
-    kwargs = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
-    evaluation = evaluate_scannet(scenes, **kwargs)
-    return replace(evaluation, settings={**evaluation.settings, "spelling": options.spelling})
+    return evaluate_scannet(scenes, options)
 
 
 def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
@@ -298,12 +300,11 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
             for file, name in images.items()
         ]
         views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
-        factor = lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
         lengths: list[Tensor | None] = [None] * len(views)
         if options.masking == "langsplat":
-            lengths = list(lifted.feature_lengths([camera for camera, _ in views], factor))
+            lengths = list(lifted.feature_lengths([camera for camera, _ in views], _scale(lifted, options)))
         for (camera, frame), length in zip(views, lengths):
-            scores = _frame_scores(lifted, camera, frame, factor, length, options)
+            scores = _frame_scores(lifted, camera, frame, length, options)
             rows += [
                 {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
@@ -314,18 +315,17 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
     return summarize_lerf(rows, options.average, settings)
 
 
+def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] | float:
+    return lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
+
+
 def _frame_scores(
-    lifted: EvaluatedRun,
-    camera: Camera,
-    frame: LabeledFrame,
-    factor: Float[Tensor, "n 1"] | float,
-    length: Float[Tensor, "h w"] | None,
-    options: LerfOptions,
+    lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
 ) -> FrameScores:
     """Return composited scores, divided by the length of each pixel's feature if given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
     negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
-    values, _ = lifted.composite(camera, factor * lifted.cosine((*prompts, *negatives)))
+    values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))
     if length is not None:
         values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
     values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
@@ -366,14 +366,8 @@ def mask_truth(
             yield read_classes(masks, name, names, camera.height, camera.width)
 
     count = len(names.classes)
-    evidence = rasterize_evidence(
-        scene.gaussians,
-        scene.train.cameras,
-        (labels.int().clamp(min=UNLABELED) for labels in classes(scene.train)),
-        num_regions=[count] * len(scene.train),
-        rasterize_mode=scene.rasterize_mode,
-        settings=settings,
-    )
+    labels = (labels.int().clamp(min=UNLABELED) for labels in classes(scene.train))
+    evidence = rasterizer(scene, settings)(scene.train.cameras, labels, num_regions=[count] * len(scene.train))
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
     if not bool((truth >= 0).any()):
         raise InputError(

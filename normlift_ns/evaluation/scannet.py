@@ -18,7 +18,7 @@ from torch import Tensor
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
 from normlift_ns.data.splat import check_ply_header
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.options import Evaluation, mean
+from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
 from normlift_ns.options import WithoutDirection
 
 NYU40 = {
@@ -38,6 +38,9 @@ CLASS_SETS = {
 """NYU40 ids of the three sets."""
 SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
+
+
+_OTHER: dict[WithoutDirection, WithoutDirection] = {"first": "none", "none": "first"}
 
 
 class SceneLabels(NamedTuple):
@@ -67,13 +70,13 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
         )
     try:
         check_ply_header(path)
-        data = PlyData.read(str(path), mmap="c")
-        vertex = data["vertex"].data if "vertex" in data else np.empty(0, [])
-        if len(vertex) == 0:
+        vertex = next((x for x in PlyData.read(str(path), mmap="c").elements if x.name == "vertex"), None)
+        if vertex is None or vertex.count == 0:
             raise InputError("its header declares no vertices")
-        if "label" not in vertex.dtype.names:
-            raise InputError(f"its vertices have no property label (found {', '.join(vertex.dtype.names)})")
-        column = vertex["label"]
+        names = [item.name for item in vertex.properties]
+        if "label" not in names:
+            raise InputError(f"its vertices have no property label (found {', '.join(names)})")
+        column = np.asarray(vertex["label"])
         labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
         if (labels != column).any():
             raise InputError("its labels are not 32-bit integers")
@@ -137,14 +140,13 @@ def predict_classes(
     return truth, classify(scene.cosine[:, columns], scene.valid, without_direction=without_direction)
 
 
-def evaluate_scannet(
-    scenes: Sequence[SceneLabels], *, min_opacity: float = 0.1, without_direction: WithoutDirection = "first"
-) -> Evaluation:
+def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> Evaluation:
     """Compute mIoU and mAcc of every set of classes, averaged over scenes.
 
     `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
     """
-    other: WithoutDirection = "none" if without_direction == "first" else "first"
+    min_opacity, without_direction = options.min_opacity, options.without_direction
+    other = _OTHER[without_direction]
     names = [scene.name for scene in scenes]
     results, rows = {}, []
     by_scene: list[dict[str, Any]] = [{"scene": name} for name in names]
@@ -165,10 +167,8 @@ def evaluate_scannet(
             row |= {f"miou_{classes}": score.miou, f"macc_{classes}": score.macc}
             rows += _class_rows(row["scene"], classes, score)
     missing = [name for name in SCENES if name not in names]
-    settings = {
-        "protocol": "scannet", "min_opacity": min_opacity, "without_direction": without_direction, "scenes": names,
-        "missing_scenes": missing,
-    }  # fmt: skip
+    facts = {"min_opacity": min_opacity, "without_direction": without_direction, "scenes": names}
+    settings = {"protocol": "scannet", **facts, "missing_scenes": missing, "spelling": options.spelling}
     share = mean([float((~scene.valid).double().mean()) for scene in scenes])
     return Evaluation({**results, "without_direction_share": share}, rows, settings, by_scene)
 

@@ -109,8 +109,9 @@ def make_display(
     scalars = field.scalars
     zeros = torch.zeros_like(scalars.reliability)
     relevancy = zeros[:, None][:, :0] if answer is None else answer.relevancy
-    explicit, selected = selection is not None, selection_mask(answer, shown) if selection is None else selection
-    selected = zeros.bool() if selected is None else selected
+    explicit, selected = selection is not None, zeros.bool() if selection is None else selection
+    if answer is not None and not explicit:
+        selected = answer.selected.any(dim=1) if shown is None else answer.selected[:, shown]
     count, shown_relevancy, selected_by_any = relevancy.shape[1], zeros, zeros
     scale = whole = (0.0, 1.0)
     if answer is not None and count > 0:
@@ -121,13 +122,6 @@ def make_display(
     values = torch.cat([relevancy.float(), torch.stack([c.float() for c in columns], dim=1)], dim=1)
     texts = () if answer is None else answer.texts
     return Display(values, scale, whole, colormap, texts, prompt_colors(texts).to(values), shown, drawn, by_hand)
-
-
-def selection_mask(answer: Answer | None, shown: int | None) -> Bool[Tensor, " n"] | None:
-    """Return the mask of Gaussians selected by prompt `shown` (None: by any prompt); None without an answer."""
-    if answer is None:
-        return None
-    return answer.selected.any(dim=1) if shown is None else answer.selected[:, shown]
 
 
 def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float, float]:
@@ -349,8 +343,10 @@ def view_figure(
         selected: mask of the selected pixels, which are outlined.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
-    panels = [panel] if image is None else [Image.fromarray(image.cpu().numpy()).resize(panel.size), panel]
-    captions = ["answer"] if image is None else ["training image", "answer"]
+    panels, captions = [panel], ["answer"]
+    if image is not None:
+        panels.insert(0, Image.fromarray(image.cpu().numpy()).resize(panel.size))
+        captions.insert(0, "training image")
     summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {header.summary}"
     if not bool(selected.any()):
         summary = header.summary
@@ -469,32 +465,28 @@ def save_overlays(
         OSError: a file cannot be written.
         ValueError: two figures would have the same name.
     """
-    files = {
-        view: [f"{view}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)] for view in cameras
-    }
-    sheets = (
-        [f"{CONTACT_SHEET_PREFIX}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
-        if len(cameras) > 1
-        else []
-    )
-    counts = Counter([*sheets, *(name for names in files.values() for name in names)])
+    prefixes = [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras]
+    ends = [f"{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
+    counts = Counter(f"{prefix}_{end}" for prefix in prefixes for end in ends)
     duplicates = [name for name, count in counts.items() if count > 1]
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
     headers = [FigureHeader.of(finding) for finding in answer]
     sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
+
+    def save(prefix: str, q: int, picture: Image.Image) -> None:
+        paths.append(folder / f"{prefix}_{ends[q]}")
+        with atomic_file(paths[-1], overwrite=overwrite) as draft:
+            picture.save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+
     for view, camera in cameras.items():
         image = _training_image(scene, view)
         for q, overlay in enumerate(_overlays(scene, answer, camera, settings)):
             overlays[q].append((view, *overlay))
-            paths.append(folder / files[view][q])
-            with atomic_file(paths[-1], overwrite=overwrite) as draft:
-                view_figure(sheet, headers[q], view, image, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
-    for q, name in enumerate(sheets):
-        paths.append(folder / name)
-        with atomic_file(paths[-1], overwrite=overwrite) as draft:
-            contact_sheet(sheet, headers[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+            save(view, q, view_figure(sheet, headers[q], view, image, *overlay))
+    for q in range(len(ends) if len(cameras) > 1 else 0):
+        save(CONTACT_SHEET_PREFIX, q, contact_sheet(sheet, headers[q], overlays[q]))
     return paths
 
 
