@@ -162,11 +162,13 @@ def find_objects(
         ValueError: `min_gaussians` is less than 1, or as in `connected_components`.
     """
     labels, count = _large_components(means, selected, max_gap, min_gaussians)
-    return Objects(
-        gaussians=int(selected.sum()),
-        in_smaller_parts=int(selected.sum() - (labels >= 0).sum()),
-        objects=[describe_object(field, means, labels == i) for i in range(count)],
-    )
+    return _objects(field, means, selected, labels + 1, range(1, count + 1))
+
+
+def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor, listed: Iterable[int]) -> Objects:
+    """Summarize the objects that are listed, of those that `ids` numbers; 0 is none."""
+    small = int((selected & (ids == 0)).sum())
+    return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
 def _large_components(means: Tensor, selected: Tensor, reach: float, min_size: int) -> tuple[Int32[Tensor, " n"], int]:
@@ -317,15 +319,9 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
         ids = [i for i, class_id in enumerate(instances.classes, 1) if class_id == number]
-        tables.append({
-            "text": text,
-            "class_id": number,
-            "gaussians": int(in_class.sum()),
-            "in_smaller_parts": int((in_class & (instances.instance_id == 0)).sum()),
-            "objects": [
-                {"instance_id": i, **asdict(describe_object(field, means, instances.instance_id == i))} for i in ids
-            ],
-        })  # fmt: skip
+        found = _objects(field, means, in_class, instances.instance_id, ids).to_json()
+        objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
+        tables.append({"text": text, "class_id": number, **found, "objects": objects})
     return tables
 
 

@@ -156,16 +156,16 @@ class NormLiftEval:
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
         """Return a function that scores runs, and one that measures the signals of R."""
-        from normlift_ns.evaluation import protocols, studies  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation import lerf, protocols, scannet, studies  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.options import Evaluation  # noqa: PLC0415
 
         if self.protocol == "none":
             return lambda runs: Evaluation({}, [], {"protocol": "none"}), lambda runs: []
         if self.protocol == "scannet":
             kwargs = {"labels": self.labels, "options": self.scannet}
-            return partial(protocols.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
+            return partial(scannet.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
         if self.protocol == "lerf":
-            evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
+            evaluate = partial(lerf.run_lerf, labels=self.labels, options=self.lerf)
             return evaluate, partial(studies.plain_signals, labels=self.labels)
         run = next(iter(runs))
         truth = protocols.mask_truth(run.scene, self.labels[0], self.masks, settings=run.settings)

@@ -8,6 +8,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -31,7 +32,7 @@ from normlift_ns.evaluation.studies import recorded_vote, voting_scalars
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files, refuse_run_files
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import OBJECT_MAX_GAP, RasterizeMode, check_number, check_path
+from normlift_ns.options import RasterizeMode, check_number, check_path
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -113,7 +114,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
     lifted = [view for view in train if view[0] in used]
     unused = [view for view in train if view[0] not in used]
     reasons: list[LeftOutReason] = ["no features" if name in unusable else "max_views" for name, _ in unused]
-    reasons += ["held out"] * len(held_out)
+    reasons.extend("held out" for _ in held_out)
     chosen, left = (sample_evenly(count, MAX_IMAGES) for count in (len(lifted), len(reasons)))
     images = [*(lifted[i] for i in chosen), *([*unused, *held_out][i] for i in left)]
     names, cameras = [name for name, _ in images], [camera for _, camera in images]
@@ -184,19 +185,16 @@ def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
 
 
 def weak_regions(
-    evidence: GaussianEvidence, *, min_reliability: float, reach: float
+    evidence: GaussianEvidence, min_reliability: float
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
     """Return regions of visible Gaussians with R_j(S) below a bound, and their Gaussians, sorted by their lack of
     evidence.
 
     The lack of a region is sum_j s_j (min_reliability - R_j(S)).
-
-    Args:
-        reach: as in `connected_components`.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)
-    labels = connected_components(evidence.means, weak, reach=reach)
+    labels = connected_components(evidence.means, weak)
     chosen = (labels >= 0).nonzero().squeeze(1)
     number, lacking = labels[chosen].long(), surface * (min_reliability - evidence.reliability)
     share, lack = (torch.bincount(number, x[chosen]) for x in (surface / surface.sum(), lacking))
@@ -259,11 +257,6 @@ class RasterInputs(NamedTuple):
     settings: RasterSettings
     weight_power: int
 
-    @property
-    def options(self) -> RasterOptions:
-        """The settings as keywords of `rasterize_evidence`."""
-        return RasterOptions(rasterize_mode=self.rasterize_mode, settings=self.settings, weight_power=self.weight_power)
-
 
 @dataclass(frozen=True)
 class ReliabilityModel:
@@ -308,7 +301,9 @@ def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int 
     with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
         warnings.filterwarnings("ignore", message=".*are not drawn")
         labels = (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small)
-        rows = rasterize_evidence(drawn.gaussians, small, labels, num_regions=[1] * len(small), **drawn.options).rows
+        mode, power = drawn.rasterize_mode, drawn.weight_power
+        options = RasterOptions(rasterize_mode=mode, weight_power=power, settings=drawn.settings)
+        rows = rasterize_evidence(drawn.gaussians, small, labels, num_regions=[1] * len(small), **options).rows
     area = torch.tensor([float(c.width * c.height) for c in small], dtype=torch.float64, device=rows.weight.device)
     return SparseRows(rows.offsets, rows.column, rows.weight.double() / area[rows.column.long()])
 
@@ -358,13 +353,7 @@ def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Ten
 
 
 def choose_views(
-    model: ReliabilityModel,
-    views: SparseRows,
-    count: int,
-    max_views: int,
-    *,
-    candidates: Bool[Tensor, " views"] | None = None,
-    accept: Callable[[int], bool] = lambda view: True,
+    model: ReliabilityModel, views: SparseRows, count: int, max_views: int, accept: Callable[[int], bool] | None = None
 ) -> list[tuple[int, float]]:
     """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
 
@@ -372,20 +361,18 @@ def choose_views(
 
     Args:
         views: W_jv of the candidates, [N, count].
-        candidates: views to choose from; None: all.
-        accept: whether a view may be chosen, asked only of those with the largest gain.
+        accept: whether a view may be chosen; None: any view.
     """
-    left = torch.ones(count, dtype=torch.bool) if candidates is None else candidates.clone()
     chosen: list[tuple[int, float]] = []
-    while len(chosen) < max_views and bool(left.any()):
-        gain = gains(model, views, count).cpu().where(left, 0.0)
-        best = int(gain.argmax())
-        if not float(gain[best]) > 0:
+    for _ in range(min(max_views, count)):
+        gain = gains(model, views, count).cpu()
+        gain[[view for view, _ in chosen]] = 0.0
+        order = gain.argsort(descending=True, stable=True)[: int((gain > 0).sum())].tolist()
+        best = next((view for view in order if accept is None or accept(view)), None)
+        if best is None:
             break
-        left[best] = False
-        if accept(best):
-            chosen.append((best, float(gain[best])))
-            model = model.with_view(views, best)
+        chosen.append((best, float(gain[best])))
+        model = model.with_view(views, best)
     return chosen
 
 
@@ -595,27 +582,22 @@ def suggest_poses(
     inside[torch.cat(list(parts))] = 1
     share = float((inside * model.surface).sum() / model.surface.sum())
     lacking = replace(model, surface=inside * model.surface)
-    near = _MIN_DEPTH * space.depth
-    chosen = choose_views(
-        lacking,
-        weights,
-        len(candidates),
-        MAX_SUGGESTED_POSES,
-        candidates=shown.amax(0) >= MIN_SHOWN_SHARE,
-        accept=lambda view: _near_depth(drawn, candidates[view]) >= near,
-    )
+
+    @cache
+    def accept(view: int) -> bool:
+        """Whether a view shows a region, and all but a few pixels are not too near."""
+        if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
+            return False
+        depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()
+        return float(depth.sort().values[int(_NEAR_SHARE * len(depth))]) >= _MIN_DEPTH * space.depth
+
+    chosen = choose_views(lacking, weights, len(candidates), MAX_SUGGESTED_POSES, accept)
     return [Pose(candidates[v], share * gain, _regions_shown(shown, v), float(shown[:, v].max())) for v, gain in chosen]
 
 
 def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
     """Return the numbers of the regions that a view shows, from 1."""
     return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
-
-
-def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
-    """Return the depth that all but a few pixels exceed."""
-    depth = mean_depth(drawn, _with_pixels(camera, _DEPTH_PIXELS))
-    return float(depth.flatten().sort().values[int(_NEAR_SHARE * depth.numel())])
 
 
 # Output files of the coverage study: renders of the new poses, and a camera path for ns-render.
@@ -835,7 +817,7 @@ def coverage_of(
     reliability = model.reliability(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
     evidenced = GaussianEvidence(gaussians.means, scalars, surface, reliability, count_views(lifted, surface), lost)
-    regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=OBJECT_MAX_GAP)
+    regions, parts = weak_regions(evidenced, min_reliability)
     targets = [region.centre for region in regions]
     poses = suggest_poses(drawn, images.cameras, model, targets, parts)
     return Coverage(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, NamedTuple
 
@@ -15,18 +16,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.metrics import localized, mask_iou, mask_recall
+from normlift_ns.core.relevancy import relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import (
     LANGSPLAT_MASKINGS,
     AveragingOrder,
     Evaluation,
+    LerfOptions,
     Masking,
     PromptText,
     mean,
     read_document,
 )
+from normlift_ns.evaluation.protocols import EvaluatedRun, scene_names
 from normlift_ns.evaluation.sfs import clean_mask, histogram_threshold
+from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 
 # Labels of LERF-OVS: one JSON file per annotated frame, with polygons of named objects.
 
@@ -306,3 +312,52 @@ def _grouped(
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return groups
+
+
+def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
+    """Run protocol lerf with one run per scene.
+
+    Raises:
+        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
+    """
+    files = [read_frames(folder) for folder in labels]
+    rows, missing = [], []
+    for scene, frames, lifted in zip(scene_names(labels), files, runs):
+        cameras = lifted.cameras()
+        images, unmatched = match_views(frames, list(cameras))
+        missing += [f"{scene}/{stem}" for stem in unmatched]
+        views = [
+            (cameras[name], read_frame(file, cameras[name].width, cameras[name].height))
+            for file, name in images.items()
+        ]
+        views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
+        lengths: list[Tensor | None] = [None] * len(views)
+        if options.masking == "langsplat":
+            lengths = list(lifted.feature_lengths([camera for camera, _ in views], _scale(lifted, options)))
+        for (camera, frame), length in zip(views, lengths):
+            scores = _frame_scores(lifted, camera, frame, length, options)
+            rows += [
+                {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
+                for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
+            ]
+    if len(rows) == 0:
+        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
+    settings = {**asdict(options), "labels_without_image": missing}
+    return summarize_lerf(rows, options.average, settings)
+
+
+def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] | float:
+    return lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
+
+
+def _frame_scores(
+    lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
+) -> FrameScores:
+    """Return composited scores, divided by the length of each pixel's feature if given."""
+    prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
+    negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
+    values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))
+    if length is not None:
+        values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
+    values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
+    return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)

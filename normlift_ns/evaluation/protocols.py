@@ -1,10 +1,10 @@
-"""Evaluation protocols on lifted runs, and instance masks."""
+"""Lifted runs to evaluate, and the evaluation against instance masks."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -20,38 +20,11 @@ from normlift_ns.core.evidence import UNLABELED, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.metrics import NO_CLASS, class_scores, classify, confusion
-from normlift_ns.core.relevancy import relevancy
 from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.base import check_files_distinct
 from normlift_ns.encoders.text_files import TextEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.lerf import (
-    FrameScores,
-    LabeledFrame,
-    frame_rows,
-    match_views,
-    read_frame,
-    read_frames,
-    summarize_lerf,
-)
-from normlift_ns.evaluation.options import (
-    LANGSPLAT_MASKINGS,
-    Evaluation,
-    LerfOptions,
-    MaskOptions,
-    PromptText,
-    ScannetOptions,
-    read_document,
-)
-from normlift_ns.evaluation.scannet import (
-    NYU40,
-    PAPER_SPELLING,
-    SceneLabels,
-    check_identity,
-    evaluate_scannet,
-    read_labels,
-)
-from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
+from normlift_ns.evaluation.options import Evaluation, MaskOptions, PromptText, read_document
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
@@ -176,7 +149,7 @@ def evaluate_masks(
     return Evaluation(results, rows, {"protocol": "masks", **settings})
 
 
-# The three evaluation protocols on lifted runs: from files and options to metrics.
+# Lifted runs, as all protocols evaluate them.
 
 
 _CHANNELS = 64
@@ -255,81 +228,6 @@ def scene_names(labels: Sequence[Path]) -> list[str]:
     """
     short = [path.name.split("_vh_clean")[0] for path in labels]
     return [name if short.count(name) == 1 else str(path) for name, path in zip(short, labels)]
-
-
-def label_scene(
-    lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
-) -> SceneLabels:
-    """Return the data of a run that protocol scannet needs.
-
-    Raises:
-        ValueError: the number of vertices differs from that of Gaussians.
-    """
-    check_identity(name, len(lifted.scene.gaussians), nyu40, path)
-    prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
-    cosine = lifted.cosine(tuple(prompts.values()))
-    return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
-
-
-def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
-    """Run protocol scannet with one run per scene.
-
-    Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
-    """
-    truths = [read_labels(path) for path in labels]
-    inputs = zip(runs, scene_names(labels), labels, truths)
-    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
-    return evaluate_scannet(scenes, options)
-
-
-def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
-    """Run protocol lerf with one run per scene.
-
-    Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
-    """
-    files = [read_frames(folder) for folder in labels]
-    rows, missing = [], []
-    for scene, frames, lifted in zip(scene_names(labels), files, runs):
-        cameras = lifted.cameras()
-        images, unmatched = match_views(frames, list(cameras))
-        missing += [f"{scene}/{stem}" for stem in unmatched]
-        views = [
-            (cameras[name], read_frame(file, cameras[name].width, cameras[name].height))
-            for file, name in images.items()
-        ]
-        views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
-        lengths: list[Tensor | None] = [None] * len(views)
-        if options.masking == "langsplat":
-            lengths = list(lifted.feature_lengths([camera for camera, _ in views], _scale(lifted, options)))
-        for (camera, frame), length in zip(views, lengths):
-            scores = _frame_scores(lifted, camera, frame, length, options)
-            rows += [
-                {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
-                for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
-            ]
-    if len(rows) == 0:
-        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
-    settings = {**asdict(options), "labels_without_image": missing}
-    return summarize_lerf(rows, options.average, settings)
-
-
-def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] | float:
-    return lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
-
-
-def _frame_scores(
-    lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
-) -> FrameScores:
-    """Return composited scores, divided by the length of each pixel's feature if given."""
-    prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
-    negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
-    values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))
-    if length is not None:
-        values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
-    values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
-    return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classi
 from normlift_ns.data.splat import check_ply_header
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
+from normlift_ns.evaluation.protocols import EvaluatedRun, scene_names
 from normlift_ns.options import WithoutDirection
 
 NYU40 = {
@@ -180,3 +181,29 @@ def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str,
         for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())
         if not math.isnan(iou)
     ]
+
+
+def label_scene(
+    lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
+) -> SceneLabels:
+    """Return the data of a run that protocol scannet needs.
+
+    Raises:
+        ValueError: the number of vertices differs from that of Gaussians.
+    """
+    check_identity(name, len(lifted.scene.gaussians), nyu40, path)
+    prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
+    cosine = lifted.cosine(tuple(prompts.values()))
+    return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
+
+
+def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
+    """Run protocol scannet with one run per scene.
+
+    Raises:
+        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
+    """
+    truths = [read_labels(path) for path in labels]
+    inputs = zip(runs, scene_names(labels), labels, truths)
+    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
+    return evaluate_scannet(scenes, options)

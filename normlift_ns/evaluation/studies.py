@@ -22,8 +22,8 @@ from normlift_ns.core.refine import decay_width, refine, voting_weights
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.baselines import BASELINES, baseline_field, time_dense_lift, timing_obstacle, with_consensus
 from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
-from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scene, scene_names
-from normlift_ns.evaluation.scannet import predict_classes, read_labels
+from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, scene_names
+from normlift_ns.evaluation.scannet import label_scene, predict_classes, read_labels
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
 
