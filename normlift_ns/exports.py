@@ -414,16 +414,8 @@ def transfer_labels(
 
 
 def _export_ply(job: ExportJob, path: Path) -> list[str]:
-    rows = write_splat_ply(
-        path,
-        TrainedSplat.of(job.scene),
-        job.field,
-        job.answer,
-        keep=job.keep,
-        instances=job.instances,
-        objects=job.objects,
-        overwrite=job.overwrite,
-    )
+    kwargs = {name: getattr(job, name) for name in ("keep", "instances", "objects", "overwrite")}
+    rows = write_splat_ply(path, TrainedSplat.of(job.scene), job.field, job.answer, **kwargs)
     return [f"{len(rows):,} of {len(job.field):,} Gaussians in {path}"]
 
 

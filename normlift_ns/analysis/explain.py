@@ -30,7 +30,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
-from normlift_ns.core.scene import Scene, View
+from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures
 from normlift_ns.encoders.build import restore_source
@@ -395,15 +395,11 @@ class RecordedVotes:
         index_of = {name: index for index, name in enumerate(self.scene.train.names)}
         indices, images = [index_of[self.names[view]] for view in views], []
 
-        def done(view: View) -> None:
-            images.append(view.image)
-
         rendered = self._option("image_source", str, "photos") == "render"
         settings = RasterSettings.recorded(self.field.manifest) if rendered else None
-        divisor = self._option("lift_downscale", int, 1)
-        return observe_views(
-            self.scene, indices, self._source, render_settings=settings, downscale=divisor, on_view=done
-        ), images
+        kwargs: dict[str, Any] = {"render_settings": settings, "downscale": self._option("lift_downscale", int, 1)}
+        kwargs |= {"on_view": lambda view: images.append(view.image)}
+        return observe_views(self.scene, indices, self._source, **kwargs), images
 
     @cached_property
     def _source(self) -> FeatureSource:
@@ -446,21 +442,10 @@ def _without_networks(source: FeatureSource, cache: Path) -> FeatureSource:
         is_color = isinstance(source.encoder, ColorEncoder)
         encoder: Any = source.encoder if is_color else _CacheOnly(source.encoder, cache)
         return replace(source, regions=regions, encoder=encoder)
-    return _CacheOnlyPatches(source.encoder, source.count, cache) if isinstance(source, PatchFeatures) else source
-
-
-def _missing_features(cache: Path) -> InputError:
-    return InputError(f"{cache / 'features'} no longer holds the features of the images; {_REMEDY}")
-
-
-@dataclass(frozen=True)
-class _CacheOnlyPatches(PatchFeatures):
-    """Patch features without a network; see `_CacheOnly`."""
-
-    cache: Path = Path()
-
-    def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float[Tensor, "r d"]:
-        raise _missing_features(self.cache)
+    if isinstance(source, PatchFeatures):
+        encoder = _CacheOnly(source.encoder, cache)
+        return replace(source, encoder=encoder)
+    return source
 
 
 class _CacheOnly:
@@ -477,5 +462,11 @@ class _CacheOnly:
 
     def encode_each(self, views: Iterable[tuple[Tensor, Tensor]]) -> Iterator[Tensor]:
         for _ in views:
-            raise _missing_features(self._cache)
+            raise self._missing_features()
         yield from ()
+
+    def patches(self, image: Tensor, rows: int, columns: int) -> Tensor:
+        raise self._missing_features()
+
+    def _missing_features(self) -> InputError:
+        return InputError(f"{self._cache / 'features'} no longer holds the features of the images; {_REMEDY}")

@@ -61,11 +61,11 @@ class OrientedBox:
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         return self.center + (signs * self.size) @ self.axes
 
-    def transformed(
-        self, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]
-    ) -> OrientedBox:
-        """Return the box transformed by p -> scale * rotation @ p + shift."""
-        return OrientedBox(scale * rotation @ self.center + shift, scale * self.size, self.axes @ rotation.T)
+    def transformed(self, by: SimilarityTransform) -> OrientedBox:
+        """Return the transformed box."""
+        return OrientedBox(
+            by.scale * by.rotation @ self.center + by.shift, by.scale * self.size, self.axes @ by.rotation.T
+        )
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
@@ -453,7 +453,7 @@ def make_catalogue(
         order, num_views = np.lexsort((-share, ~whole, ~shows)), int(shows.sum())
         scene_place = _place(means[rows], weight[rows])
         points = to_capture.transform_points(means[rows])
-        box = scene_place.box.transformed(to_capture.rotation, to_capture.scale, to_capture.shift)
+        box = scene_place.box.transformed(to_capture)
         objects.append(
             CatalogueObject(
                 id=number,

@@ -28,7 +28,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import MAX_SUGGESTED_POSES, pose_output_paths
-from normlift_ns.evaluation.studies import recorded_vote, voting_scalars
+from normlift_ns.evaluation.studies import make_figure, recorded_vote, voting_scalars
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files, refuse_run_files
 from normlift_ns.lifted_run import LiftedRun
@@ -605,7 +605,7 @@ def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
 
 _MAX_RENDER_PIXELS = 300_000
 """Maximum number of pixels in a render."""
-_INCHES, _DPI = 6.0, 100
+_INCHES = 6.0
 
 
 class PoseRender(NamedTuple):
@@ -677,11 +677,8 @@ def write_poses(
 
 def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     """Save the scene next to its reliability, with a color scale."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
-
     height, width = picture.reliability.shape
-    figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = make_figure((2 * _INCHES, _INCHES * height / width + 0.6), 1, 2)
     left.imshow(picture.image.numpy())
     left.set_title(title, parse_math=False)
     right.set_facecolor("black")
@@ -811,7 +808,8 @@ def coverage_of(
     surface = max_weights(weights)
     if not float(surface.sum()) > 0:
         raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
-    columns = torch.arange(count, device=device).tensor_split([images.lifted])
+    split = images.lifted
+    columns = torch.arange(count, device=device).tensor_split([split])
     lifted, unused = (weights.select_columns(part, count) for part in columns)
     model = model_of_lift(scalars, lifted, surface, beta=vote.beta)
     reliability = model.reliability(model.weight, model.squared)
@@ -820,26 +818,20 @@ def coverage_of(
     regions, parts = weak_regions(evidenced, min_reliability)
     targets = [region.centre for region in regions]
     poses = suggest_poses(drawn, images.cameras, model, targets, parts)
+    shown = visible_shares(unused, len(images.reasons), model.surface, parts)
+    photographs = [
+        SuggestedImage(images.names[split + view], images.reasons[view], gain, _regions_shown(shown, view))
+        for view, gain in choose_views(model, unused, len(images.reasons), _MAX_IMAGES)
+    ]
     return Coverage(
         reliability=float((surface * reliability).sum() / surface.sum()),
         regions=regions,
-        photographs=_suggest_images(images, model, unused, parts),
+        photographs=photographs,
         poses=poses,
         pictures=[render_pose(drawn, scene, reliability, pose) for pose in poses],
         left_out=images.left_out,
         remarks=_remarks(images, regions, poses, min_reliability),
     )
-
-
-def _suggest_images(
-    images: StudyImages, model: ReliabilityModel, unused: SparseRows, parts: Sequence[Tensor]
-) -> list[SuggestedImage]:
-    names, count = images.names[images.lifted :], len(images.reasons)
-    shown = visible_shares(unused, count, model.surface, parts)
-    return [
-        SuggestedImage(names[view], images.reasons[view], gain, _regions_shown(shown, view))
-        for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
-    ]
 
 
 def _remarks(

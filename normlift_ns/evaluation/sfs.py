@@ -50,7 +50,9 @@ def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
     elif float(values.var()) < _MIN_VARIANCE:
         threshold = float(values.mean())
     else:
-        threshold = (_otsu(counts, edges) + _upper_quartile(values)) / 2
+        few = len(values) <= _MAX_QUANTILE_VALUES
+        upper = values.quantile(_UPPER_QUANTILE) if few else np.quantile(values.numpy(), _UPPER_QUANTILE)
+        threshold = (_otsu(counts, edges) + float(upper)) / 2
     return float(torch.tensor(threshold, dtype=torch.float32))
 
 
@@ -75,12 +77,6 @@ def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> flo
     above, total = 1 - below, (share * center).sum()
     between = below * above * (moment / (below + _EPSILON) - (total - moment) / (above + _EPSILON)) ** 2
     return float(center[int(between.argmax())])
-
-
-def _upper_quartile(values: Float[Tensor, " n"]) -> float:
-    if len(values) <= _MAX_QUANTILE_VALUES:
-        return float(values.quantile(_UPPER_QUANTILE))
-    return float(np.quantile(values.numpy(), _UPPER_QUANTILE))
 
 
 def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

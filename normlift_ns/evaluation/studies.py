@@ -382,7 +382,7 @@ def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, re
         result: main result of the run, drawn as a line across all panels.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
-    figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
+    figure, axes = make_figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
     for panel, parameter in zip(axes, parameters):
         points = sorted((row for row in rows if row["parameter"] == parameter), key=lambda row: row["value"])
         values = [row[metric] for row in points]
@@ -414,7 +414,7 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, if there is a truth. The
     right panel shows the histogram of R, with R = 0 as a separate bar.
     """
-    figure, axes = _figure((9, 3.5 * len(rows)), len(rows), 2)
+    figure, axes = make_figure((9, 3.5 * len(rows)), len(rows), 2)
     for row, curves, histogram in zip(rows, axes[::2], axes[1::2]):
         for name, label in (("reliability", "R"), ("norm", "||f||")):
             bins = [100 * x for key, x in row.items() if key.startswith(f"{name}.bin")]
@@ -436,7 +436,8 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
+def make_figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
+    """Return a figure of a size in inches, and its panels row by row."""
     from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
 
     figure = Figure(figsize=size, layout="constrained")
