@@ -304,37 +304,31 @@ def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
 
 
 def label_cloud(
-    cloud: PlyData,
-    path: Path,
-    means: Float64[np.ndarray, "m 3"],
-    columns: dict[str, np.ndarray],
-    max_distance: float,
-    *,
-    overwrite: bool = False,
+    transfer: CloudTransfer, path: Path, means: np.ndarray, columns: dict[str, np.ndarray], *, overwrite: bool = False
 ) -> LabelTransfer:
     """Write a cloud with the labels of the nearest Gaussians, and with zeros for points that are too far from any.
 
     Args:
         path: path of the new PLY file.
-        means: centers of the Gaussians to take labels from, in the coordinates of the cloud.
+        means: centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
         columns: labels of these Gaussians, by property name.
-        max_distance: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
         ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
         raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
+    means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     spacing = spacing[spacing.isfinite()]
     if len(spacing) == 0:
         raise InputError(
             "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
         )
-    limit = max_distance * float(spacing.median())
-    row, within = nearest_gaussians(vertex_positions(cloud), means, limit)
+    limit = transfer.max_distance * float(spacing.median())
+    row, within = nearest_gaussians(vertex_positions(transfer.cloud), means, limit)
     labels = {name: np.where(within, x[row], 0).astype(x.dtype) for name, x in columns.items()}
-    write_cloud(path, cloud, labels, overwrite=overwrite)
+    write_cloud(path, transfer.cloud, labels, overwrite=overwrite)
     return LabelTransfer(len(within), float(within.mean()), limit)
 
 
@@ -407,10 +401,9 @@ def transfer_labels(
     columns = TrainedSplat.of(scene).columns()
     rows = exportable_rows(columns, torch.ones(len(field), dtype=torch.bool))
     means = scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
-    means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     labels = semantic_columns(field, answer, instances)
     labels = {name: x[rows] for name, x in labels.items() if name not in ("reliability", "n_eff")}
-    return label_cloud(transfer.cloud, path, means, labels, transfer.max_distance, overwrite=overwrite)
+    return label_cloud(transfer, path, means, labels, overwrite=overwrite)
 
 
 def _export_ply(job: ExportJob, path: Path) -> list[str]:
@@ -455,12 +448,7 @@ ARRAYS = Exporter(_export_arrays)
 CLOUD = Exporter(_export_cloud, ".ply")
 EXPORTERS = Registry(
     "normlift_ns.exporters",
-    {
-        "ply": "normlift_ns.exports:PLY",
-        "masks": "normlift_ns.exports:MASKS",
-        "arrays": "normlift_ns.exports:ARRAYS",
-        "cloud": "normlift_ns.exports:CLOUD",
-    },
+    {name: f"normlift_ns.exports:{name.upper()}" for name in ("ply", "masks", "arrays", "cloud")},
     Exporter,
     "exporter",
     "--exporters",

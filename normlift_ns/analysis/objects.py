@@ -24,7 +24,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_files
 from normlift_ns.options import CATALOG_FILES, FLOATER_THRESHOLD, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, check_number
-from normlift_ns.rasterization.rasterize import rasterize_evidence
+from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
 # Oriented bounding boxes of Gaussian centers that are robust to outliers.
@@ -63,9 +63,8 @@ class OrientedBox:
 
     def transformed(self, by: SimilarityTransform) -> OrientedBox:
         """Return the transformed box."""
-        return OrientedBox(
-            by.scale * by.rotation @ self.center + by.shift, by.scale * self.size, self.axes @ by.rotation.T
-        )
+        center = by.scale * by.rotation @ self.center + by.shift
+        return OrientedBox(center, by.scale * self.size, self.axes @ by.rotation.T)
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
@@ -363,10 +362,6 @@ class SimilarityTransform:
         shift = other.transform_points(self.shift[None])[0]
         return SimilarityTransform(other.rotation @ self.rotation, other.scale * self.scale, shift)
 
-    def scaled(self, factor: float) -> SimilarityTransform:
-        """Return this transform followed by scaling with `factor`."""
-        return SimilarityTransform(self.rotation, factor * self.scale, factor * self.shift)
-
     def transform_points(self, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3"]:
         """Transform points [M, 3]."""
         return self.scale * points @ self.rotation.T + self.shift
@@ -436,13 +431,12 @@ def make_catalogue(
         metres_per_unit: length of a capture unit in meters, > 0; None if unknown.
         device: device that renders the objects, to rank images.
     """
-    to_capture = capture if metres_per_unit is None else capture.scaled(metres_per_unit)
+    unit = 1.0 if metres_per_unit is None else metres_per_unit
+    to_capture = SimilarityTransform(capture.rotation, unit * capture.scale, unit * capture.shift)
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
     weight, reliability = (x.double().cpu().numpy() for x in (field.scalars.weight + 1e-12, field.scalars.reliability))
     count, names, cameras = len(instances.classes), scene.train.names, scene.train.cameras
-    settings = RasterSettings.recorded(field.manifest)
-    gaussians, mode = scene.gaussians.to(device), scene.rasterize_mode
-    shares = view_shares(gaussians, cameras, instances, rasterize_mode=mode, settings=settings).cpu().numpy()
+    shares = view_shares(scene, instances, RasterSettings.recorded(field.manifest), device).cpu().numpy()
     objects = []
     for number in range(1, count + 1):
         rows = np.flatnonzero(ids == number)
@@ -471,25 +465,18 @@ def make_catalogue(
     return Catalogue(tuple(objects), small, metres_per_unit)
 
 
-def view_shares(
-    gaussians: GaussianScene,
-    cameras: Sequence[Camera],
-    instances: Instances,
-    *,
-    rasterize_mode: str = "classic",
-    settings: RasterSettings | None = None,
-) -> Float[Tensor, "m v"]:
+def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
     """Return the share of each image that each object covers, with occlusion.
 
     The share is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
     count = len(instances.classes)
     if count == 0:
-        return torch.zeros(count, len(cameras))
-    small = [camera.downscaled(_RENDER_SIZE / max(camera.width, camera.height)) for camera in cameras]
+        return torch.zeros(count, len(scene.train))
+    small = [camera.downscaled(_RENDER_SIZE / max(camera.width, camera.height)) for camera in scene.train.cameras]
     maps = [torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small]
-    options = {"rasterize_mode": rasterize_mode, "settings": settings, "num_regions": [1] * len(small)}
-    rows = rasterize_evidence(gaussians, small, maps, **options).rows  # pyright: ignore[reportArgumentType]
+    kwargs = RasterOptions(rasterize_mode=scene.rasterize_mode, settings=settings)
+    rows = rasterize_evidence(scene.gaussians.to(device), small, maps, num_regions=[1] * len(small), **kwargs).rows
     ids = instances.instance_id.to(rows.weight.device).long()[rows.row_index()]
     flat = torch.zeros((count + 1) * len(small), dtype=torch.float64, device=rows.weight.device)
     flat.index_add_(0, ids * len(small) + rows.column.long(), rows.weight.double())

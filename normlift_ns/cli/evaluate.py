@@ -97,7 +97,7 @@ class NormLiftEval:
         write_evaluation(self.output_path, evaluation, names, studies=found, overwrite=self.overwrite)
         written = [self.output_path, *self._plots(found, evaluation.results)]
         if covered is not None:
-            written += write_poses(self._coverage_stem, covered.poses, covered.pictures, overwrite=self.overwrite)
+            written += write_poses(self._beside("coverage"), covered.poses, covered.pictures, overwrite=self.overwrite)
         _print_tables(evaluation, found)
         info(f"Written: {', '.join(map(str, written))}")
         return evaluation
@@ -139,8 +139,8 @@ class NormLiftEval:
         for labels in self.labels:
             (check_readable_file if self.protocol == "scannet" else check_readable_folder)(labels, "--labels")
         check_readable_file(self.masks.names, "--names")
-        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
-        figures += pose_output_paths(self._coverage_stem) if "coverage" in self.study else []
+        figures = [self._beside(f"{name}.svg") for name in _WITH_FIGURE if name in self.study]
+        figures += pose_output_paths(self._beside("coverage")) if "coverage" in self.study else []
         refuse_existing(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
         for path in (self.output_path, *figures):
             check_writable_file(path, "--output-path")
@@ -181,16 +181,12 @@ class NormLiftEval:
         metric, result = next(iter(results.items()), ("", 0.0))
         draw = {"sweeps": lambda rows: sweeps_figure(rows, metric, metric, result), "signals": signals_figure}
         for name in (name for name in _WITH_FIGURE if name in studies):
-            save_figure(draw[name](studies[name]), self._figure(name), overwrite=self.overwrite)
-            yield self._figure(name)
+            save_figure(draw[name](studies[name]), self._beside(f"{name}.svg"), overwrite=self.overwrite)
+            yield self._beside(f"{name}.svg")
 
-    @property
-    def _coverage_stem(self) -> Path:
-        """Common beginning of the paths of the coverage study."""
-        return self.output_path.with_name(f"{self.output_path.stem}_coverage")
-
-    def _figure(self, study: str) -> Path:
-        return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
+    def _beside(self, end: str) -> Path:
+        """Return the path of the output file with another end."""
+        return self.output_path.with_name(f"{self.output_path.stem}_{end}")
 
 
 def _print_tables(evaluation: Evaluation, studies: Mapping[str, list[Row]]) -> None:

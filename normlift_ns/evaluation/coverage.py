@@ -81,9 +81,7 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
     """
     names = list(scene.train.names)
     try:
-        record = msgspec.convert(
-            {key: manifest[key] for key in _LiftRecord.__struct_fields__ if key in manifest}, _LiftRecord
-        )
+        record = msgspec.convert(dict(manifest), _LiftRecord)
     except msgspec.ValidationError as error:
         raise InputError(f"the run's record of its images is damaged ({error}); lift again") from None
     used, counts = record.views_lifted, record.statistics
@@ -437,14 +435,9 @@ class Pose:
 
     def to_json(self) -> dict[str, Any]:
         """Return the pose as JSON types."""
-        return {
-            "position": self.camera_to_world()[:3, 3].tolist(),
-            "camera_to_world": self.camera_to_world().tolist(),
-            "field_of_view": self.field_of_view,
-            "gain": self.gain,
-            "regions": self.regions,
-            "shown": self.shown,
-        }
+        pose = self.camera_to_world()
+        numbers = {name: getattr(self, name) for name in ("field_of_view", "gain", "regions", "shown")}
+        return {"position": pose[:3, 3].tolist(), "camera_to_world": pose.tolist(), **numbers}
 
     def camera_to_world(self) -> Float64[Tensor, "4 4"]:
         """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
@@ -837,21 +830,14 @@ def coverage_of(
 def _remarks(
     images: StudyImages, regions: Sequence[WeakRegion], poses: Sequence[Pose], min_reliability: float
 ) -> list[str]:
-    remarks = []
-    if len(regions) == 0:
-        remarks.append(
-            f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except "
-            "for parts smaller than a thousandth of it."
-        )
-    elif len(poses) == 0:
-        remarks.append(
-            "No new pose shows a region better than the images do; it may be hidden from all possible positions."
-        )
-    if len(images.reasons) == 0:
-        remarks.append("No image was left out of the lift, so none can be suggested.")
-    total = sum(images.left_out.values())
-    if len(images.reasons) < total:
-        remarks.append(f"Of {total:,} images left out, only {len(images.reasons)}, evenly spaced, were examined.")
-    if len(images.cameras) == 1:
-        remarks.append("The scene has a single camera; the study cannot judge what this camera does not show.")
-    return remarks
+    total, examined = sum(images.left_out.values()), len(images.reasons)
+    hidden, single = len(regions) > 0 and len(poses) == 0, len(images.cameras) == 1
+    remarks = {
+        f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except for "
+        "parts smaller than a thousandth of it.": len(regions) == 0,
+        "No new pose shows a region better than the images do; it may be hidden from all possible positions.": hidden,
+        "No image was left out of the lift, so none can be suggested.": examined == 0,
+        f"Of {total:,} images left out, only {examined}, evenly spaced, were examined.": examined < total,
+        "The scene has a single camera; the study cannot judge what this camera does not show.": single,
+    }
+    return [text for text, applies in remarks.items() if applies]

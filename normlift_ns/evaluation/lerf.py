@@ -326,11 +326,9 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
         cameras = lifted.cameras()
         images, unmatched = match_views(frames, list(cameras))
         missing += [f"{scene}/{stem}" for stem in unmatched]
-        views = [
-            (cameras[name], read_frame(file, cameras[name].width, cameras[name].height))
-            for file, name in images.items()
-        ]
-        views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
+        labeled = ((cameras[name], file) for file, name in images.items())
+        read = [(camera, read_frame(file, camera.width, camera.height)) for camera, file in labeled]
+        views = [(camera, frame) for camera, frame in read if len(frame.masks) > 0]
         lengths: list[Tensor | None] = [None] * len(views)
         if options.masking == "langsplat":
             lengths = list(lifted.feature_lengths([camera for camera, _ in views], _scale(lifted, options)))

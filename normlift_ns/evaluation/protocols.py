@@ -203,8 +203,8 @@ class EvaluatedRun:
 
     def cameras(self) -> dict[str, Camera]:
         """Return the cameras of all training and held-out images by image name."""
-        splits = (self.scene.train, self.scene.held_out)
-        return {name: camera for views in splits for name, camera in zip(views.names, views.cameras)}
+        train, held_out = self.scene.train, self.scene.held_out
+        return dict(zip((*train.names, *held_out.names), (*train.cameras, *held_out.cameras)))
 
 
 Rasterize = Callable[..., Evidence]

@@ -175,7 +175,7 @@ def render_outputs(
         named_by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise
             they are scalars named relevancy_0, relevancy_1, …
     """
-    count, colors = display.num_prompts, colormap_rgb(display.colormap).to(rgb)
+    count = display.num_prompts
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
     _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
     opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
@@ -185,15 +185,12 @@ def render_outputs(
         segmented = segmentation(rgb, pixel[:, :, :count].argmax(dim=2), selected_by_any, display.palette)
         segmented = add_prompt_legend(segmented, display.texts, display.palette)
     if count > 0 and not display.by_hand:
-        overlaid = overlay(rgb, pixel[:, :, count], selected, colors, display.scale)
+        overlaid = overlay(display, rgb, pixel[:, :, count], selected)
         overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
     if named_by_text:
-        outputs = {
-            name: add_color_bar(
-                relevancy_map(display, rgb, pixel[:, :, i], alpha), display.colormap, display.map_scale, text
-            )
-            for i, (name, text) in enumerate(zip(output_names(display.texts), display.texts))
-        }
+        texts, scale = display.texts, (display.colormap, display.map_scale)
+        maps = (relevancy_map(display, rgb, pixel[:, :, i], alpha) for i in range(count))
+        outputs = {name: add_color_bar(x, *scale, text) for name, text, x in zip(output_names(texts), texts, maps)}
     return {
         **outputs,
         "reliability": reliability_map(rgb, reliability, alpha),
@@ -206,19 +203,14 @@ def render_outputs(
 
 
 def overlay(
-    rgb: Float[Tensor, "h w 3"],
-    relevancy: Float[Tensor, "h w"],
-    share: Float[Tensor, "h w 1"],
-    colors: Float[Tensor, "256 3"],
-    scale: tuple[float, float],
+    display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], share: Float[Tensor, "h w 1"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, with the selection colored by relevancy and more opaque for higher relevancies.
 
     Args:
         share: selected fraction of each pixel, 0..1.
-        scale: relevancies of the first and the last color.
     """
-    color, opacity = apply_colormap(relevancy, scale, colors)
+    color, opacity = apply_colormap(relevancy, display.scale, colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
 
 
@@ -347,9 +339,8 @@ def view_figure(
     if image is not None:
         panels.insert(0, Image.fromarray(image.cpu().numpy()).resize(panel.size))
         captions.insert(0, "training image")
-    summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {header.summary}"
-    if not bool(selected.any()):
-        summary = header.summary
+    share = float(selected.float().mean())
+    summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
     return _page(sheet, [f"{header.title}   ·   {clip_text(view, 40)}", summary], panels, captions, 2)
 
 
@@ -599,15 +590,11 @@ def unique_file_names(images: Sequence[str]) -> list[str]:
         counts = Counter(map(str.casefold, names))
         duplicate = [counts[name.casefold()] > 1 for name in names]
         names = [longer(image).replace("/", "_") if x else name for image, name, x in zip(images, names, duplicate)]
-    taken: set[str] = set()
-    return [_unique_name(name, taken) for name in names]
-
-
-def _unique_name(name: str, taken: set[str]) -> str:
-    """Return the first of the `numbered_paths` names that is not taken, and add it to the taken ones."""
-    unique = next(path.name for path in numbered_paths(Path(name)) if path.name.casefold() not in taken)
-    taken.add(unique.casefold())
-    return unique
+    taken: dict[str, str] = {}
+    for name in names:
+        unique = next(path.name for path in numbered_paths(Path(name)) if path.name.casefold() not in taken)
+        taken[unique.casefold()] = unique
+    return list(taken.values())
 
 
 def _without_suffix(image: str) -> str:

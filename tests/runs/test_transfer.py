@@ -87,10 +87,11 @@ def test_what_is_no_cloud_is_refused(tmp_path):
 @pytest.mark.parametrize("count", [1, 3])
 def test_gaussians_at_one_position_label_no_cloud(count, tmp_path):
     cloud(tmp_path / "a.ply")
+    transfer = CloudTransfer(read_cloud(tmp_path / "a.ply"), 2.0, None)
     means, columns = np.ones((count, 3)), {"class_id": np.ones(count, np.uint32)}
     with pytest.raises(InputError, match="one position"):
-        label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0)
+        label_cloud(transfer, tmp_path / "b.ply", means, columns)
     assert not (tmp_path / "b.ply").exists()
     means = np.concatenate([means, [[1, 1, 2.0]]])
     columns = {"class_id": np.ones(count + 1, np.uint32)}
-    assert label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0).limit == 2.0
+    assert label_cloud(transfer, tmp_path / "b.ply", means, columns).limit == 2.0
