@@ -188,9 +188,9 @@ def render_outputs(
         overlaid = overlay(display, rgb, pixel[:, :, count], selected)
         overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
     if named_by_text:
-        texts, scale = display.texts, (display.colormap, display.map_scale)
         maps = (relevancy_map(display, rgb, pixel[:, :, i], alpha) for i in range(count))
-        outputs = {name: add_color_bar(x, *scale, text) for name, text, x in zip(output_names(texts), texts, maps)}
+        named = zip(output_names(display.texts), display.texts, maps)
+        outputs = {name: add_color_bar(x, display.colormap, display.map_scale, text) for name, text, x in named}
     return {
         **outputs,
         "reliability": reliability_map(rgb, reliability, alpha),

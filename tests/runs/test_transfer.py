@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
-from normlift_ns.exports import label_cloud, nearest_gaussians, read_cloud, vertex_positions, write_cloud
+from normlift_ns.exports import CloudTransfer, label_cloud, nearest_gaussians, read_cloud, vertex_positions, write_cloud
 from tests.examples import examples
 
 
