@@ -437,15 +437,12 @@ def _region_mask(labels: Tensor, regions: Tensor, region: int) -> Bool[Tensor, "
 
 def _without_networks(source: FeatureSource, cache: Path) -> FeatureSource:
     """Return the source with networks that raise an error instead of computing what the cache does not hold."""
-    if isinstance(source, RegionFeatures):
-        regions: Any = _CacheOnly(source.regions, cache) if isinstance(source.regions, SamMasks) else source.regions
-        is_color = isinstance(source.encoder, ColorEncoder)
-        encoder: Any = source.encoder if is_color else _CacheOnly(source.encoder, cache)
-        return replace(source, regions=regions, encoder=encoder)
-    if isinstance(source, PatchFeatures):
-        encoder = _CacheOnly(source.encoder, cache)
-        return replace(source, encoder=encoder)
-    return source
+    if not isinstance(source, RegionFeatures | PatchFeatures):
+        return source
+    changed = {} if isinstance(source.encoder, ColorEncoder) else {"encoder": _CacheOnly(source.encoder, cache)}
+    if isinstance(source, RegionFeatures) and isinstance(source.regions, SamMasks):
+        changed["regions"] = _CacheOnly(source.regions, cache)
+    return replace(source, **changed)
 
 
 class _CacheOnly:

@@ -210,9 +210,8 @@ def top_evidence(
             count = min(_RAYS, len(flat) - first)
             chosen = (pixels >= first) & (pixels < first + count) & (pixel_columns.flatten().cpu() >= 0)
             labels = torch.where(chosen, pixels - first, MASKED).view(pixel_columns.shape)
-            gaussian, pixel, weight = _heaviest_of_rays(
-                rasterize([camera], [labels], num_regions=[count]).rows, count, top
-            )
+            rays = rasterize([camera], [labels], num_regions=[count]).rows
+            gaussian, pixel, weight = _heaviest_of_rays(rays, count, top)
             rows = SparseRows.from_coo(gaussian, flat[first + pixel], weight, size)
             parts.append((rows.row_index(), rows.column.long(), rows.weight))
     row, column, weight = (torch.cat(part) for part in zip(*parts))

@@ -518,9 +518,8 @@ def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64
     angle = torch.arange(_RING_POSITIONS, dtype=torch.float64) * (2 * math.pi / _RING_POSITIONS)
     circle = angle.cos()[:, None] * first + angle.sin()[:, None] * second
     rings = [target + height.median() * space.up + factor * radius * circle for factor in (1.0, 0.5)]
-    positions = torch.cat(
-        [space.camera_positions[sample_evenly(len(space.camera_positions), _CAMERA_POSITIONS)], *rings]
-    )
+    near = space.camera_positions[sample_evenly(len(space.camera_positions), _CAMERA_POSITIONS)]
+    positions = torch.cat([near, *rings])
     far = (positions - target).norm(dim=1) > _MIN_DEPTH * space.depth
     return positions[space.is_free(positions) & far]
 
@@ -564,9 +563,8 @@ def suggest_poses(
     for target in targets[:_TARGET_REGIONS]:
         center = torch.tensor(target, dtype=torch.float64)
         positions = positions_around(space, center)
-        candidates += [
-            look_at(positions[i], center, space.up, cameras[0]) for i in sample_evenly(len(positions), _MAX_CANDIDATES)
-        ]
+        eyes = positions[sample_evenly(len(positions), _MAX_CANDIDATES)]
+        candidates += [look_at(eye, center, space.up, cameras[0]) for eye in eyes]
     if len(candidates) == 0:
         return []
     weights = view_weights(drawn, candidates)

@@ -527,9 +527,8 @@ def plain_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path]) -> list[
 
 def _by_refinement(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
     """Return the run with unrefined directions and, if it was lifted with a vote, with refined ones."""
-    kinds = {"unrefined": False, "refined": True}
-    if not lifted.field.manifest.get("options", {}).get("refine", True):
-        del kinds["refined"]
+    voted = lifted.field.manifest.get("options", {}).get("refine", True)
+    kinds = {"unrefined": False, **({"refined": True} if voted else {})}
     return {kind: replace(lifted, refined=refined) for kind, refined in kinds.items()}
 
 
@@ -540,8 +539,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
     rows: list[Row] = []
-    for refined in (True, False):
-        name, what = ("normlift", "the run, refined") if refined else ("unrefined", "the run, unrefined")
+    for name, what, refined in (("normlift", "the run, refined", True), ("unrefined", "the run, unrefined", False)):
         results = evaluate(replace(lifted, refined=refined) for lifted in runs).results
         rows.append({"method": name, "what": what, **results})
     for method, what in BASELINES.items():

@@ -218,9 +218,8 @@ def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
-    color, opacity = apply_colormap(
-        relevancy, display.map_scale, colormap_rgb(display.colormap).to(rgb), min_opacity=0.0
-    )
+    colors = colormap_rgb(display.colormap).to(rgb)
+    color, opacity = apply_colormap(relevancy, display.map_scale, colors, min_opacity=0.0)
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
 
 
