@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
-from normlift_ns.analysis.catalogue import SimilarityTransform
-from normlift_ns.analysis.objects import Instances, find_instances
+from normlift_ns.analysis.objects import Instances, SimilarityTransform, find_instances
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
@@ -38,30 +37,6 @@ MIN_OPACITY_LOGIT = -5.5373
 """Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
 _MAX_COMMENT_LENGTH = 60
-
-
-def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> dict[str, np.ndarray]:
-    """Return the vertex properties of `ns-export gaussian-splat`, in its order.
-
-    Opacities are logits and scales are logarithms, as splatfacto stores them.
-
-    Args:
-        parameters: gauss_params of splatfacto by name.
-        spherical_harmonics: False if colors do not depend on the view (sh_degree 0) and are stored as logits.
-    """
-    values = {name: value.detach().float().cpu() for name, value in parameters.items()}
-    means, rest = values["means"], values["features_rest"]
-    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
-    columns = {name: means[:, i] for i, name in enumerate("xyz")}
-    columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
-    columns |= {f"f_dc_{i}": constant[:, i] for i in range(3)}
-    if spherical_harmonics:
-        by_channel = rest.transpose(1, 2).reshape(len(rest), -1)  # all red coefficients, then green, then blue
-        columns |= {f"f_rest_{i}": by_channel[:, i] for i in range(by_channel.shape[1])}
-    columns["opacity"] = values["opacities"][:, 0]
-    columns |= {f"scale_{i}": values["scales"][:, i] for i in range(3)}
-    columns |= {f"rot_{i}": values["quats"][:, i] for i in range(4)}
-    return {name: value.numpy() for name, value in columns.items()}
 
 
 def semantic_columns(field: SemanticField, answer: Answer | None, instances: Instances | None) -> dict[str, np.ndarray]:
@@ -107,8 +82,23 @@ class TrainedSplat(NamedTuple):
         return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return `splat_columns`."""
-        return splat_columns(self.parameters, spherical_harmonics=self.spherical_harmonics)
+        """Return the vertex properties of `ns-export gaussian-splat`, in its order.
+
+        Opacities are logits and scales are logarithms, as splatfacto stores them.
+        """
+        values = {name: value.detach().float().cpu() for name, value in self.parameters.items()}
+        means, colors, rest = values["means"], values["features_dc"], values["features_rest"]
+        colors = colors if self.spherical_harmonics else (torch.sigmoid(colors) - 0.5) / SH_C0
+        columns = {name: means[:, i] for i, name in enumerate("xyz")}
+        columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
+        columns |= {f"f_dc_{i}": colors[:, i] for i in range(3)}
+        if self.spherical_harmonics:
+            by_channel = rest.transpose(1, 2).reshape(len(rest), -1)  # all red coefficients, then green, then blue
+            columns |= {f"f_rest_{i}": by_channel[:, i] for i in range(by_channel.shape[1])}
+        columns["opacity"] = values["opacities"][:, 0]
+        columns |= {f"scale_{i}": values["scales"][:, i] for i in range(3)}
+        columns |= {f"rot_{i}": values["quats"][:, i] for i in range(4)}
+        return {name: value.numpy() for name, value in columns.items()}
 
 
 def write_splat_ply(
@@ -141,13 +131,16 @@ def write_splat_ply(
         OSError: a file cannot be written, for instance because the disk is full.
     """
     columns = splat.columns()
-    rows = _written_rows(path, columns, keep)
+    rows = exportable_rows(columns, keep)
+    if len(rows) == 0:
+        count, why = int(keep.sum()), "opacity below 1/255, or parameters that are not finite"
+        reason = f"all {count:,} selected Gaussians are invisible ({why})"
+        raise InputError(f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}")
     if answer is not None and instances is None:
         instances = answer_instances(answer)
     columns |= semantic_columns(field, answer, instances)
-    vertices = np.empty(len(rows), [(name, "<u4" if name in INSTANCE_PROPERTIES else "<f4") for name in columns])
-    for name, column in columns.items():
-        vertices[name] = column[rows]
+    types = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    vertices = np.rec.fromarrays([column[rows] for column in columns.values()], dtype=types)
     comments = _comments(splat.rasterize_mode, () if answer is None else answer.texts)
     ply, indices, names_file, objects_file = export_paths(path)
     contents = {names_file: None if instances is None else instances.to_json(), objects_file: objects}
@@ -159,19 +152,6 @@ def write_splat_ply(
         np.save(drafts[1], rows)
         for draft, text in zip(drafts[2:], documents.values()):
             draft.write_text(text, "utf8")
-    return rows
-
-
-def _written_rows(path: Path, columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:
-    """Return `exportable_rows`; raise ValueError if there are none."""
-    rows = exportable_rows(columns, keep)
-    if len(rows) == 0 and not bool(keep.any()):
-        raise InputError(f"{path} is not written: no Gaussian is selected")
-    if len(rows) == 0:
-        raise InputError(
-            f"{path} is not written: all {int(keep.sum()):,} selected Gaussians are invisible (opacity below 1/255, or "
-            "parameters that are not finite)"
-        )
     return rows
 
 
@@ -244,14 +224,6 @@ def write_label_arrays(
 # Transfer of labels from Gaussians to the points of a point cloud or mesh.
 
 
-class NearestGaussians(NamedTuple):
-    """The nearest Gaussian of every point."""
-
-    row: Int64[np.ndarray, " p"]
-    within_limit: Bool[np.ndarray, " p"]
-    """Whether that Gaussian is within the maximum distance."""
-
-
 class CloudTransfer(NamedTuple):
     """A point cloud to label, and the rule for it."""
 
@@ -274,22 +246,23 @@ class LabelTransfer(NamedTuple):
 
 def nearest_gaussians(
     points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], max_distance: float
-) -> NearestGaussians:
-    """Find the Gaussian whose center is nearest to each point, with a k-d tree.
+) -> tuple[Int64[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
+    """Find the Gaussian whose center is nearest to each point, with a k-d tree, and whether it is within the maximum
+    distance.
 
     Args:
         means: centers of at least one Gaussian.
         max_distance: maximum distance, inclusive.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
-    NearestGaussians(row=array([1, 0]), within_limit=array([ True, False]))
+    (array([1, 0]), array([ True, False]))
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 (nothing else here needs it)
 
     finite = np.asarray(np.isfinite(points).all(axis=1))
     distance, row = (np.asarray(x) for x in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
     has_row = np.isfinite(distance)  # the tree returns no row if the squared distance overflows
-    return NearestGaussians(np.where(has_row, row, 0), finite & (distance <= max_distance))
+    return np.where(has_row, row, 0), finite & (distance <= max_distance)
 
 
 def read_cloud(path: Path) -> PlyData:
@@ -331,38 +304,32 @@ def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
 
 
 def label_cloud(
-    cloud: PlyData,
-    path: Path,
-    means: Float64[np.ndarray, "m 3"],
-    columns: dict[str, np.ndarray],
-    max_distance: float,
-    *,
-    overwrite: bool = False,
+    transfer: CloudTransfer, path: Path, means: np.ndarray, columns: dict[str, np.ndarray], *, overwrite: bool = False
 ) -> LabelTransfer:
     """Write a cloud with the labels of the nearest Gaussians, and with zeros for points that are too far from any.
 
     Args:
         path: path of the new PLY file.
-        means: centers of the Gaussians to take labels from, in the coordinates of the cloud.
+        means: centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
         columns: labels of these Gaussians, by property name.
-        max_distance: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
         ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
         raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
+    means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     spacing = spacing[spacing.isfinite()]
     if len(spacing) == 0:
         raise InputError(
             "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
         )
-    limit = max_distance * float(spacing.median())
-    nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
-    labels = {name: np.where(nearest.within_limit, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
-    write_cloud(path, cloud, labels, overwrite=overwrite)
-    return LabelTransfer(len(nearest.within_limit), float(nearest.within_limit.mean()), limit)
+    limit = transfer.max_distance * float(spacing.median())
+    row, within = nearest_gaussians(vertex_positions(transfer.cloud), means, limit)
+    labels = {name: np.where(within, x[row], 0).astype(x.dtype) for name, x in columns.items()}
+    write_cloud(path, transfer.cloud, labels, overwrite=overwrite)
+    return LabelTransfer(len(within), float(within.mean()), limit)
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
@@ -375,12 +342,10 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
     """
     check_no_properties(cloud, columns)
     vertex = cloud["vertex"].data
-    existing = [(name, vertex.dtype[name].newbyteorder("<")) for name in vertex.dtype.names or ()]
-    table = np.empty(len(vertex), [*existing, *((name, column.dtype) for name, column in columns.items())])
-    for name, _ in existing:
-        table[name] = vertex[name]
-    for name, column in columns.items():
-        table[name] = column
+    names = vertex.dtype.names or ()
+    types = [(name, vertex.dtype[name].newbyteorder("<")) for name in names]
+    types += [(name, column.dtype) for name, column in columns.items()]
+    table = np.rec.fromarrays([*(vertex[name] for name in names), *columns.values()], dtype=types)
     elements = [PlyElement.describe(table, "vertex") if e.name == "vertex" else e for e in cloud.elements]
     labeled = PlyData(elements, byte_order="<", comments=cloud.comments, obj_info=cloud.obj_info)
     with atomic_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
@@ -436,23 +401,14 @@ def transfer_labels(
     columns = TrainedSplat.of(scene).columns()
     rows = exportable_rows(columns, torch.ones(len(field), dtype=torch.bool))
     means = scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
-    means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     labels = semantic_columns(field, answer, instances)
     labels = {name: x[rows] for name, x in labels.items() if name not in ("reliability", "n_eff")}
-    return label_cloud(transfer.cloud, path, means, labels, transfer.max_distance, overwrite=overwrite)
+    return label_cloud(transfer, path, means, labels, overwrite=overwrite)
 
 
 def _export_ply(job: ExportJob, path: Path) -> list[str]:
-    rows = write_splat_ply(
-        path,
-        TrainedSplat.of(job.scene),
-        job.field,
-        job.answer,
-        keep=job.keep,
-        instances=job.instances,
-        objects=job.objects,
-        overwrite=job.overwrite,
-    )
+    kwargs = {name: getattr(job, name) for name in ("keep", "instances", "objects", "overwrite")}
+    rows = write_splat_ply(path, TrainedSplat.of(job.scene), job.field, job.answer, **kwargs)
     return [f"{len(rows):,} of {len(job.field):,} Gaussians in {path}"]
 
 
@@ -480,9 +436,8 @@ def _export_cloud(job: ExportJob, path: Path) -> list[str]:
     if job.transfer is None:
         raise InputError("there is no point cloud to label; give one with --transfer")
     assert job.answer is not None and job.instances is not None
-    labeled = transfer_labels(
-        job.scene, job.field, job.answer, job.instances, job.transfer, path, overwrite=job.overwrite
-    )
+    cloud = (job.transfer, path)
+    labeled = transfer_labels(job.scene, job.field, job.answer, job.instances, *cloud, overwrite=job.overwrite)
     within = f"{labeled.share:.1%} of them within {labeled.limit:.3g} of a Gaussian"
     return [f"{labeled.points:,} points in {path}, {within}"]
 
@@ -493,12 +448,7 @@ ARRAYS = Exporter(_export_arrays)
 CLOUD = Exporter(_export_cloud, ".ply")
 EXPORTERS = Registry(
     "normlift_ns.exporters",
-    {
-        "ply": "normlift_ns.exports:PLY",
-        "masks": "normlift_ns.exports:MASKS",
-        "arrays": "normlift_ns.exports:ARRAYS",
-        "cloud": "normlift_ns.exports:CLOUD",
-    },
+    {name: f"normlift_ns.exports:{name.upper()}" for name in ("ply", "masks", "arrays", "cloud")},
     Exporter,
     "exporter",
     "--exporters",

@@ -15,10 +15,16 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from normlift_ns.analysis.catalogue import Catalogue, SimilarityTransform, make_catalogue
-from normlift_ns.analysis.explain import Why
-from normlift_ns.analysis.objects import Floaters, Instances, find_floaters, find_instances
-from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.analysis.explain import RecordedVotes, Why
+from normlift_ns.analysis.objects import (
+    Catalogue,
+    Floaters,
+    Instances,
+    SimilarityTransform,
+    find_floaters,
+    find_instances,
+    make_catalogue,
+)
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import normlift_ns as nl
-from normlift_ns.analysis.catalogue import CatalogueObject
+from normlift_ns.analysis.objects import CatalogueObject
 from normlift_ns.core.scene import Scene
 
 EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]

@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from normlift_ns.evaluation.studies import default_value, plot_signals, plot_sweeps
+from normlift_ns.evaluation.studies import default_value, save_figure, signals_figure, sweeps_figure
 from research.documents import PRESETS, TITLES, Document, Documents, steps
 from research.signals import STEP
 
@@ -28,11 +28,12 @@ def plots(found: Documents, folder: Path) -> Iterator[Path]:
         {"parameter": name, "value": float(at), "miou": value, "default": float(at) == default_value(name, "paper")}
         for (name, at), value in curves
     ]
-    plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg", overwrite=True)
+    figure = sweeps_figure(rows, "miou", "mIoU on held-out damage, points")
+    save_figure(figure, folder / "sensitivity.svg", overwrite=True)
     yield folder / "sensitivity.svg"
     start = f"tabletop.{STEP}."
     one = {k.removeprefix(start): value for k, value in signals.values.items() if k.startswith(start)}
-    plot_signals([one], folder / "reliability.svg", overwrite=True)
+    save_figure(signals_figure([one]), folder / "reliability.svg", overwrite=True)
     yield folder / "reliability.svg"
 
 

@@ -66,7 +66,7 @@ FOREIGN = {
     "viewer": TENSORS | {"numpy", "PIL", "msgspec", "viser", "matplotlib"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
     "method_configs": {"nerfstudio"},
-    "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
+    "evaluation": BASE | {"cv2", "msgspec", "matplotlib", "plyfile"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
     "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
 }

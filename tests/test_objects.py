@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from normlift_ns import InputError
 from normlift_ns.analysis.objects import (
     OrientedBox,
+    SimilarityTransform,
     connected_components,
     find_instances,
     find_objects,
@@ -121,7 +122,7 @@ def test_points_lines_and_planes_have_boxes():
 
 def test_boxes_move_with_their_points():
     points, rotation = cuboid(5), turned(5)
-    moved = oriented_box(points).transformed(rotation, 3.0, np.array([1.0, 2, 3]))
+    moved = oriented_box(points).transformed(SimilarityTransform(rotation, 3.0, np.array([1.0, 2, 3])))
     again = oriented_box(3 * points @ rotation.T + [1, 2, 3])
     assert box_iou(moved, again) > 0.95
     inside = half_spaces(moved) @ np.append(moved.center, 1)

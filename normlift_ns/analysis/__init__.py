@@ -1,1 +1,1 @@
-"""Analysis of a lifted run: objects, catalogs, explanations and vote records."""
+"""Analysis of a lifted run: objects and their catalogue, and explanations of selections."""

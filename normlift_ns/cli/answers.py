@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from rich.table import Table
 
-from normlift_ns.analysis.catalogue import Catalogue
 from normlift_ns.analysis.explain import ViewVote, Why
+from normlift_ns.analysis.objects import Catalogue
 from normlift_ns.api import open_run
 from normlift_ns.cli.common import CONSOLE, info, plain_text
 from normlift_ns.core.device import choose_device

@@ -71,96 +71,76 @@ class NormLiftEval:
         """Evaluate the runs, write the output file and print the tables."""
         self._check()
         info_opening(*self.load_config)
-        from normlift_ns.api import open_run  # noqa: PLC0415
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation import studies  # noqa: PLC0415
         from normlift_ns.evaluation.coverage import coverage_of, write_poses  # noqa: PLC0415
         from normlift_ns.evaluation.options import write_evaluation  # noqa: PLC0415
-        from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
-        from normlift_ns.evaluation.studies import (  # noqa: PLC0415
-            study_ablation,
-            study_baselines,
-            study_timing,
-            study_votes,
-            sweeps,
-        )
-        from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
+        # Scenes are large: only studies hold more than one in memory.
+        runs: Iterable[EvaluatedRun] = self._load(device, names)
+        loaded = list(runs) if self.study or self.protocol == "masks" else []
+        runs = loaded or runs
+        evaluate, measure_signals = self._protocol(runs)
+        evaluation = evaluate(runs)
+        covered = coverage_of(loaded[0].scene, loaded[0].field, device=device) if "coverage" in self.study else None
+        measure: dict[str, Callable[[], list[Row]]] = {
+            "signals": lambda: measure_signals(loaded),
+            "timing": lambda: studies.study_timing(loaded, device, info),
+            "baselines": lambda: studies.study_baselines(loaded, evaluate, device),
+            "coverage": lambda: [] if covered is None else [covered.to_json()],
+            "ablation": lambda: studies.study_ablation(loaded, evaluate, device, info),
+            "sweeps": lambda: studies.study_votes(loaded, evaluate, studies.sweeps, device),
+        }
+        found = {name: measure[name]() for name in self.study}
+        write_evaluation(self.output_path, evaluation, names, studies=found, overwrite=self.overwrite)
+        written = [self.output_path, *self._plots(found, evaluation.results)]
+        if covered is not None:
+            written += write_poses(self._beside("coverage"), covered.poses, covered.pictures, overwrite=self.overwrite)
+        _print_tables(evaluation, found)
+        info(f"Written: {', '.join(map(str, written))}")
+        return evaluation
 
-        def load(config: Path) -> EvaluatedRun:
+    def _load(self, device: str, names: list[tuple[str, str]]) -> Iterator[EvaluatedRun]:
+        """Yield the runs, and add the name and the checkpoint of each to a list."""
+        from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
+        from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
+
+        for config in self.load_config:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
             texts = cast(Any, None) if self.protocol == "none" else run.texts  # no encoder is needed without prompts
-            return EvaluatedRun(run.scene, run.field, texts, self.refined, cache_folder(run.folder))
-
-        # Scenes are large: only studies hold more than one in memory.
-        runs: Iterable[EvaluatedRun] = (load(config) for config in self.load_config)
-        if self.study or self.protocol == "masks":
-            runs = list(runs)
-        evaluate, measure_signals = self._protocol(runs)
-        evaluation, studies, poses = evaluate(runs), {}, ((), ())
-        for name in self.study:
-            loaded = list(runs)
-            if name == "signals":
-                studies[name] = measure_signals(loaded)
-            elif name == "timing":
-                studies[name] = study_timing(loaded, device, info)
-            elif name == "baselines":
-                studies[name] = study_baselines(loaded, evaluate, device)
-            elif name == "coverage":
-                coverage = coverage_of(loaded[0].scene, loaded[0].field, device=device)
-                studies[name] = [coverage.to_json()]
-                poses = coverage.poses, coverage.pictures
-            elif name == "ablation":
-                studies[name] = study_ablation(loaded, evaluate, device, info)
-            else:
-                studies[name] = study_votes(loaded, evaluate, sweeps, device)
-        experiments, checkpoints = (", ".join(values) for values in zip(*names))
-        write_evaluation(
-            self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
-            studies=studies, overwrite=self.overwrite,
-        )  # fmt: skip
-        written = [self.output_path, *self._plots(studies, evaluation.results)]
-        written += write_poses(self._coverage_stem, *poses, overwrite=self.overwrite)
-        if len(evaluation.results) > 0:
-            CONSOLE.print(rows_table(evaluation.rows))
-            if len(evaluation.scenes) > 1:
-                CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
-            CONSOLE.print(_results_table(evaluation))
-        for name, rows in studies.items():
-            if name == "coverage":
-                for part in ("regions", "photographs", "poses"):
-                    CONSOLE.print(rows_table([_short(i, row) for i, row in enumerate(rows[0][part], 1)], part))
-                for remark in rows[0]["remarks"]:
-                    info(remark)
-            else:
-                CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
-        info(f"Written: {', '.join(map(str, written))}")
-        return evaluation
+            yield EvaluatedRun(run.scene, run.field, texts, self.refined, cache_folder(run.folder))
 
     def _check(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
+        runs = len(self.load_config)
         if self.protocol == "none":
             self._check_without_truth()
-        elif len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
+        elif runs == 0 or runs != len(self.labels):
             raise InputError(
-                f"got {len(self.load_config)} runs and {len(self.labels)} --labels; give one --labels path for each "
-                "run, in the same order"
+                f"got {runs} runs and {len(self.labels)} --labels; give one --labels path for each run, in the same "
+                "order"
             )
-        if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
+        if runs > 1 and (self.protocol == "masks" or self.data is not None):
             raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
-        if len(self.load_config) > 1 and "coverage" in self.study:
+        if runs > 1 and "coverage" in self.study:
             raise InputError("--study coverage takes one run at a time; name a single --load-config")
+        self._check_files()
+
+    def _check_files(self) -> None:
+        """Raise errors unless input files exist, and output files can be written."""
         check_readable_file(self.text_vectors, "--text-vectors")
         for config in self.load_config:
             check_lifted_run(config, self.data)
         for labels in self.labels:
             (check_readable_file if self.protocol == "scannet" else check_readable_folder)(labels, "--labels")
         check_readable_file(self.masks.names, "--names")
-        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
-        figures += pose_output_paths(self._coverage_stem) if "coverage" in self.study else []
+        figures = [self._beside(f"{name}.svg") for name in _WITH_FIGURE if name in self.study]
+        figures += pose_output_paths(self._beside("coverage")) if "coverage" in self.study else []
         refuse_existing(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
         for path in (self.output_path, *figures):
             check_writable_file(path, "--output-path")
@@ -176,16 +156,16 @@ class NormLiftEval:
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
         """Return a function that scores runs, and one that measures the signals of R."""
-        from normlift_ns.evaluation import protocols, studies  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation import lerf, protocols, scannet, studies  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.options import Evaluation  # noqa: PLC0415
 
         if self.protocol == "none":
             return lambda runs: Evaluation({}, [], {"protocol": "none"}), lambda runs: []
         if self.protocol == "scannet":
             kwargs = {"labels": self.labels, "options": self.scannet}
-            return partial(protocols.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
+            return partial(scannet.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
         if self.protocol == "lerf":
-            evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
+            evaluate = partial(lerf.run_lerf, labels=self.labels, options=self.lerf)
             return evaluate, partial(studies.plain_signals, labels=self.labels)
         run = next(iter(runs))
         truth = protocols.mask_truth(run.scene, self.labels[0], self.masks, settings=run.settings)
@@ -196,44 +176,47 @@ class NormLiftEval:
 
     def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
         """Draw the figures next to the output file and yield their paths; sweeps show the first result."""
-        from normlift_ns.evaluation.studies import plot_signals, plot_sweeps  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import save_figure, signals_figure, sweeps_figure  # noqa: PLC0415
 
         metric, result = next(iter(results.items()), ("", 0.0))
-        for name in _WITH_FIGURE:
-            if name not in studies:
-                continue
-            path = self._figure(name)
-            if name == "sweeps":
-                plot_sweeps(studies[name], metric, metric, path, result=result, overwrite=self.overwrite)
-            else:
-                plot_signals(studies[name], path, overwrite=self.overwrite)
-            yield path
+        draw = {"sweeps": lambda rows: sweeps_figure(rows, metric, metric, result), "signals": signals_figure}
+        for name in (name for name in _WITH_FIGURE if name in studies):
+            save_figure(draw[name](studies[name]), self._beside(f"{name}.svg"), overwrite=self.overwrite)
+            yield self._beside(f"{name}.svg")
 
-    @property
-    def _coverage_stem(self) -> Path:
-        """Common beginning of the paths of the coverage study."""
-        return self.output_path.with_name(f"{self.output_path.stem}_coverage")
-
-    def _figure(self, study: str) -> Path:
-        return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
+    def _beside(self, end: str) -> Path:
+        """Return the path of the output file with another end."""
+        return self.output_path.with_name(f"{self.output_path.stem}_{end}")
 
 
-def _results_table(evaluation: Evaluation) -> Table:
-    """Return a table of the mean results."""
-    table = Table("metric", "value", title=f"Protocol {evaluation.settings['protocol']}")
-    for name, value in evaluation.results.items():
-        table.add_row(name, f"{value:.4f}")
+def _print_tables(evaluation: Evaluation, studies: Mapping[str, list[Row]]) -> None:
+    if len(evaluation.results) > 0:
+        CONSOLE.print(rows_table(evaluation.rows))
+        if len(evaluation.scenes) > 1:
+            CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
+        means = ((name, f"{value:.4f}") for name, value in evaluation.results.items())
+        CONSOLE.print(_table(("metric", "value"), means, f"Protocol {evaluation.settings['protocol']}"))
+    for name, rows in studies.items():
+        if name != "coverage":
+            CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
+            continue
+        for part in ("regions", "photographs", "poses"):
+            CONSOLE.print(rows_table([_short(i, row) for i, row in enumerate(rows[0][part], 1)], part))
+        for remark in rows[0]["remarks"]:
+            info(remark)
+
+
+def _table(columns: Iterable[object], rows: Iterable[Iterable[object]], title: str | None) -> Table:
+    table = Table(*(Column(plain_text(name), overflow="fold") for name in columns), title=title)
+    for row in rows:
+        table.add_row(*map(plain_text, row))
     return table
 
 
 def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
     """Return a table of rows, for example one per class, frame or vote variant."""
-    table = Table(
-        *(Column(plain_text(name), overflow="fold") for name in (rows[0] if len(rows) > 0 else ())), title=title
-    )
-    for row in rows:
-        table.add_row(*(f"{x:.3f}" if isinstance(x, float) else plain_text(x) for x in row.values()))
-    return table
+    lines = ([f"{x:.3f}" if isinstance(x, float) else x for x in row.values()] for row in rows)
+    return _table(rows[0] if len(rows) > 0 else (), lines, title)
 
 
 def _short(number: int, row: Row) -> Row:
@@ -247,13 +230,10 @@ def _short(number: int, row: Row) -> Row:
 
 
 def signals_table(rows: Sequence[Row]) -> Table:
-    """Return a table of signals with one column per scene."""
-    scenes = (Column(plain_text(row.get("scene", "value")), overflow="fold") for row in rows)
-    table = Table("signal", *scenes, title="signals")
-    for name in (key for key in rows[0] if key != "scene"):
-        digits = ".3g" if name.endswith("_p") else ".3f"  # p-values may be tiny
-        table.add_row(name, *(f"{row[name]:{digits}}" for row in rows))
-    return table
+    """Return a table of signals with one column per scene; p-values may be tiny."""
+    digits = {name: ".3g" if name.endswith("_p") else ".3f" for name in rows[0] if name != "scene"}
+    lines = ([name, *(f"{row[name]:{format_}}" for row in rows)] for name, format_ in digits.items())
+    return _table(("signal", *(row.get("scene", "value") for row in rows)), lines, "signals")
 
 
 def entrypoint() -> None:

@@ -181,7 +181,7 @@ class NormLiftQuery:
 
     def _list_objects(self, question: Query) -> Callable[[], None]:
         """Find objects, write their files, and return a function that prints them."""
-        from normlift_ns.analysis.catalogue import write_catalogue  # noqa: PLC0415 (as above)
+        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
         from normlift_ns.cli.answers import find_catalog, print_catalog, query_metadata  # noqa: PLC0415
 
         catalog = find_catalog(self.load_config, self.data, question, self.metres_per_unit)

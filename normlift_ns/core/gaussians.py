@@ -145,3 +145,16 @@ class Camera:
             )
         if self.width < 1 or self.height < 1:
             raise InputError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")
+
+    def downscaled(self, factor: float) -> Camera:
+        """Return the camera with its size multiplied by at most 1.
+
+        >>> K = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
+        >>> camera = Camera(K, torch.eye(4), width=160, height=120)
+        >>> small = camera.downscaled(0.25)
+        >>> small.width, small.height, small.K[0].tolist()
+        (40, 30, [25.0, 0.0, 20.0])
+        """
+        width, height = (max(1, round(min(1.0, factor) * side)) for side in (self.width, self.height))
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return Camera(self.K * scale, self.world_to_camera, width, height)

@@ -256,7 +256,7 @@ def check_ply_header(path: Path) -> None:
         if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
             raise InputError(
                 f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} with {properties} "
-                "properties. Expected a splat in PLY format; copy it again."
+                "properties. Expected a complete PLY file; copy it again."
             )
         declared += int(count) * properties  # a property takes at least one byte
     if declared > size:

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -26,7 +26,7 @@ from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.protocols import EvaluatedRun
+from normlift_ns.evaluation.protocols import EvaluatedRun, Rasterize, rasterizer
 from normlift_ns.evidence_collection import (
     ViewBatch,
     cells_to_regions,
@@ -38,7 +38,6 @@ from normlift_ns.evidence_collection import (
 from normlift_ns.options import LiftOptions
 from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
-from normlift_ns.rasterization.rasterize import rasterize_evidence
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
@@ -56,8 +55,6 @@ _RAYS = 2**17
 """Number of rays that are processed together."""
 _BLOCK = 2**12
 """Number of Gaussians whose medians are computed together."""
-Rasterize = Callable[..., Evidence]
-"""`rasterize_evidence` with the arguments that are the same in all calls."""
 
 
 def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> SemanticField:
@@ -66,18 +63,10 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     Raises:
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
-    gaussians = lifted.scene.gaussians.to(device)
-    rasterize = partial(
-        rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
-    )
-    parts, tables = [], []
-    for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(_CELL_EVIDENCE[name](rasterize, gaussians, block), block))
-        tables += block.features
-    evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+    evidence, features, _ = _evidence_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
     scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.map(Tensor.cpu)
-    own, manifest = torch.arange(len(gaussians), dtype=torch.int32), {"dimension": features.shape[1]}
+    own, manifest = torch.arange(evidence.num_gaussians, dtype=torch.int32), {"dimension": features.shape[1]}
     if name != "vala":
         return SemanticField(scalars, own, StoredEvidence(evidence.to("cpu"), features.cpu()), manifest)
     rows = torch.cat([medians.half().cpu() for _, medians in iter_medians(evidence, features)])
@@ -98,29 +87,34 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     options = manifest.get("options", {})
     if options.get("consensus", False) == enabled:
         return lifted
-    power = options.get("weight_power", 1)
-    gaussians = lifted.scene.gaussians.to(device)
-    rasterize = partial(
-        rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
-    )
-    parts, tables, levels = [], [], []
-    for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(_plain(rasterize, gaussians, block, power=power), block))
-        tables += block.features
-        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
-    evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+    cells = partial(_plain, power=options.get("weight_power", 1))
+    evidence, features, level = _evidence_again(lifted, device, cells)
     lift_kwargs = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
     result = lift(evidence, features, **lift_kwargs)
     if enabled:
         kwargs = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
         kwargs = {key: value for key, value in kwargs.items() if value is not None}
-        table = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
+        table = consensus(evidence, features, level=level, **kwargs).features
         after = lift(evidence, table, **lift_kwargs)
         result = replace(after, scalars=with_original_reliability(after.scalars, result.scalars))
-    own = torch.arange(len(gaussians), dtype=torch.int32)
+    own = torch.arange(evidence.num_gaussians, dtype=torch.int32)
     store = StoredEvidence(evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": enabled}}
     return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
+
+
+def _evidence_again(
+    lifted: EvaluatedRun, device: str, cells: Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]
+) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
+    """Return evidence, features and levels of the regions of the lift, from the evidence of the cells."""
+    gaussians = lifted.scene.gaussians.to(device)
+    rasterize = rasterizer(lifted.scene, lifted.settings, gaussians)
+    parts, tables, levels = [], [], []
+    for block in lifted_batches(lifted, device):
+        parts.append(cells_to_regions(cells(rasterize, gaussians, block), block))
+        tables += block.features
+        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
+    return Evidence.merge(*parts), torch.cat(tables).to(device), torch.cat(levels)
 
 
 def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None = None) -> Iterator[ViewBatch]:
@@ -152,20 +146,11 @@ def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch, *, 
     return rasterize(block.cameras, block.labels, num_regions=counts, weight_power=power)
 
 
-def _centers(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
-    cells = _plain(rasterize, gaussians, block)
-    return center_evidence(gaussians.means, block.cameras, _columns(block), cells)
-
-
-def _heaviest(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
-    return top_evidence(rasterize, block.cameras, _columns(block), _plain(rasterize, gaussians, block))
-
-
 _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]] = {
     "sfs": partial(_plain, power=2),
-    "occam": _centers,
+    "occam": lambda r, g, block: center_evidence(g.means, block.cameras, _columns(block), _plain(r, g, block)),
     "vala": _plain,
-    "drsplat": _heaviest,
+    "drsplat": lambda r, g, block: top_evidence(r, block.cameras, _columns(block), _plain(r, g, block)),
 }
 """Functions that compute the evidence of the cells in some views."""
 
@@ -225,9 +210,8 @@ def top_evidence(
             count = min(_RAYS, len(flat) - first)
             chosen = (pixels >= first) & (pixels < first + count) & (pixel_columns.flatten().cpu() >= 0)
             labels = torch.where(chosen, pixels - first, MASKED).view(pixel_columns.shape)
-            gaussian, pixel, weight = _heaviest_of_rays(
-                rasterize([camera], [labels], num_regions=[count]).rows, count, top
-            )
+            rays = rasterize([camera], [labels], num_regions=[count]).rows
+            gaussian, pixel, weight = _heaviest_of_rays(rays, count, top)
             rows = SparseRows.from_coo(gaussian, flat[first + pixel], weight, size)
             parts.append((rows.row_index(), rows.column.long(), rows.weight))
     row, column, weight = (torch.cat(part) for part in zip(*parts))
@@ -345,27 +329,33 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)
-    timed = {"dense": lambda: _dense(job, blocks), "ours": lambda: _sparse(lifted, job, blocks)}
-    seconds = {name: _median_seconds(run) for name, run in timed.items()}
+    rasterize = rasterizer(lifted.scene, lifted.settings, job.scene)
+
+    def dense() -> None:
+        for block in blocks:
+            maps = feature_maps(block, job.scene.means.device)
+            dense_sums(job, block.cameras, maps, block.features[0].shape[1])
+
+    def ours() -> None:
+        for block in blocks:
+            evidence = cells_to_regions(_plain(rasterize, job.scene, block), block)
+            lift(evidence, torch.cat(block.features).to(job.scene.means)).directions(dtype=torch.float16)
+
+    dense_seconds, our_seconds = _median_seconds(dense), _median_seconds(ours)
     views = sum(len(block.cameras) for block in blocks)
     all_views = lifted.field.manifest.get("statistics", {}).get("views", views)
     return {
         "timed_views": float(views),
-        "dense512_s": seconds["dense"],
-        "evidence_lift_s": seconds["ours"],
-        "dense512_over_evidence_lift": seconds["dense"] / seconds["ours"],
-        "dense512_all_views_s": seconds["dense"] * all_views / views,
+        "dense512_s": dense_seconds,
+        "evidence_lift_s": our_seconds,
+        "dense512_over_evidence_lift": dense_seconds / our_seconds,
+        "dense512_all_views_s": dense_seconds * all_views / views,
     }
 
 
 def _job(lifted: EvaluatedRun, device: str) -> RasterJob:
     antialiased = lifted.scene.rasterize_mode == "antialiased"
     return RasterJob(lifted.scene.gaussians.to(device), antialiased, lifted.settings, torch.float32)
-
-
-def _dense(job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
-    for block in blocks:
-        dense_sums(job, block.cameras, feature_maps(block, job.scene.means.device), block.features[0].shape[1])
 
 
 def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float[Tensor, "h w d"]]:
@@ -375,21 +365,6 @@ def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float
         cells = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)
         rows = torch.nn.functional.pad(cells, (0, 0, 1, 0))
         yield rows[labels.to(device).long().clamp(min=-1) + 1]
-
-
-def _sparse(lifted: EvaluatedRun, job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
-    for block in blocks:
-        cells = rasterize_evidence(
-            job.scene,
-            block.cameras,
-            block.labels,
-            num_regions=[regions.shape[1] for regions in block.regions],
-            rasterize_mode=lifted.scene.rasterize_mode,
-            settings=lifted.settings,
-        )
-        lift(cells_to_regions(cells, block), torch.cat(block.features).to(job.scene.means)).directions(
-            dtype=torch.float16
-        )
 
 
 def _median_seconds(run: Callable[[], Any]) -> float:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -26,12 +28,12 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import MAX_SUGGESTED_POSES, pose_output_paths
-from normlift_ns.evaluation.studies import recorded_vote, voting_scalars
+from normlift_ns.evaluation.studies import make_figure, recorded_vote, voting_scalars
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files, refuse_run_files
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import OBJECT_MAX_GAP, RasterizeMode, check_number, check_path
-from normlift_ns.rasterization.rasterize import rasterize_evidence, render, render_image
+from normlift_ns.options import RasterizeMode, check_number, check_path
+from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
 # Images of a scene: which were lifted, and why others were not.
@@ -79,9 +81,7 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
     """
     names = list(scene.train.names)
     try:
-        record = msgspec.convert(
-            {key: manifest[key] for key in _LiftRecord.__struct_fields__ if key in manifest}, _LiftRecord
-        )
+        record = msgspec.convert(dict(manifest), _LiftRecord)
     except msgspec.ValidationError as error:
         raise InputError(f"the run's record of its images is damaged ({error}); lift again") from None
     used, counts = record.views_lifted, record.statistics
@@ -108,26 +108,15 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
         ValueError: as `lifted_names`.
     """
     used, unusable = lifted_names(scene, manifest)
-    lifted: list[tuple[str, Camera]] = []
-    others: list[tuple[str, Camera, LeftOutReason]] = []
-    for name, camera in zip(scene.train.names, scene.train.cameras):
-        if name in used:
-            lifted.append((name, camera))
-        else:
-            why: LeftOutReason = "no features" if name in unusable else "max_views"
-            others.append((name, camera, why))
-    for name, camera in zip(scene.held_out.names, scene.held_out.cameras):
-        others.append((name, camera, "held out"))
-    reasons: list[LeftOutReason] = [why for *_, why in others]
-    lifted = [lifted[i] for i in sample_evenly(len(lifted), MAX_IMAGES)]
-    others = [others[i] for i in sample_evenly(len(others), MAX_IMAGES)]
-    return StudyImages(
-        len(lifted),
-        [name for name, *_ in (*lifted, *others)],
-        [camera for _, camera, *_ in (*lifted, *others)],
-        [why for *_, why in others],
-        {why: reasons.count(why) for why in dict.fromkeys(reasons)},
-    )
+    train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
+    lifted = [view for view in train if view[0] in used]
+    unused = [view for view in train if view[0] not in used]
+    reasons: list[LeftOutReason] = ["no features" if name in unusable else "max_views" for name, _ in unused]
+    reasons.extend("held out" for _ in held_out)
+    chosen, left = (sample_evenly(count, MAX_IMAGES) for count in (len(lifted), len(reasons)))
+    images = [*(lifted[i] for i in chosen), *([*unused, *held_out][i] for i in left)]
+    names, cameras = [name for name, _ in images], [camera for _, camera in images]
+    return StudyImages(len(chosen), names, cameras, [reasons[i] for i in left], dict(Counter(reasons)))
 
 
 # Regions without reliable evidence: spatially connected parts of what the images show.
@@ -194,19 +183,16 @@ def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
 
 
 def weak_regions(
-    evidence: GaussianEvidence, *, min_reliability: float, reach: float
+    evidence: GaussianEvidence, min_reliability: float
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
     """Return regions of visible Gaussians with R_j(S) below a bound, and their Gaussians, sorted by their lack of
     evidence.
 
     The lack of a region is sum_j s_j (min_reliability - R_j(S)).
-
-    Args:
-        reach: as in `connected_components`.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)
-    labels = connected_components(evidence.means, weak, reach=reach)
+    labels = connected_components(evidence.means, weak)
     chosen = (labels >= 0).nonzero().squeeze(1)
     number, lacking = labels[chosen].long(), surface * (min_reliability - evidence.reliability)
     share, lack = (torch.bincount(number, x[chosen]) for x in (surface / surface.sum(), lacking))
@@ -302,34 +288,20 @@ class ReliabilityModel:
         )
 
 
-def downscale_camera(camera: Camera, pixels: int = PIXELS) -> Camera:
-    """Return the camera with about `pixels` pixels, but never more than it has.
-
-    >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), torch.eye(4), width=160, height=120)
-    >>> small = downscale_camera(camera, 1200)
-    >>> small.width, small.height, small.K[0].tolist()
-    (40, 30, [25.0, 0.0, 20.0])
-    """
-    factor = min(1.0, (pixels / (camera.width * camera.height)) ** 0.5)
-    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
-    return Camera(camera.K * scale.to(camera.K.device), camera.world_to_camera, width, height)
+def _with_pixels(camera: Camera, pixels: int) -> Camera:
+    """Return the camera with about `pixels` pixels, but never more than it has."""
+    return camera.downscaled((pixels / (camera.width * camera.height)) ** 0.5)
 
 
 def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int = PIXELS) -> SparseRows:
     """Return W_jv, [N, views]: the weight of Gaussian j in view v, as a share of the image."""
-    small = [downscale_camera(camera, pixels) for camera in cameras]
+    small = [_with_pixels(camera, pixels) for camera in cameras]
     with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
         warnings.filterwarnings("ignore", message=".*are not drawn")
-        rows = rasterize_evidence(
-            drawn.gaussians,
-            small,
-            (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small),
-            num_regions=[1] * len(small),
-            rasterize_mode=drawn.rasterize_mode,
-            settings=drawn.settings,
-            weight_power=drawn.weight_power,
-        ).rows
+        labels = (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small)
+        mode, power = drawn.rasterize_mode, drawn.weight_power
+        options = RasterOptions(rasterize_mode=mode, weight_power=power, settings=drawn.settings)
+        rows = rasterize_evidence(drawn.gaussians, small, labels, num_regions=[1] * len(small), **options).rows
     area = torch.tensor([float(c.width * c.height) for c in small], dtype=torch.float64, device=rows.weight.device)
     return SparseRows(rows.offsets, rows.column, rows.weight.double() / area[rows.column.long()])
 
@@ -378,20 +350,24 @@ def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Ten
     return _ratio(rise, model.surface.sum())
 
 
-def choose_views(model: ReliabilityModel, views: SparseRows, count: int, max_views: int) -> list[tuple[int, float]]:
+def choose_views(
+    model: ReliabilityModel, views: SparseRows, count: int, max_views: int, accept: Callable[[int], bool] | None = None
+) -> list[tuple[int, float]]:
     """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
 
     Views without any gain are not returned.
 
     Args:
         views: W_jv of the candidates, [N, count].
+        accept: whether a view may be chosen; None: any view.
     """
     chosen: list[tuple[int, float]] = []
     for _ in range(min(max_views, count)):
-        gain = gains(model, views, count)
+        gain = gains(model, views, count).cpu()
         gain[[view for view, _ in chosen]] = 0.0
-        best = int(gain.argmax())
-        if not float(gain[best]) > 0:
+        order = gain.argsort(descending=True, stable=True)[: int((gain > 0).sum())].tolist()
+        best = next((view for view in order if accept is None or accept(view)), None)
+        if best is None:
             break
         chosen.append((best, float(gain[best])))
         model = model.with_view(views, best)
@@ -459,14 +435,9 @@ class Pose:
 
     def to_json(self) -> dict[str, Any]:
         """Return the pose as JSON types."""
-        return {
-            "position": self.camera_to_world()[:3, 3].tolist(),
-            "camera_to_world": self.camera_to_world().tolist(),
-            "field_of_view": self.field_of_view,
-            "gain": self.gain,
-            "regions": self.regions,
-            "shown": self.shown,
-        }
+        pose = self.camera_to_world()
+        numbers = {name: getattr(self, name) for name in ("field_of_view", "gain", "regions", "shown")}
+        return {"position": pose[:3, 3].tolist(), "camera_to_world": pose.tolist(), **numbers}
 
     def camera_to_world(self) -> Float64[Tensor, "4 4"]:
         """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
@@ -513,7 +484,7 @@ class FreeSpace:
 
 def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
     """Compute the depths of some of the images."""
-    chosen = [downscale_camera(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
+    chosen = [_with_pixels(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
     to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
     up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
     if not bool(up.norm() > 0):  # cameras with all kinds of roll
@@ -525,9 +496,14 @@ def mean_depth(drawn: RasterInputs, camera: Camera) -> Float64[Tensor, "h w"]:
     """Return the mean depth at each pixel of a camera; infinite if less than half of the pixel is covered."""
     pose = camera.world_to_camera.to(drawn.gaussians.means)
     z = (drawn.gaussians.means @ pose[2, :3] + pose[2, 3])[:, None]
-    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
-    values, alpha = render(drawn.gaussians, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), **kwargs)
-    return torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.inf).double().cpu()
+    return _mean_of_pixels(drawn, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), torch.inf).double().cpu()
+
+
+def _mean_of_pixels(
+    drawn: RasterInputs, camera: Camera, values: Float[Tensor, "n 1"], empty: float
+) -> Float[Tensor, "h w"]:
+    image, alpha = render(drawn.gaussians, camera, values, rasterize_mode=drawn.rasterize_mode, settings=drawn.settings)
+    return torch.where(alpha > 0.5, image[:, :, 0] / alpha, empty)
 
 
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
@@ -542,9 +518,8 @@ def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64
     angle = torch.arange(_RING_POSITIONS, dtype=torch.float64) * (2 * math.pi / _RING_POSITIONS)
     circle = angle.cos()[:, None] * first + angle.sin()[:, None] * second
     rings = [target + height.median() * space.up + factor * radius * circle for factor in (1.0, 0.5)]
-    positions = torch.cat(
-        [space.camera_positions[sample_evenly(len(space.camera_positions), _CAMERA_POSITIONS)], *rings]
-    )
+    near = space.camera_positions[sample_evenly(len(space.camera_positions), _CAMERA_POSITIONS)]
+    positions = torch.cat([near, *rings])
     far = (positions - target).norm(dim=1) > _MIN_DEPTH * space.depth
     return positions[space.is_free(positions) & far]
 
@@ -588,9 +563,8 @@ def suggest_poses(
     for target in targets[:_TARGET_REGIONS]:
         center = torch.tensor(target, dtype=torch.float64)
         positions = positions_around(space, center)
-        candidates += [
-            look_at(positions[i], center, space.up, cameras[0]) for i in sample_evenly(len(positions), _MAX_CANDIDATES)
-        ]
+        eyes = positions[sample_evenly(len(positions), _MAX_CANDIDATES)]
+        candidates += [look_at(eye, center, space.up, cameras[0]) for eye in eyes]
     if len(candidates) == 0:
         return []
     weights = view_weights(drawn, candidates)
@@ -599,27 +573,22 @@ def suggest_poses(
     inside[torch.cat(list(parts))] = 1
     share = float((inside * model.surface).sum() / model.surface.sum())
     lacking = replace(model, surface=inside * model.surface)
-    available = shown.amax(0) >= MIN_SHOWN_SHARE
-    poses: list[Pose] = []
-    while len(poses) < MAX_SUGGESTED_POSES and bool(available.any()):
-        gain = gains(lacking, weights, len(candidates)).cpu()
-        gain[~available] = 0.0
-        best = int(gain.argmax())
-        if not float(gain[best]) > 0:
-            break
-        available[best] = False
-        if _near_depth(drawn, candidates[best]) < _MIN_DEPTH * space.depth:
-            continue
-        numbers = [i for i, x in enumerate(shown[:, best].tolist(), 1) if x >= MIN_SHOWN_SHARE]
-        poses.append(Pose(candidates[best], share * float(gain[best]), numbers, float(shown[:, best].max())))
-        lacking = lacking.with_view(weights, best)
-    return poses
+
+    @cache
+    def accept(view: int) -> bool:
+        """Whether a view shows a region, and all but a few pixels are not too near."""
+        if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
+            return False
+        depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()
+        return float(depth.sort().values[int(_NEAR_SHARE * len(depth))]) >= _MIN_DEPTH * space.depth
+
+    chosen = choose_views(lacking, weights, len(candidates), MAX_SUGGESTED_POSES, accept)
+    return [Pose(candidates[v], share * gain, _regions_shown(shown, v), float(shown[:, v].max())) for v, gain in chosen]
 
 
-def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
-    """Return the depth that all but a few pixels exceed."""
-    depth = mean_depth(drawn, downscale_camera(camera, _DEPTH_PIXELS))
-    return float(depth.flatten().sort().values[int(_NEAR_SHARE * depth.numel())])
+def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
+    """Return the numbers of the regions that a view shows, from 1."""
+    return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
 
 
 # Output files of the coverage study: renders of the new poses, and a camera path for ns-render.
@@ -627,7 +596,7 @@ def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
 
 _MAX_RENDER_PIXELS = 300_000
 """Maximum number of pixels in a render."""
-_INCHES, _DPI = 6.0, 100
+_INCHES = 6.0
 
 
 class PoseRender(NamedTuple):
@@ -640,11 +609,10 @@ class PoseRender(NamedTuple):
 
 def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
     """Render the trained scene from a new pose, with the mean R at every pixel."""
-    camera = downscale_camera(pose.camera, _MAX_RENDER_PIXELS)
-    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
+    camera = _with_pixels(pose.camera, _MAX_RENDER_PIXELS)
     image = render_image(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
-    values, alpha = render(drawn.gaussians, camera, reliability[:, None].to(drawn.gaussians.means), **kwargs)
-    return PoseRender(image, torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.nan).cpu())
+    values = reliability[:, None].to(drawn.gaussians.means)
+    return PoseRender(image, _mean_of_pixels(drawn, camera, values, torch.nan).cpu())
 
 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
@@ -700,13 +668,8 @@ def write_poses(
 
 def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     """Save the scene next to its reliability, with a color scale."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (only drawing needs it)
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     height, width = picture.reliability.shape
-    figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = make_figure((2 * _INCHES, _INCHES * height / width + 0.6), 1, 2)
     left.imshow(picture.image.numpy())
     left.set_title(title, parse_math=False)
     right.set_facecolor("black")
@@ -717,8 +680,7 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     scale.set_label("R")
     right.set_title("reliability")
     for axes in (left, right):
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
     figure.savefig(path)
 
 
@@ -838,18 +800,24 @@ def coverage_of(
     if not float(surface.sum()) > 0:
         raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
     split = images.lifted
-    lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
+    columns = torch.arange(count, device=device).tensor_split([split])
+    lifted, unused = (weights.select_columns(part, count) for part in columns)
     model = model_of_lift(scalars, lifted, surface, beta=vote.beta)
     reliability = model.reliability(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
     evidenced = GaussianEvidence(gaussians.means, scalars, surface, reliability, count_views(lifted, surface), lost)
-    regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=OBJECT_MAX_GAP)
+    regions, parts = weak_regions(evidenced, min_reliability)
     targets = [region.centre for region in regions]
     poses = suggest_poses(drawn, images.cameras, model, targets, parts)
+    shown = visible_shares(unused, len(images.reasons), model.surface, parts)
+    photographs = [
+        SuggestedImage(images.names[split + view], images.reasons[view], gain, _regions_shown(shown, view))
+        for view, gain in choose_views(model, unused, len(images.reasons), _MAX_IMAGES)
+    ]
     return Coverage(
         reliability=float((surface * reliability).sum() / surface.sum()),
         regions=regions,
-        photographs=_suggest_images(images, model, unused, parts),
+        photographs=photographs,
         poses=poses,
         pictures=[render_pose(drawn, scene, reliability, pose) for pose in poses],
         left_out=images.left_out,
@@ -857,44 +825,17 @@ def coverage_of(
     )
 
 
-def _suggest_images(
-    images: StudyImages, model: ReliabilityModel, unused: SparseRows, parts: Sequence[Tensor]
-) -> list[SuggestedImage]:
-    names, count = images.names[images.lifted :], len(images.reasons)
-    shown = visible_shares(unused, count, model.surface, parts)
-    return [
-        SuggestedImage(
-            names[view],
-            images.reasons[view],
-            gain,
-            [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE],
-        )
-        for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
-    ]
-
-
-def _columns(weights: SparseRows, views: range, count: int) -> SparseRows:
-    return weights.select_columns(torch.tensor(list(views), dtype=torch.int64, device=weights.weight.device), count)
-
-
 def _remarks(
     images: StudyImages, regions: Sequence[WeakRegion], poses: Sequence[Pose], min_reliability: float
 ) -> list[str]:
-    remarks = []
-    if len(regions) == 0:
-        remarks.append(
-            f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except "
-            "for parts smaller than a thousandth of it."
-        )
-    elif len(poses) == 0:
-        remarks.append(
-            "No new pose shows a region better than the images do; it may be hidden from all possible positions."
-        )
-    if len(images.reasons) == 0:
-        remarks.append("No image was left out of the lift, so none can be suggested.")
-    total = sum(images.left_out.values())
-    if len(images.reasons) < total:
-        remarks.append(f"Of {total:,} images left out, only {len(images.reasons)}, evenly spaced, were examined.")
-    if len(images.cameras) == 1:
-        remarks.append("The scene has a single camera; the study cannot judge what this camera does not show.")
-    return remarks
+    total, examined = sum(images.left_out.values()), len(images.reasons)
+    hidden, single = len(regions) > 0 and len(poses) == 0, len(images.cameras) == 1
+    remarks = {
+        f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except for "
+        "parts smaller than a thousandth of it.": len(regions) == 0,
+        "No new pose shows a region better than the images do; it may be hidden from all possible positions.": hidden,
+        "No image was left out of the lift, so none can be suggested.": examined == 0,
+        f"Of {total:,} images left out, only {examined}, evenly spaced, were examined.": examined < total,
+        "The scene has a single camera; the study cannot judge what this camera does not show.": single,
+    }
+    return [text for text, applies in remarks.items() if applies]

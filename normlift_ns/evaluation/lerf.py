@@ -1,14 +1,11 @@
-"""Evaluation on LERF-OVS: labels, scores, and the score maps of Splat Feature Solver.
-
-Score map processing of the published code of Splat Feature Solver (SFS), number by number, including its
-oddities.
-"""
+"""Evaluation on LERF-OVS: labels and scores."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, NamedTuple
 
@@ -16,113 +13,26 @@ import cv2
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
-from scipy import ndimage
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.metrics import localized, mask_iou, mask_recall
+from normlift_ns.core.relevancy import relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import (
     LANGSPLAT_MASKINGS,
     AveragingOrder,
     Evaluation,
+    LerfOptions,
     Masking,
     PromptText,
     mean,
     read_document,
 )
-
-_BINS, _MIN_PEAK, _UPPER_QUANTILE = 40, 600, 0.75
-_MIN_RANGE, _MIN_VARIANCE = 1e-12, 1e-10
-_MAX_QUANTILE_VALUES = 2**24
-"""Maximum number of values for torch's quantile."""
-_EPSILON = 1e-12
-"""Keeps the means of empty sides finite."""
-
-
-def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
-    """Return the threshold of SFS's attention maps, a float32 number. Scores that reach it (>=) are selected.
-
-    The histogram has 40 bins from the smallest to the largest score. Its peaks are the bins of at least 600 pixels that
-    no neighbor exceeds; on a plateau, every bin is a peak. The rule uses the k-th peak from the right, with k the
-    number of true instances. If there are fewer than k, it uses the rightmost peak.
-
-    The valley is the nearest bin to the left that is lower than the peak and that no neighbor undercuts. The first bin
-    is excluded. If there is no such bin, the valley is the rightmost bin of all that lies right of the peak and is
-    lower. The threshold is the middle of the valley.
-
-    Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. It
-    is the mean of all scores if these are nearly equal (variance below 1e-10).
-
-    In two cases, the published code has no answer to follow. It fails if the last two bins are equal and the peak is
-    the last; this function then follows the rule above. Its float32 mean of a constant map may exceed the constant;
-    this function then selects every pixel. The last digit of float32 sums depends on the memory layout, so this
-    function keeps that of `score`.
-    """
-    values = score.detach().cpu().float().flatten()
-    low, high = float(values.min()), float(values.max())
-    if low == high:
-        return low
-    if high <= low + _MIN_RANGE:
-        counts, edges = torch.tensor([len(values)]), torch.linspace(low, high + 1e-6, 2)
-    else:
-        counts, edges = values.histc(_BINS, low, high).long(), torch.linspace(low, high, _BINS + 1)
-    valley = _valley(counts.tolist(), max(1, instances))
-    if valley is not None:
-        threshold = (float(edges[valley]) + float(edges[valley + 1])) / 2
-    elif float(values.var()) < _MIN_VARIANCE:
-        threshold = float(values.mean())
-    else:
-        threshold = (_otsu(counts, edges) + _upper_quartile(values)) / 2
-    return float(torch.tensor(threshold, dtype=torch.float32))
-
-
-def _valley(counts: list[int], instances: int) -> int | None:
-    last = len(counts) - 1
-    peaks = [
-        i for i, count in enumerate(counts) if count >= max(_MIN_PEAK, counts[max(i - 1, 0)], counts[min(i + 1, last)])
-    ]
-    if len(peaks) == 0:
-        return None
-    peak = peaks[-instances] if instances <= len(peaks) else peaks[-1]
-    for i in range(peak - 1, 0, -1):
-        if counts[i] <= min(counts[i - 1], counts[i + 1]) and counts[i] < counts[peak]:
-            return i
-    return next((i for i in range(last, peak, -1) if counts[i] < counts[peak]), None)
-
-
-def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> float:
-    """Return the center of the bin after which a split maximizes the variance between both sides, in float32."""
-    center, share = (edges[:-1] + edges[1:]) / 2, counts.float() / int(counts.sum())
-    below, moment = share.cumsum(0), (share * center).cumsum(0)
-    above, total = 1 - below, (share * center).sum()
-    between = below * above * (moment / (below + _EPSILON) - (total - moment) / (above + _EPSILON)) ** 2
-    return float(center[int(between.argmax())])
-
-
-def _upper_quartile(values: Float[Tensor, " n"]) -> float:
-    if len(values) <= _MAX_QUANTILE_VALUES:
-        return float(values.quantile(_UPPER_QUANTILE))
-    return float(np.quantile(values.numpy(), _UPPER_QUANTILE))
-
-
-def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Open and close the mask by 3 x 3 pixels, keep its largest 8-connected component (the first of equals), and fill
-    holes.
-
-    The outside of the image counts as empty in every step, so erosion removes the border. In the outermost rows and
-    columns, only filled holes remain.
-    """
-    image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
-    for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):
-        image = step(image, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    labels, count = ndimage.label(image, structure=square)  # pyright: ignore[reportGeneralTypeIssues]
-    if count == 0:
-        return torch.zeros_like(mask, device="cpu")
-    sizes = np.bincount(labels.ravel())
-    largest = labels == 1 + sizes[1:].argmax()
-    return torch.from_numpy(np.asarray(ndimage.binary_fill_holes(largest)))
-
+from normlift_ns.evaluation.protocols import EvaluatedRun, scene_names
+from normlift_ns.evaluation.sfs import clean_mask, histogram_threshold
+from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 
 # Labels of LERF-OVS: one JSON file per annotated frame, with polygons of named objects.
 
@@ -402,3 +312,50 @@ def _grouped(
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return groups
+
+
+def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
+    """Run protocol lerf with one run per scene.
+
+    Raises:
+        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
+    """
+    files = [read_frames(folder) for folder in labels]
+    rows, missing = [], []
+    for scene, frames, lifted in zip(scene_names(labels), files, runs):
+        cameras = lifted.cameras()
+        images, unmatched = match_views(frames, list(cameras))
+        missing += [f"{scene}/{stem}" for stem in unmatched]
+        labeled = ((cameras[name], file) for file, name in images.items())
+        read = [(camera, read_frame(file, camera.width, camera.height)) for camera, file in labeled]
+        views = [(camera, frame) for camera, frame in read if len(frame.masks) > 0]
+        lengths: list[Tensor | None] = [None] * len(views)
+        if options.masking == "langsplat":
+            lengths = list(lifted.feature_lengths([camera for camera, _ in views], _scale(lifted, options)))
+        for (camera, frame), length in zip(views, lengths):
+            scores = _frame_scores(lifted, camera, frame, length, options)
+            rows += [
+                {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
+                for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
+            ]
+    if len(rows) == 0:
+        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
+    settings = {**asdict(options), "labels_without_image": missing}
+    return summarize_lerf(rows, options.average, settings)
+
+
+def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] | float:
+    return lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
+
+
+def _frame_scores(
+    lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
+) -> FrameScores:
+    """Return composited scores, divided by the length of each pixel's feature if given."""
+    prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
+    negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
+    values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))
+    if length is not None:
+        values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
+    values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
+    return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)

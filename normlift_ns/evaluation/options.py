@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ import msgspec
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
+from normlift_ns.io.manifest import read_text
 from normlift_ns.options import WithoutDirection, check_options
 
 Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]
@@ -101,8 +102,6 @@ class MaskOptions:
 
 PromptText = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
 """Text that can be used as a prompt: not blank, and without lone surrogates."""
-_MAX_BYTES = 2**26
-"""Maximum file size in bytes; label files have some thousands."""
 _Document = TypeVar("_Document")
 
 
@@ -112,26 +111,19 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     Raises:
         ValueError: the file is missing, too large or not valid JSON, a key occurs twice, or a value has another type.
     """
-    if not os.path.isfile(path):
-        raise InputError("it is not a file")
     try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise InputError(f"it has more than {_MAX_BYTES:,} bytes")
-        document = json.loads(content.decode("utf8"), object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
+        text = read_text(path)
+        document = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
         return msgspec.convert(document, kind)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{type(error).__name__}: {error}") from None
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) < len(pairs):
-        keys = [key for key, _ in pairs]
-        duplicate = next(key for key in keys if keys.count(key) > 1)
-        raise InputError(f"the key {duplicate!r} occurs twice")
-    return result
+    for key, count in Counter(key for key, _ in pairs).items():
+        if count > 1:
+            raise InputError(f"the key {key!r} occurs twice")
+    return dict(pairs)
 
 
 def _reject_constant(text: str) -> float:
@@ -168,10 +160,8 @@ def mean(values: Sequence[float]) -> float:
 def write_evaluation(
     path: Path,
     evaluation: Evaluation,
+    runs: Sequence[tuple[str, str]],
     *,
-    experiment_name: str,
-    method_name: str,
-    checkpoint: str,
     studies: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -180,19 +170,16 @@ def write_evaluation(
 
     NaN is written as null.
 
+    Args:
+        runs: name and checkpoint of every run.
     Raises:
         FileExistsError: the file exists and `overwrite` is False.
     """
-    document = {
-        "experiment_name": experiment_name,
-        "method_name": method_name,
-        "checkpoint": checkpoint,
-        "results": evaluation.results,
-        "settings": evaluation.settings,
-        **({"scenes": evaluation.scenes} if evaluation.scenes else {}),
-        "rows": evaluation.rows,
-        **({"studies": studies} if studies else {}),
-    }
+    names, checkpoints = (", ".join(values) for values in zip(*runs))
+    document: dict[str, Any] = {"experiment_name": names, "method_name": "normlift", "checkpoint": checkpoints}
+    document |= {"results": evaluation.results, "settings": evaluation.settings}
+    document |= {"scenes": evaluation.scenes} if evaluation.scenes else {}
+    document |= {"rows": evaluation.rows} | ({"studies": studies} if studies else {})
     write_text_file(path, json.dumps(_to_json(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
 
 

@@ -1,11 +1,12 @@
-"""Evaluation protocols on lifted runs, and instance masks."""
+"""Lifted runs to evaluate, and the evaluation against instance masks."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +18,13 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED, Evidence
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
-from normlift_ns.core.relevancy import relevancy
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.metrics import NO_CLASS, class_scores, classify, confusion
 from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.base import check_files_distinct
 from normlift_ns.encoders.text_files import TextEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.lerf import (
-    FrameScores,
-    LabeledFrame,
-    frame_rows,
-    match_views,
-    read_frame,
-    read_frames,
-    summarize_lerf,
-)
-from normlift_ns.evaluation.options import (
-    LANGSPLAT_MASKINGS,
-    Evaluation,
-    LerfOptions,
-    MaskOptions,
-    PromptText,
-    ScannetOptions,
-    read_document,
-)
-from normlift_ns.evaluation.scannet import (
-    NYU40,
-    PAPER_SPELLING,
-    SceneLabels,
-    check_identity,
-    evaluate_scannet,
-    read_labels,
-)
-from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
+from normlift_ns.evaluation.options import Evaluation, MaskOptions, PromptText, read_document
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
@@ -88,7 +62,10 @@ def read_names(path: Path) -> Names:
     try:
         document = read_document(path, dict[str, Any])
         named = msgspec.convert(document if "labels" in document else {"labels": document}, _NamesFile)
-        name_of = _by_value(named.labels)
+        wrong = [key for key in named.labels if _VALUE.fullmatch(key) is None]
+        if len(wrong) > 0:
+            raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
+        name_of = {int(value): name for value, name in named.labels.items()}
         if named.background is not None and named.background in name_of:
             raise InputError(f"value {named.background} is the background, but has a name")
         if len(name_of) == 0:
@@ -97,13 +74,6 @@ def read_names(path: Path) -> Names:
         raise InputError(f"{path} is not a valid file of mask names ({error}); {expected}") from error
     classes = tuple(dict.fromkeys(name_of.values()))
     return Names(classes, {value: classes.index(name) for value, name in name_of.items()})
-
-
-def _by_value(labels: Mapping[str, str]) -> dict[int, str]:
-    wrong = [key for key in labels if _VALUE.fullmatch(key) is None]
-    if len(wrong) > 0:
-        raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
-    return {int(value): name for value, name in labels.items()}
 
 
 def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
@@ -171,18 +141,15 @@ def evaluate_masks(
         "gaussians_with_truth_share": float(scored.double().mean()),
         "zero_evidence_share": float((reliability == 0).double().mean()),
     }
-    rows = [
-        {"class": name, "gaussians": int((truth == c).sum()), **_row(of_gaussians, c, "3d"), **_row(of_pixels, c, "2d")}
-        for c, name in enumerate(names)
-    ]
+    rows: list[dict[str, Any]] = []
+    for c, name in enumerate(names):
+        rows.append({"class": name, "gaussians": int((truth == c).sum())})
+        for suffix, scores in (("3d", of_gaussians), ("2d", of_pixels)):
+            rows[-1] |= {f"iou_{suffix}": float(scores.iou[c]), f"accuracy_{suffix}": float(scores.accuracy[c])}
     return Evaluation(results, rows, {"protocol": "masks", **settings})
 
 
-def _row(scores: ClassScores, c: int, suffix: str) -> dict[str, float]:
-    return {f"iou_{suffix}": float(scores.iou[c]), f"accuracy_{suffix}": float(scores.accuracy[c])}
-
-
-# The three evaluation protocols on lifted runs: from files and options to metrics.
+# Lifted runs, as all protocols evaluate them.
 
 
 _CHANNELS = 64
@@ -236,8 +203,18 @@ class EvaluatedRun:
 
     def cameras(self) -> dict[str, Camera]:
         """Return the cameras of all training and held-out images by image name."""
-        splits = (self.scene.train, self.scene.held_out)
-        return {name: camera for views in splits for name, camera in zip(views.names, views.cameras)}
+        train, held_out = self.scene.train, self.scene.held_out
+        return dict(zip((*train.names, *held_out.names), (*train.cameras, *held_out.cameras)))
+
+
+Rasterize = Callable[..., Evidence]
+"""`rasterize_evidence` with the arguments that are the same in all calls."""
+
+
+def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
+    """Return `rasterize_evidence` for a scene, or for its Gaussians on another device."""
+    gaussians = scene.gaussians if gaussians is None else gaussians
+    return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)
 
 
 def scene_names(labels: Sequence[Path]) -> list[str]:
@@ -251,85 +228,6 @@ def scene_names(labels: Sequence[Path]) -> list[str]:
     """
     short = [path.name.split("_vh_clean")[0] for path in labels]
     return [name if short.count(name) == 1 else str(path) for name, path in zip(short, labels)]
-
-
-def label_scene(
-    lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
-) -> SceneLabels:
-    """Return the data of a run that protocol scannet needs.
-
-    Raises:
-        ValueError: the number of vertices differs from that of Gaussians.
-    """
-    check_identity(name, len(lifted.scene.gaussians), nyu40, path)
-    prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
-    cosine = lifted.cosine(tuple(prompts.values()))
-    return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
-
-
-def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
-    """Run protocol scannet with one run per scene.
-
-    Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
-    """
-    truths = [read_labels(path) for path in labels]
-    inputs = zip(runs, scene_names(labels), labels, truths)
-    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
-    kwargs = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
-    evaluation = evaluate_scannet(scenes, **kwargs)
-    return replace(evaluation, settings={**evaluation.settings, "spelling": options.spelling})
-
-
-def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
-    """Run protocol lerf with one run per scene.
-
-    Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
-    """
-    files = [read_frames(folder) for folder in labels]
-    rows, missing = [], []
-    for scene, frames, lifted in zip(scene_names(labels), files, runs):
-        cameras = lifted.cameras()
-        images, unmatched = match_views(frames, list(cameras))
-        missing += [f"{scene}/{stem}" for stem in unmatched]
-        views = [
-            (cameras[name], read_frame(file, cameras[name].width, cameras[name].height))
-            for file, name in images.items()
-        ]
-        views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
-        factor = lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
-        lengths: list[Tensor | None] = [None] * len(views)
-        if options.masking == "langsplat":
-            lengths = list(lifted.feature_lengths([camera for camera, _ in views], factor))
-        for (camera, frame), length in zip(views, lengths):
-            scores = _frame_scores(lifted, camera, frame, factor, length, options)
-            rows += [
-                {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
-                for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
-            ]
-    if len(rows) == 0:
-        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
-    settings = {**asdict(options), "labels_without_image": missing}
-    return summarize_lerf(rows, options.average, settings)
-
-
-def _frame_scores(
-    lifted: EvaluatedRun,
-    camera: Camera,
-    frame: LabeledFrame,
-    factor: Float[Tensor, "n 1"] | float,
-    length: Float[Tensor, "h w"] | None,
-    options: LerfOptions,
-) -> FrameScores:
-    """Return composited scores, divided by the length of each pixel's feature if given."""
-    prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
-    negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
-    values, _ = lifted.composite(camera, factor * lifted.cosine((*prompts, *negatives)))
-    if length is not None:
-        values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
-    values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
-    return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)
 
 
 @dataclass(frozen=True)
@@ -366,14 +264,8 @@ def mask_truth(
             yield read_classes(masks, name, names, camera.height, camera.width)
 
     count = len(names.classes)
-    evidence = rasterize_evidence(
-        scene.gaussians,
-        scene.train.cameras,
-        (labels.int().clamp(min=UNLABELED) for labels in classes(scene.train)),
-        num_regions=[count] * len(scene.train),
-        rasterize_mode=scene.rasterize_mode,
-        settings=settings,
-    )
+    labels = (labels.int().clamp(min=UNLABELED) for labels in classes(scene.train))
+    evidence = rasterizer(scene, settings)(scene.train.cameras, labels, num_regions=[count] * len(scene.train))
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
     if not bool((truth >= 0).any()):
         raise InputError(

@@ -1,88 +1,26 @@
-"""Evaluation on ScanNet as OpenGaussian does it."""
+"""3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh."""
 
 from __future__ import annotations
 
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
+from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, classify, confusion
+from normlift_ns.data.splat import check_ply_header
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.options import Evaluation, mean
+from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
+from normlift_ns.evaluation.protocols import EvaluatedRun, scene_names
 from normlift_ns.options import WithoutDirection
-
-_MAX_HEADER = 2**16
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-
-
-def read_column(path: Path, name: str) -> np.ndarray:
-    """Read a property of all vertices.
-
-    Raises:
-        ValueError: the file is not a PLY file, does not begin with vertices, lacks the property, or is shorter than its
-            header says.
-        OSError: the file cannot be read.
-    """
-    with path.open("rb") as file:
-        start = file.read(_MAX_HEADER)
-        end = start.find(b"end_header")
-        body = start.find(b"\n", end) + 1
-        if not start.startswith(b"ply") or end < 0 or body == 0:
-            raise InputError("it has no PLY header")
-        encoding, count, table = _header(start[:end].decode("ascii"))
-        if name not in (table.names or ()):
-            raise InputError(f"its vertices have no property {name} (found {', '.join(table.names or ['none'])})")
-        size, least = os.fstat(file.fileno()).st_size - body, table.itemsize
-        if encoding == "ascii":
-            least = 2 * len(table.names or ())  # a digit and a separator
-        if not 0 < count <= (size + 1) // least:
-            raise InputError(f"its header declares {count:,} vertices, which does not fit its size of {size:,} bytes")
-        file.seek(body)
-        if encoding != "ascii":
-            return np.fromfile(file, table, count)[name]
-        column = np.loadtxt(file, ndmin=2, max_rows=count, usecols=(table.names or ()).index(name))[:, 0]
-        if len(column) != count:
-            raise InputError(f"its header declares {count:,} vertices, but it has {len(column):,}")
-        return column
-
-
-def _header(text: str) -> tuple[str, int, np.dtype]:
-    """Return the encoding, the number of vertices and the type of a vertex."""
-    encoding, count, fields = "", -1, []
-    for line in text.splitlines()[1:]:
-        match line.split():
-            case ["format", name, *_] if name in _BYTE_ORDERS:
-                encoding = name
-            case ["element", _, _] if count >= 0:
-                break  # the elements after the vertices
-            case ["element", "vertex", digits] if digits.isdigit() and len(digits) < 16:
-                count = int(digits)
-            case ["property", kind, name] if kind in _TYPES and count >= 0 and encoding != "":
-                fields.append((name, _BYTE_ORDERS[encoding] + _TYPES[kind]))
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                raise InputError(f"its header has the line {line[:80]!r}, expected vertices with numbers first")
-    if count < 0 or len(fields) == 0:
-        raise InputError("its header declares no vertices, or vertices without numbers")
-    return encoding, count, np.dtype(fields)
-
-
-# 3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh.
-
 
 NYU40 = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
@@ -101,6 +39,9 @@ CLASS_SETS = {
 """NYU40 ids of the three sets."""
 SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
+
+
+_OTHER: dict[WithoutDirection, WithoutDirection] = {"first": "none", "none": "first"}
 
 
 class SceneLabels(NamedTuple):
@@ -129,11 +70,18 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
             "registration, under its license"
         )
     try:
-        column = read_column(path, "label")
+        check_ply_header(path)
+        vertex = next((x for x in PlyData.read(str(path), mmap="c").elements if x.name == "vertex"), None)
+        if vertex is None or vertex.count == 0:
+            raise InputError("its header declares no vertices")
+        names = [item.name for item in vertex.properties]
+        if "label" not in names:
+            raise InputError(f"its vertices have no property label (found {', '.join(names)})")
+        column = np.asarray(vertex["label"])
         labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
         if (labels != column).any():
             raise InputError("its labels are not 32-bit integers")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, PlyParseError, EOFError, MemoryError, OverflowError) as error:
         raise InputError(
             f"{path} is damaged, or not a PLY file with labeled vertices ({error}); download the scene's "
             "*_vh_clean_2.labels.ply again"
@@ -193,14 +141,13 @@ def predict_classes(
     return truth, classify(scene.cosine[:, columns], scene.valid, without_direction=without_direction)
 
 
-def evaluate_scannet(
-    scenes: Sequence[SceneLabels], *, min_opacity: float = 0.1, without_direction: WithoutDirection = "first"
-) -> Evaluation:
+def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> Evaluation:
     """Compute mIoU and mAcc of every set of classes, averaged over scenes.
 
     `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
     """
-    other: WithoutDirection = "none" if without_direction == "first" else "first"
+    min_opacity, without_direction = options.min_opacity, options.without_direction
+    other = _OTHER[without_direction]
     names = [scene.name for scene in scenes]
     results, rows = {}, []
     by_scene: list[dict[str, Any]] = [{"scene": name} for name in names]
@@ -209,7 +156,11 @@ def evaluate_scannet(
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
             for rule in (without_direction, other)
         }
-        _check_scored(scores[without_direction], names, classes, min_opacity)
+        if all(math.isnan(score.miou) for score in scores[without_direction]):
+            raise InputError(
+                f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among "
+                f"them and an opacity of at least {min_opacity:g} (--min-opacity)"
+            )
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])
@@ -217,21 +168,10 @@ def evaluate_scannet(
             row |= {f"miou_{classes}": score.miou, f"macc_{classes}": score.macc}
             rows += _class_rows(row["scene"], classes, score)
     missing = [name for name in SCENES if name not in names]
-    settings = {
-        "protocol": "scannet", "min_opacity": min_opacity, "without_direction": without_direction, "scenes": names,
-        "missing_scenes": missing,
-    }  # fmt: skip
+    facts = {"min_opacity": min_opacity, "without_direction": without_direction, "scenes": names}
+    settings = {"protocol": "scannet", **facts, "missing_scenes": missing, "spelling": options.spelling}
     share = mean([float((~scene.valid).double().mean()) for scene in scenes])
     return Evaluation({**results, "without_direction_share": share}, rows, settings, by_scene)
-
-
-def _check_scored(scores: Sequence[ClassScores], names: Sequence[str], classes: int, min_opacity: float) -> None:
-    """Raise InputError if no scene has a score."""
-    if all(math.isnan(score.miou) for score in scores):
-        raise InputError(
-            f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among them "
-            f"and an opacity of at least {min_opacity:g} (--min-opacity)"
-        )
 
 
 def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
@@ -241,3 +181,29 @@ def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str,
         for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())
         if not math.isnan(iou)
     ]
+
+
+def label_scene(
+    lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
+) -> SceneLabels:
+    """Return the data of a run that protocol scannet needs.
+
+    Raises:
+        ValueError: the number of vertices differs from that of Gaussians.
+    """
+    check_identity(name, len(lifted.scene.gaussians), nyu40, path)
+    prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
+    cosine = lifted.cosine(tuple(prompts.values()))
+    return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
+
+
+def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
+    """Run protocol scannet with one run per scene.
+
+    Raises:
+        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
+    """
+    truths = [read_labels(path) for path in labels]
+    inputs = zip(runs, scene_names(labels), labels, truths)
+    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
+    return evaluate_scannet(scenes, options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -22,8 +22,8 @@ from normlift_ns.core.refine import decay_width, refine, voting_weights
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.baselines import BASELINES, baseline_field, time_dense_lift, timing_obstacle, with_consensus
 from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
-from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scene, scene_names
-from normlift_ns.evaluation.scannet import predict_classes, read_labels
+from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, scene_names
+from normlift_ns.evaluation.scannet import label_scene, predict_classes, read_labels
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
 
@@ -191,17 +191,8 @@ def voting_scalars(field: SemanticField) -> Scalars:
     return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))
 
 
-def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """Yield the variants of the paper's table 2 and the posterior vote, one vote per run."""
-    return _variants(owns, {variant: variant for variant in get_args(Variant)})
-
-
-def consensus_ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """Yield `CONSENSUS_VARIANTS` for runs with consensus, one vote per run."""
-    return _variants(owns, CONSENSUS_VARIANTS)
-
-
-def _variants(owns: Sequence[Vote], variants: Mapping[str, Variant]) -> Iterator[list[Vote]]:
+def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """Yield variants by name, one vote per run."""
     for name, variant in variants.items():
         yield [replace(own, variant=variant, label={"variant": name}) for own in owns]
 
@@ -369,21 +360,16 @@ def _mean(values: Tensor, group: Tensor) -> float:
 # Figures of the studies: a curve for every parameter, and R with accuracy.
 
 
-def plot_sweeps(
-    rows: Sequence[Mapping[str, Any]],
-    metric: str,
-    label: str,
-    path: Path,
-    *,
-    result: float | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write the figure of `sweeps_figure`.
+def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:
+    """Write a figure, the same bytes each time.
 
     Args:
         overwrite: replace a file of that name.
     """
-    _save(sweeps_figure(rows, metric, label, result), path, overwrite)
+    import matplotlib as mpl  # noqa: PLC0415 (only drawing needs it)
+
+    with mpl.rc_context({"svg.hashsalt": "normlift"}), atomic_file(path, overwrite=overwrite) as draft:
+        figure.savefig(draft, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None) -> Figure:
@@ -396,7 +382,7 @@ def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, re
         result: main result of the run, drawn as a line across all panels.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
-    figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
+    figure, axes = make_figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
     for panel, parameter in zip(axes, parameters):
         points = sorted((row for row in rows if row["parameter"] == parameter), key=lambda row: row["value"])
         values = [row[metric] for row in points]
@@ -422,22 +408,13 @@ _MARKS: dict[str, dict[str, Any]] = {
 }
 
 
-def plot_signals(rows: Sequence[Mapping[str, Any]], path: Path, *, overwrite: bool = False) -> None:
-    """Write the figure of `signals_figure`.
-
-    Args:
-        overwrite: replace a file of that name.
-    """
-    _save(signals_figure(rows), path, overwrite)
-
-
 def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Plot accuracy and reliability, one line of panels per row of the study (that is, per scene).
 
     The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, if there is a truth. The
     right panel shows the histogram of R, with R = 0 as a separate bar.
     """
-    figure, axes = _figure((9, 3.5 * len(rows)), len(rows), 2)
+    figure, axes = make_figure((9, 3.5 * len(rows)), len(rows), 2)
     for row, curves, histogram in zip(rows, axes[::2], axes[1::2]):
         for name, label in (("reliability", "R"), ("norm", "||f||")):
             bins = [100 * x for key, x in row.items() if key.startswith(f"{name}.bin")]
@@ -459,18 +436,12 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
-    import matplotlib as mpl  # noqa: PLC0415 (only drawing needs it)
-    from matplotlib.figure import Figure  # noqa: PLC0415
+def make_figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
+    """Return a figure of a size in inches, and its panels row by row."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
 
-    mpl.rcParams["svg.hashsalt"] = "normlift"  # reproducible files
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
-
-
-def _save(figure: Figure, path: Path, overwrite: bool) -> None:
-    with atomic_file(path, overwrite=overwrite) as draft:
-        figure.savefig(draft, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 # Further studies of lifted runs: ablation, parameter sweeps, signals of R, comparison with other methods, timing.
@@ -493,10 +464,8 @@ def study_votes(
     for run_votes in votes([recorded_vote(lifted.field.manifest) for lifted in runs]):
         key = tuple((vote.variant, vote.config, vote.beta) for vote in run_votes)
         if key not in results:
-            voted = (
-                replace(lifted, field=vote_again(vote), refined=True)
-                for lifted, vote_again, vote in zip(runs, voters, run_votes)
-            )
+            fields = (vote_again(vote) for vote_again, vote in zip(voters, run_votes))
+            voted = (replace(lifted, field=field, refined=True) for lifted, field in zip(runs, fields))
             results[key] = evaluate(voted).results
         rows.append({**run_votes[0].label, **results[key]})
     return rows
@@ -511,13 +480,13 @@ def study_ablation(
         warn: called with the reason if variants are left out, because the features of a run cannot be computed again.
     """
     rows: list[Row] = []
-    for on, votes in ((False, ablation), (True, consensus_ablation)):
+    for on, names in ((False, {name: name for name in get_args(Variant)}), (True, CONSENSUS_VARIANTS)):
         try:
-            variants = [with_consensus(lifted, on, device) for lifted in runs]
+            again = [with_consensus(lifted, on, device) for lifted in runs]
         except (ValueError, FileNotFoundError) as error:
             warn(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
             continue
-        rows += study_votes(variants, evaluate, votes, device)
+        rows += study_votes(again, evaluate, partial(variant_votes, names), device)
     return rows
 
 
@@ -558,9 +527,8 @@ def plain_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path]) -> list[
 
 def _by_refinement(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
     """Return the run with unrefined directions and, if it was lifted with a vote, with refined ones."""
-    kinds = {"unrefined": False, "refined": True}
-    if not lifted.field.manifest.get("options", {}).get("refine", True):
-        del kinds["refined"]
+    voted = lifted.field.manifest.get("options", {}).get("refine", True)
+    kinds = {"unrefined": False, **({"refined": True} if voted else {})}
     return {kind: replace(lifted, refined=refined) for kind, refined in kinds.items()}
 
 
@@ -571,8 +539,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
     rows: list[Row] = []
-    for refined in (True, False):
-        name, what = ("normlift", "the run, refined") if refined else ("unrefined", "the run, unrefined")
+    for name, what, refined in (("normlift", "the run, refined", True), ("unrefined", "the run, unrefined", False)):
         results = evaluate(replace(lifted, refined=refined) for lifted in runs).results
         rows.append({"method": name, "what": what, **results})
     for method, what in BASELINES.items():

@@ -63,7 +63,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no complete semantic field ({MANIFEST_FILE} is missing); {LIFT_AGAIN}")
     try:
-        text = _read_text(path)
+        text = read_text(path)
         facts = json.loads(text)
         if not isinstance(facts, dict):
             raise InputError(f"it holds a {type(facts).__name__}, expected a JSON object")
@@ -91,7 +91,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
     return facts, digests
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
     """Read a regular file of limited size; reading a pipe, say, might never end."""
     if not path.is_file():
         raise InputError("it is not a regular file")

@@ -59,29 +59,19 @@ def trainer_config(
     )
 
 
+def _optimizer(lr: float, lr_final: float | None = None, **warmup: Any) -> dict[str, Any]:
+    decay = lr_final and ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=30000, **warmup)
+    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+
+
 def _splatfacto_optimizers() -> dict[str, Any]:
+    rates = {"features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005, "quats": 0.001}
+    warmup = {"warmup_steps": 1000, "lr_pre_warmup": 0}
     return {
-        "means": {
-            "optimizer": AdamOptimizerConfig(lr=1.6e-4, eps=1e-15),
-            "scheduler": ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=30000),
-        },
-        "features_dc": {"optimizer": AdamOptimizerConfig(lr=0.0025, eps=1e-15), "scheduler": None},
-        "features_rest": {"optimizer": AdamOptimizerConfig(lr=0.0025 / 20, eps=1e-15), "scheduler": None},
-        "opacities": {"optimizer": AdamOptimizerConfig(lr=0.05, eps=1e-15), "scheduler": None},
-        "scales": {"optimizer": AdamOptimizerConfig(lr=0.005, eps=1e-15), "scheduler": None},
-        "quats": {"optimizer": AdamOptimizerConfig(lr=0.001, eps=1e-15), "scheduler": None},
-        "camera_opt": {
-            "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
-            "scheduler": ExponentialDecaySchedulerConfig(
-                lr_final=5e-7, max_steps=30000, warmup_steps=1000, lr_pre_warmup=0
-            ),
-        },
-        "bilateral_grid": {
-            "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
-            "scheduler": ExponentialDecaySchedulerConfig(
-                lr_final=1e-4, max_steps=30000, warmup_steps=1000, lr_pre_warmup=0
-            ),
-        },
+        "means": _optimizer(1.6e-4, 1.6e-6),
+        **{name: _optimizer(rate) for name, rate in rates.items()},
+        "camera_opt": _optimizer(1e-4, 5e-7, **warmup),
+        "bilateral_grid": _optimizer(2e-3, 1e-4, **warmup),
     }
 
 
@@ -128,7 +118,7 @@ scannet_method = MethodSpecification(
         ),
         NormLiftModelConfig(stop_split_at=0),
         image_scale=0.5,
-        means={"optimizer": AdamOptimizerConfig(lr=0.0, eps=1e-15), "scheduler": None},
+        means=_optimizer(0.0),
     ),
     description="normlift with frozen points, for ScanNet: Gaussian i is vertex i.",
 )

@@ -18,7 +18,7 @@ from nerfstudio.viewer.render_state_machine import RenderAction
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
-from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.analysis.explain import RecordedVotes
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.relevancy import RELEVANCY_RULES

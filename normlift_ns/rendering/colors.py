@@ -80,11 +80,9 @@ def named_color(text: str) -> tuple[float, float, float] | None:
     >>> named_color("the fox"), named_color("white")
     (None, None)
     """
-    table = xkcd_colors()
-    named = [
-        table[name] for name in find_color_names(text) if name in table
-    ]  # each name with a slash has a twin without
-    colors = [(c[0] / 255, c[1] / 255, c[2] / 255) for c in (bytes.fromhex(code[1:]) for code in named)]
+    table = xkcd_colors()  # each name with a slash has a twin without
+    codes = (bytes.fromhex(table[name][1:]) for name in find_color_names(text) if name in table)
+    colors = ((c[0] / 255, c[1] / 255, c[2] / 255) for c in codes)
     return next((color for color in colors if colorsys.rgb_to_hsv(*color)[1] >= _MIN_SATURATION), None)
 
 

@@ -109,8 +109,9 @@ def make_display(
     scalars = field.scalars
     zeros = torch.zeros_like(scalars.reliability)
     relevancy = zeros[:, None][:, :0] if answer is None else answer.relevancy
-    explicit, selected = selection is not None, selection_mask(answer, shown) if selection is None else selection
-    selected = zeros.bool() if selected is None else selected
+    explicit, selected = selection is not None, zeros.bool() if selection is None else selection
+    if answer is not None and not explicit:
+        selected = answer.selected.any(dim=1) if shown is None else answer.selected[:, shown]
     count, shown_relevancy, selected_by_any = relevancy.shape[1], zeros, zeros
     scale = whole = (0.0, 1.0)
     if answer is not None and count > 0:
@@ -121,13 +122,6 @@ def make_display(
     values = torch.cat([relevancy.float(), torch.stack([c.float() for c in columns], dim=1)], dim=1)
     texts = () if answer is None else answer.texts
     return Display(values, scale, whole, colormap, texts, prompt_colors(texts).to(values), shown, drawn, by_hand)
-
-
-def selection_mask(answer: Answer | None, shown: int | None) -> Bool[Tensor, " n"] | None:
-    """Return the mask of Gaussians selected by prompt `shown` (None: by any prompt); None without an answer."""
-    if answer is None:
-        return None
-    return answer.selected.any(dim=1) if shown is None else answer.selected[:, shown]
 
 
 def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float, float]:
@@ -181,7 +175,7 @@ def render_outputs(
         named_by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise
             they are scalars named relevancy_0, relevancy_1, …
     """
-    count, colors = display.num_prompts, colormap_rgb(display.colormap).to(rgb)
+    count = display.num_prompts
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
     _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
     opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
@@ -191,15 +185,12 @@ def render_outputs(
         segmented = segmentation(rgb, pixel[:, :, :count].argmax(dim=2), selected_by_any, display.palette)
         segmented = add_prompt_legend(segmented, display.texts, display.palette)
     if count > 0 and not display.by_hand:
-        overlaid = overlay(rgb, pixel[:, :, count], selected, colors, display.scale)
+        overlaid = overlay(display, rgb, pixel[:, :, count], selected)
         overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
     if named_by_text:
-        outputs = {
-            name: add_color_bar(
-                relevancy_map(display, rgb, pixel[:, :, i], alpha), display.colormap, display.map_scale, text
-            )
-            for i, (name, text) in enumerate(zip(output_names(display.texts), display.texts))
-        }
+        maps = (relevancy_map(display, rgb, pixel[:, :, i], alpha) for i in range(count))
+        named = zip(output_names(display.texts), display.texts, maps)
+        outputs = {name: add_color_bar(x, display.colormap, display.map_scale, text) for name, text, x in named}
     return {
         **outputs,
         "reliability": reliability_map(rgb, reliability, alpha),
@@ -212,19 +203,14 @@ def render_outputs(
 
 
 def overlay(
-    rgb: Float[Tensor, "h w 3"],
-    relevancy: Float[Tensor, "h w"],
-    share: Float[Tensor, "h w 1"],
-    colors: Float[Tensor, "256 3"],
-    scale: tuple[float, float],
+    display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], share: Float[Tensor, "h w 1"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, with the selection colored by relevancy and more opaque for higher relevancies.
 
     Args:
         share: selected fraction of each pixel, 0..1.
-        scale: relevancies of the first and the last color.
     """
-    color, opacity = apply_colormap(relevancy, scale, colors)
+    color, opacity = apply_colormap(relevancy, display.scale, colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
 
 
@@ -232,9 +218,8 @@ def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
-    color, opacity = apply_colormap(
-        relevancy, display.map_scale, colormap_rgb(display.colormap).to(rgb), min_opacity=0.0
-    )
+    colors = colormap_rgb(display.colormap).to(rgb)
+    color, opacity = apply_colormap(relevancy, display.map_scale, colors, min_opacity=0.0)
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
 
 
@@ -349,11 +334,12 @@ def view_figure(
         selected: mask of the selected pixels, which are outlined.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
-    panels = [panel] if image is None else [Image.fromarray(image.cpu().numpy()).resize(panel.size), panel]
-    captions = ["answer"] if image is None else ["training image", "answer"]
-    summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {header.summary}"
-    if not bool(selected.any()):
-        summary = header.summary
+    panels, captions = [panel], ["answer"]
+    if image is not None:
+        panels.insert(0, Image.fromarray(image.cpu().numpy()).resize(panel.size))
+        captions.insert(0, "training image")
+    share = float(selected.float().mean())
+    summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
     return _page(sheet, [f"{header.title}   ·   {clip_text(view, 40)}", summary], panels, captions, 2)
 
 
@@ -469,32 +455,28 @@ def save_overlays(
         OSError: a file cannot be written.
         ValueError: two figures would have the same name.
     """
-    files = {
-        view: [f"{view}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)] for view in cameras
-    }
-    sheets = (
-        [f"{CONTACT_SHEET_PREFIX}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
-        if len(cameras) > 1
-        else []
-    )
-    counts = Counter([*sheets, *(name for names in files.values() for name in names)])
+    prefixes = [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras]
+    ends = [f"{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
+    counts = Counter(f"{prefix}_{end}" for prefix in prefixes for end in ends)
     duplicates = [name for name, count in counts.items() if count > 1]
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
     headers = [FigureHeader.of(finding) for finding in answer]
     sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
+
+    def save(prefix: str, q: int, picture: Image.Image) -> None:
+        paths.append(folder / f"{prefix}_{ends[q]}")
+        with atomic_file(paths[-1], overwrite=overwrite) as draft:
+            picture.save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+
     for view, camera in cameras.items():
         image = _training_image(scene, view)
         for q, overlay in enumerate(_overlays(scene, answer, camera, settings)):
             overlays[q].append((view, *overlay))
-            paths.append(folder / files[view][q])
-            with atomic_file(paths[-1], overwrite=overwrite) as draft:
-                view_figure(sheet, headers[q], view, image, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
-    for q, name in enumerate(sheets):
-        paths.append(folder / name)
-        with atomic_file(paths[-1], overwrite=overwrite) as draft:
-            contact_sheet(sheet, headers[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+            save(view, q, view_figure(sheet, headers[q], view, image, *overlay))
+    for q in range(len(ends) if len(cameras) > 1 else 0):
+        save(CONTACT_SHEET_PREFIX, q, contact_sheet(sheet, headers[q], overlays[q]))
     return paths
 
 
@@ -607,15 +589,11 @@ def unique_file_names(images: Sequence[str]) -> list[str]:
         counts = Counter(map(str.casefold, names))
         duplicate = [counts[name.casefold()] > 1 for name in names]
         names = [longer(image).replace("/", "_") if x else name for image, name, x in zip(images, names, duplicate)]
-    taken: set[str] = set()
-    return [_unique_name(name, taken) for name in names]
-
-
-def _unique_name(name: str, taken: set[str]) -> str:
-    """Return the first of the `numbered_paths` names that is not taken, and add it to the taken ones."""
-    unique = next(path.name for path in numbered_paths(Path(name)) if path.name.casefold() not in taken)
-    taken.add(unique.casefold())
-    return unique
+    taken: dict[str, str] = {}
+    for name in names:
+        unique = next(path.name for path in numbered_paths(Path(name)) if path.name.casefold() not in taken)
+        taken[unique.casefold()] = unique
+    return list(taken.values())
 
 
 def _without_suffix(image: str) -> str:

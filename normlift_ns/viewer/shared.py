@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt32
 from torch import Tensor
 
+from normlift_ns.analysis.explain import RecordedVotes
 from normlift_ns.analysis.objects import find_floaters
-from normlift_ns.analysis.vote_records import RecordedVotes
 from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError

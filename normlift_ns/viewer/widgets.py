@@ -14,8 +14,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
-from normlift_ns.analysis.explain import ViewVote
-from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.analysis.explain import RecordedVotes, ViewVote
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.query.histogram import Histogram
 from normlift_ns.rendering.colors import clip_text

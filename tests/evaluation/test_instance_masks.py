@@ -57,7 +57,7 @@ def test_figures_by_hand(tmp_path):
     assert evaluation.rows[0]["gaussians"] == 2
 
     with_gap = Evaluation({**results, "none": math.nan}, evaluation.rows, evaluation.settings)
-    write_evaluation(tmp_path / "o" / "out.json", with_gap, experiment_name="e", method_name="m", checkpoint="c")
+    write_evaluation(tmp_path / "o" / "out.json", with_gap, [("e", "c")])
     document = json.loads((tmp_path / "o" / "out.json").read_text())
     assert list(document)[:4] == ["experiment_name", "method_name", "checkpoint", "results"]  # as ns-eval
     assert document["results"]["none"] is None

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from normlift_ns.errors import InputError
+from normlift_ns.evaluation.options import ScannetOptions
 from normlift_ns.evaluation.scannet import (
     CLASS_SETS,
     NYU40,
@@ -52,7 +53,7 @@ def loop(scene: SceneLabels, classes: int, first: bool) -> tuple[float, float]:
 
 def test_equals_the_loop():
     scenes = [random_scene(seed, n=150 + 100 * seed) for seed in range(3)]
-    found = evaluate_scannet(scenes).results
+    found = evaluate_scannet(scenes, ScannetOptions()).results
     for classes in CLASS_SETS:
         for suffix, first in (("", True), ("_none", False)):
             miou, macc = (sum(part) / 3 for part in zip(*(loop(scene, classes, first) for scene in scenes)))
@@ -83,7 +84,7 @@ def test_opacity_absent_classes_and_missing_directions_by_hand():
     assert scores.iou[2:].isnan().all()  # no chair that counts; the floor called chair hurts the floor alone
     assert scene_scores(scene, 10, without_direction="none").iou[0] == 1
     assert scene_scores(scene, 10, min_opacity=0).iou[3] == 1 / 2
-    evaluation = evaluate_scannet([scene])
+    evaluation = evaluate_scannet([scene], ScannetOptions())
     assert {row["class"] for row in evaluation.rows} == {"wall", "floor"}
     assert evaluation.results["without_direction_share"] == pytest.approx(1 / 6)
     assert not any(math.isnan(value) for value in evaluation.results.values())
@@ -92,7 +93,7 @@ def test_opacity_absent_classes_and_missing_directions_by_hand():
 def test_what_cannot_be_scored_is_refused(tmp_path):
     scene = SceneLabels("s", torch.zeros(3, 19), torch.ones(3).bool(), torch.full((3,), 0.5), torch.tensor([1, 2, 3]))
     with pytest.raises(InputError, match=r" s .*--min-opacity"):
-        evaluate_scannet([scene], min_opacity=1)
+        evaluate_scannet([scene], ScannetOptions(min_opacity=1))
     check_identity("s", 4, np.zeros(4), tmp_path / "labels.ply")
     for count in (3, 5):
         with pytest.raises(InputError, match=rf"{count} Gaussians, .*labels\.ply has 4"):

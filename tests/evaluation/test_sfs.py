@@ -16,7 +16,8 @@ import pytest
 import torch
 from scipy import ndimage
 
-from normlift_ns.evaluation.lerf import clean_mask, histogram_threshold, prompt_mask
+from normlift_ns.evaluation.lerf import prompt_mask
+from normlift_ns.evaluation.sfs import clean_mask, histogram_threshold
 
 CHANNELS = 9
 """Of the maps that SFS's code looks at: a prompt and eight background words, side by side in memory."""

@@ -108,10 +108,10 @@ def test_runs_lifted_differently_are_swept_over_the_same_values():
 
 
 def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
-    from normlift_ns.evaluation.studies import plot_sweeps, sweeps_figure  # noqa: PLC0415
+    from normlift_ns.evaluation.studies import save_figure, sweeps_figure  # noqa: PLC0415
 
     rows = [{"parameter": "$\\frac{$", "value": x, "$\\frac{$": x} for x in (1.0, 2.0)]  # not mathematics
-    plot_sweeps(rows, "$\\frac{$", "$\\frac{$", tmp_path / "a.svg")
+    save_figure(sweeps_figure(rows, "$\\frac{$", "$\\frac{$"), tmp_path / "a.svg")
     assert (tmp_path / "a.svg").stat().st_size > 1000
     values = [("k", 12.0, False, True, 0.4), ("k", 36.0, True, False, 0.5), ("beta", 1.0, True, True, 0.4)]
     rows = [{"parameter": p, "value": v, "default": d, "own": o, "miou": y} for p, v, d, o, y in values]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
-from normlift_ns.exports import label_cloud, nearest_gaussians, read_cloud, vertex_positions, write_cloud
+from normlift_ns.exports import CloudTransfer, label_cloud, nearest_gaussians, read_cloud, vertex_positions, write_cloud
 from tests.examples import examples
 
 
@@ -19,20 +19,20 @@ def test_nearest_rows_are_those_of_loops(seed, most):
     g = np.random.default_rng(seed)
     points, means = g.normal(size=(20, 3)), g.normal(size=(15, 3))
     points[3] = [np.nan, 0, np.inf]
-    found = nearest_gaussians(points, means, most)
+    row, within = nearest_gaussians(points, means, most)
     for i, point in enumerate(points):
         distances = [float(np.sqrt(((point - mean) ** 2).sum())) for mean in means]
         if i == 3:
-            assert not found.within_limit[i]
+            assert not within[i]
             continue
-        assert found.row[i] == int(np.argmin(distances))
-        assert found.within_limit[i] == (min(distances) <= most)
+        assert row[i] == int(np.argmin(distances))
+        assert within[i] == (min(distances) <= most)
 
 
 def test_points_however_far_away_have_no_label():
     for far in (1e150, 1e200, 1e300, np.finfo(np.float64).max):
-        found = nearest_gaussians(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
-        assert found.within_limit.tolist() == [False, True] and set(found.row) <= {0, 1, 2}, far
+        row, within = nearest_gaussians(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
+        assert within.tolist() == [False, True] and set(row) <= {0, 1, 2}, far
 
 
 def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:
@@ -87,10 +87,11 @@ def test_what_is_no_cloud_is_refused(tmp_path):
 @pytest.mark.parametrize("count", [1, 3])
 def test_gaussians_at_one_position_label_no_cloud(count, tmp_path):
     cloud(tmp_path / "a.ply")
+    transfer = CloudTransfer(read_cloud(tmp_path / "a.ply"), 2.0, None)
     means, columns = np.ones((count, 3)), {"class_id": np.ones(count, np.uint32)}
     with pytest.raises(InputError, match="one position"):
-        label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0)
+        label_cloud(transfer, tmp_path / "b.ply", means, columns)
     assert not (tmp_path / "b.ply").exists()
     means = np.concatenate([means, [[1, 1, 2.0]]])
     columns = {"class_id": np.ones(count + 1, np.uint32)}
-    assert label_cloud(read_cloud(tmp_path / "a.ply"), tmp_path / "b.ply", means, columns, 2.0).limit == 2.0
+    assert label_cloud(transfer, tmp_path / "b.ply", means, columns).limit == 2.0

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import normlift_ns as nl
-from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.analysis.explain import RecordedVotes
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.demo.room import DemoRoom
 

@@ -16,11 +16,12 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, open_run
-from normlift_ns.analysis.catalogue import csv_columns, view_shares
+from normlift_ns.analysis.objects import csv_columns, view_shares
 from normlift_ns.cli import export, query
 from normlift_ns.cli.answers import print_catalog
 from normlift_ns.exports import answer_instances
 from normlift_ns.rasterization.rasterize import render
+from normlift_ns.rasterization.settings import RasterSettings
 from tests.scripts.conftest import run_entry, said
 
 if TYPE_CHECKING:
@@ -102,8 +103,7 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
     run = open_run(lifted)
     answer = run.ask("red", "yellow")
     found, instances = run.catalogue(answer), answer_instances(answer)
-    how = {"rasterize_mode": run.scene.rasterize_mode}
-    shares = view_shares(run.scene.gaussians, run.scene.train.cameras, instances, **how)
+    shares = view_shares(run.scene, instances, RasterSettings(), "cpu")
     for number, thing in enumerate(found.objects, 1):
         mask = (instances.instance_id == number).float()[:, None]
         drawn = [render(run.scene.gaussians, camera, mask)[0].mean() for camera in run.scene.train.cameras]

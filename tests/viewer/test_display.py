@@ -13,6 +13,7 @@ from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import clip_text, colormap_rgb, prompt_colors
 from normlift_ns.rendering.figures import (
+    Display,
     color_scale,
     make_display,
     overlay,
@@ -36,7 +37,8 @@ def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
     relevancy[0] = torch.tensor([-1.0, 0.5, 0.75, 1.0, 7.0])
     share[0] = 1
     share[1, 0], relevancy[1, 0] = 0.5, 1.0
-    found = overlay(rgb, relevancy, share, colors, (0.5, 1.0))
+    display = Display(torch.zeros(0, 5), (0.5, 1.0), (0.0, 1.0), "viridis", (), torch.zeros(0, 3))
+    found = overlay(display, rgb, relevancy, share)
     for x, (row, opacity) in enumerate(((0, 0.35), (0, 0.35), (128, 0.625), (255, 0.9), (255, 0.9))):
         torch.testing.assert_close(found[0, x], (1 - opacity) * grey[0, x] + opacity * colors[row])
     torch.testing.assert_close(found[1, 0], 0.55 * grey[1, 0] + 0.45 * colors[255])

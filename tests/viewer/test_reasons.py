@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from normlift_ns import Evidence
-from normlift_ns.analysis.explain import explain_selection
-from normlift_ns.analysis.vote_records import VoteImage
+from normlift_ns.analysis.explain import VoteImage, explain_selection
 from normlift_ns.core.evidence import Entries
 from normlift_ns.errors import InputError
 from normlift_ns.session import actions
