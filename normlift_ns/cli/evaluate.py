@@ -71,7 +71,6 @@ class NormLiftEval:
         """Evaluate the runs, write the output file and print the tables."""
         self._check()
         info_opening(*self.load_config)
-        from normlift_ns.api import open_run  # noqa: PLC0415
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.coverage import coverage_of, write_poses  # noqa: PLC0415
         from normlift_ns.evaluation.options import write_evaluation  # noqa: PLC0415
@@ -84,6 +83,7 @@ class NormLiftEval:
             sweeps,
         )
         from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []

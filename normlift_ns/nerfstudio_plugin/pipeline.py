@@ -18,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from normlift_ns.data.checkpoint import numpy_scalar_globals
 from normlift_ns.data.nerfstudio.config import check_components, check_lift_options
 from normlift_ns.data.nerfstudio.config_file import dataset_in_config
+from normlift_ns.data.nerfstudio.dataset_views import DatasetViews, nerfstudio_views
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.encoders.base import FeatureSource
@@ -27,7 +28,6 @@ from normlift_ns.io.atomic import write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, add_digest_comment, cache_folder, run_file_digests
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.panel_view import rerender_clients
-from normlift_ns.nerfstudio_plugin.views import DatasetViews, nerfstudio_views
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.query.engine import run_query

@@ -251,7 +251,7 @@ def test_undistortion_and_masks_are_nerfstudios(nerfstudio, tmp_path: Path) -> N
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: PLC0415
     from nerfstudio.data.datasets.base_dataset import InputDataset  # noqa: PLC0415
 
-    from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
+    from normlift_ns.data.nerfstudio.dataset_views import DatasetViews  # noqa: PLC0415
     from tests.nerfstudio_plugin.stock_run import write_dataset  # noqa: PLC0415
 
     write_dataset(tmp_path / "a", masks=True, channels=4)
