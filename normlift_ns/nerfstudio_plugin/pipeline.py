@@ -27,7 +27,7 @@ from normlift_ns.errors import describe_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, add_digest_comment, cache_folder, run_file_digests
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
-from normlift_ns.nerfstudio_plugin.panel_view import rerender_clients
+from normlift_ns.nerfstudio_plugin.panel import rerender_clients
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.query.engine import run_query
