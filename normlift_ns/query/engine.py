@@ -225,18 +225,9 @@ class Finding:
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as plain Python types."""
-        return {
-            "text": self.text,
-            "fraction": self.fraction,
-            "centroid": self.centroid,
-            "extent": self.extent,
-            "peak": self.peak,
-            "mean_reliability": self.mean_reliability,
-            "stands_out": self.stands_out,
-            "nearest": self.nearest,
-            "suggested_threshold": self.suggested_threshold,
-            "histogram": None if self.histogram is None else self.histogram.to_json(),
-        }
+        names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "stands_out", "nearest")
+        values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
+        return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}
 
     @cached_property
     def _selection(self) -> SelectionStats:

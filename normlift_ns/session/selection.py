@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components as graph_components
+from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from normlift_ns.analysis.objects import connected_components
@@ -111,17 +114,15 @@ class SelectionContext:
             return selected
         seeds = selected.cpu().numpy()
         candidates = seeds | self.similar_to(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
-        _, labels = _components(self._graph(candidates))
+        _, labels = graph_components(self._graph(candidates), directed=False)
         reached = np.zeros(labels.max() + 1, bool)
         reached[labels[seeds]] = True
         return torch.from_numpy(reached[labels] & candidates).to(selected.device)
 
     def _shrunk(self, selected: Bool[Tensor, " n"], steps: int) -> Bool[Tensor, " n"]:
-        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415 (a lift does not need it)
-
         rows = np.flatnonzero(selected.cpu().numpy())
         graph = self._graph(selected.cpu().numpy())[rows][:, rows]
-        count, labels = _components(graph)
+        count, labels = graph_components(graph, directed=False)
         means = np.nan_to_num(self.means.detach().double().cpu().numpy()[rows])
         size = np.bincount(labels, minlength=count)
         center = np.stack([np.bincount(labels, x, count) / size for x in means.T], axis=1)
@@ -137,8 +138,6 @@ class SelectionContext:
 
     def _graph(self, mask: np.ndarray) -> Any:
         """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
-        from scipy.sparse import csr_array  # noqa: PLC0415 (a lift does not need it)
-
         first, second = self._edges
         inside = mask[first] & mask[second]
         pairs = (first[inside], second[inside])
@@ -154,12 +153,6 @@ class SelectionContext:
         near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
         first, slot = np.nonzero(near)
         return first.astype(np.int32), neighbors.index.numpy()[first, slot]
-
-
-def _components(graph: Any) -> tuple[int, np.ndarray]:
-    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415 (as above)
-
-    return components_of_graph(graph, directed=False)
 
 
 @dataclass(frozen=True)

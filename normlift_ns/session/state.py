@@ -197,11 +197,10 @@ class History(Generic[T]):
 # Request tokens that discard stale results: a number per user that increases with every request.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RequestToken:
     """Token of one request."""
 
-    number: int
     description: str
     """Description of the request, shown while it runs."""
 
@@ -217,38 +216,36 @@ class RequestTokens:
     """
 
     _lock: Lock = field(default_factory=Lock, repr=False)
-    _last: RequestToken = RequestToken(0, "")
-    _running: bool = False
+    _running: RequestToken | None = None
 
     def start(self, description: str) -> RequestToken:
         """Return a new token; all earlier ones become stale."""
         with self._lock:
-            self._last, self._running = RequestToken(self._last.number + 1, description), True
-            return self._last
+            self._running = token = RequestToken(description)
+            return token
 
     def is_current(self, token: RequestToken) -> bool:
         """Return whether the result of a request is still wanted."""
-        with self._lock:
-            return self._running and token.number == self._last.number
+        return self._running is token
 
     def finish(self, token: RequestToken) -> bool:
         """End a request; return whether its result is still wanted."""
         with self._lock:
-            current = self._running and token.number == self._last.number
-            self._running = self._running and not current
+            current = self._running is token
+            self._running = None if current else self._running
             return current
 
     def cancel(self) -> bool:
         """Make the running request stale; return whether there was one."""
         with self._lock:
-            running, self._running = self._running, False
-            return running
+            running, self._running = self._running, None
+            return running is not None
 
     @property
     def busy(self) -> str:
         """Description of the running request; empty if there is none."""
-        with self._lock:
-            return self._last.description if self._running else ""
+        running = self._running
+        return "" if running is None else running.description
 
 
 # Job queue that keeps slow work out of viser's few threads, which serve all pages.
