@@ -18,7 +18,6 @@ from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
-from normlift_ns.data.checkpoint import Checkpoint
 from normlift_ns.data.extra_images import EXTRA_IMAGES_FILE
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import (
@@ -251,8 +250,6 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
             "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
             f"{type(scene).__name__}"
         )
-    if request.export is not None:
-        _refuse_equal_stems(scene.train.names)
     if source is None:
         source = precomputed_features(request.features, request.texts, scene.train.names)
         if len(request.queries) > 0:
@@ -298,7 +295,7 @@ def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTi
         field = replace(field, manifest={**field.manifest, "source": settings})
     seconds = {**stages.seconds, **result.seconds}
     with stages("write") as step:
-        question = _question(field, prepared.scene.gaussians.means, prepared.source, request.queries)
+        question = query_to_store(field, prepared.scene.gaussians.means, prepared.source, request.queries)
         exact = target.timestamp is not None
         run_dir = write_run(
             prepared.scene, field, prepared.run_dir,
@@ -312,20 +309,14 @@ def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTi
     )
 
 
-def _refuse_equal_stems(names: Sequence[str]) -> None:
-    """Raise if two images have the same stem, because LangSplat's format names files by it."""
-    stems = [Path(name).stem for name in names]
-    for i, stem in enumerate(stems):
-        if stem in stems[:i]:
-            raise InputError(
-                f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
-                "Rename one of the images, or lift without --export-langsplat."
-            )
-
-
-def _question(
+def query_to_store(
     field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
 ) -> Query | None:
+    """Return the query that a new run stores for these prompts; None without prompts.
+
+    Raises:
+        ValueError: the source encodes the prompts in another dimension than the features.
+    """
     if len(queries) == 0:
         return None
     length = source.text(queries).shape[1]
@@ -424,9 +415,11 @@ def _write_tensors(
     question: Query | None,
     texts: Mapping[str, Tensor] | None,
 ) -> None:
-    checkpoint = (
-        splatfacto_checkpoint(source) if isinstance(source, SplatScene) else _model_checkpoint(source.checkpoint)
-    )
+    if isinstance(source, SplatScene):
+        checkpoint = splatfacto_checkpoint(source)
+    else:  # without optimizers
+        model = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
+        checkpoint = {"step": source.checkpoint.step, "pipeline": model}
     path = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
     with atomic_file(path) as draft:
         torch.save(checkpoint, draft)
@@ -438,12 +431,6 @@ def _write_tensors(
     )
     if question is not None:
         save_query(field_dir, question)
-
-
-def _model_checkpoint(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return the step and the model of a checkpoint, without optimizers."""
-    pipeline = {f"_model.{name}": tensor for name, tensor in checkpoint.model.items()}
-    return {"step": checkpoint.step, "pipeline": pipeline}
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:

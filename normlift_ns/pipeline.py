@@ -347,13 +347,15 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
 
     Errors are suppressed here, because the lift itself will raise them again.
     """
+    x, y = torch.arange(camera.width), torch.arange(camera.height)
+    labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     sample = GaussianScene(*(array[:_WARM_UP_GAUSSIANS] for array in arrays))
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
             evidence = rasterize_evidence(
-                sample, [camera], [_quarters(camera)], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
+                sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
                 rasterize_mode=config.rasterize_mode, settings=config.settings, dtype=config.dtype,
                 weight_power=config.weight_power,
             )  # fmt: skip
@@ -369,9 +371,3 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
     thread = Thread(target=work, name="kernel warm-up", daemon=True)
     thread.start()
     return thread
-
-
-def _quarters(camera: Camera) -> torch.Tensor:
-    """Return labels of the four quarters of an image."""
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    return (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()

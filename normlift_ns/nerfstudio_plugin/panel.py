@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from nerfstudio.viewer.render_state_machine import RenderAction
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
+from viser import Icon, _gui_handles, _messages
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.analysis.vote_records import RecordedVotes
@@ -203,9 +204,6 @@ def prompt_table(state: State) -> str:
     return "\n".join(lines)
 
 
-# Results that the panel exports: the selection as a file, and the prompts stored in a run.
-
-
 class PanelHost(Protocol):
     """Interface of the model that the panel uses."""
 
@@ -224,47 +222,6 @@ class PanelHost(Protocol):
     def splat_parameters(self) -> TrainedSplat:
         """Return the trained Gaussians, for `write_splat_ply`."""
         ...
-
-
-def export_selection(host: PanelHost, state: State, mask: Bool[Tensor, " n"], stem: str) -> tuple[str, bytes, int]:
-    """Export Gaussians as a PLY file.
-
-    Args:
-        mask: the selection, or an object in it.
-        stem: name of the file without suffix.
-    Returns:
-        Name and content of the file, and its number of Gaussians.
-    Raises:
-        ValueError: nothing is selected, or no selected Gaussian is ever drawn.
-    """
-    if not bool(mask.any()):
-        raise InputError("Nothing is selected; there is nothing to download.")
-    splat = host.splat_parameters()
-    if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
-        raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
-    name = f"{safe_file_name(stem)}.ply"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        rows = write_splat_ply(path, splat, state.space.field, state.answer, keep=mask)
-        return name, path.read_bytes(), len(rows)
-
-
-def store_prompts(folder: Path | None, state: State, *, replace: bool) -> int:
-    """Store the prompts of a state in a run, in addition to the prompts stored there.
-
-    Args:
-        folder: folder of the semantic field; None: the run is not stored yet.
-        replace: replace the stored prompts.
-    Returns:
-        Number of prompts that the run stores now.
-    Raises:
-        ValueError: there are no prompts to store, or the stored prompts use another rule.
-    """
-    if state.query is None or folder is None:
-        raise InputError("No query yet; there is nothing to save.")
-    question = merge_queries(None if replace else load_query(folder), state.query)
-    save_query(folder, question)
-    return len(question.texts)
 
 
 # Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
@@ -364,7 +321,7 @@ class PanelWidgets:
                 self.refined = self._input(
                     "refined", self._gui.add_checkbox("Refined", True, hint="Use refined features.")
                 )
-        self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
+        self._gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=_SCRIPT))
 
     def reset_query_settings(self, negatives: str) -> None:
         """Reset the settings that apply to the next query.
@@ -436,8 +393,6 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
 
     viser adds new tabs at the end, and the viewer does not expose its tab group.
     """
-    from viser import Icon, _gui_handles  # noqa: PLC0415 (nerfstudio's commands without a viewer load this module)
-
     handles = gui._container_handle_from_id.values()
     tabs = [handle for handle in handles if isinstance(handle, _gui_handles.GuiTabHandle)]
     group = tabs[0]._parent if len(tabs) > 0 else gui.add_tab_group()
@@ -447,12 +402,6 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
         row.insert(0, row.pop())
     group._sync_with_client()
     return tab
-
-
-def _javascript(source: str) -> Any:
-    from viser import _messages  # noqa: PLC0415 (as above)
-
-    return _messages.RunJavascriptMessage(source=source)
 
 
 # Details of an answer in the panel: objects, histograms, and the training images behind it.
@@ -715,10 +664,18 @@ class SearchPanel(torch.nn.Module):
             history = cast("History[State]", self._history)
             self._show(history.do((actions.show_only if action == "only" else actions.hide)(history.now, row.mask)))
 
-    def _download(self, mask: Tensor, name: str, client: Any) -> None:
-        file, content, count = export_selection(self._host[0], cast(State, self.state), mask, name)
-        client.send_file_download(file, content)
-        self.show_message(f"Sent {file} with {count:,} Gaussians to the browser's downloads.")
+    def _download(self, mask: Tensor, stem: str, client: Any) -> None:
+        """Send Gaussians as a PLY file to a browser."""
+        if not bool(mask.any()):
+            raise InputError("Nothing is selected; there is nothing to download.")
+        splat, state = self._host[0].splat_parameters(), cast(State, self.state)
+        if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
+            raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
+        name = f"{safe_file_name(stem)}.ply"
+        with tempfile.TemporaryDirectory() as folder:
+            rows = write_splat_ply(Path(folder) / name, splat, state.space.field, state.answer, keep=mask)
+            client.send_file_download(name, (Path(folder) / name).read_bytes())
+        self.show_message(f"Sent {name} with {len(rows):,} Gaussians to the browser's downloads.")
 
     def _ask(self) -> None:
         """Ask the prompts in the text boxes."""
@@ -824,13 +781,17 @@ class SearchPanel(torch.nn.Module):
             self.show_message(describe_error(error)[0])
 
     def _save(self, state: State, *, replaces: bool) -> None:
+        """Store the prompts of a state in the run, beside or instead of those stored there."""
         try:
-            count = store_prompts(self._folder, state, replace=replaces)
+            if state.query is None or self._folder is None:
+                raise InputError("No query yet; there is nothing to save.")
+            question = merge_queries(None if replaces else load_query(self._folder), state.query)
+            save_query(self._folder, question)
         except InputError:
             self._offer_to_replace(state.query is not None)
             raise
         self._offer_to_replace(False)
-        prompts = "one prompt" if count == 1 else f"{count} prompts"
+        prompts = "one prompt" if len(question.texts) == 1 else f"{len(question.texts)} prompts"
         self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
     def _offer_to_replace(self, visible: bool) -> None:

@@ -15,6 +15,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from normlift_ns.api import query_to_store
 from normlift_ns.data.checkpoint import numpy_scalar_globals
 from normlift_ns.data.nerfstudio.config import check_components, check_lift_options
 from normlift_ns.data.nerfstudio.config_file import dataset_in_config
@@ -30,8 +31,7 @@ from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.panel import rerender_clients
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import make_query, save_query
+from normlift_ns.query.question import save_query
 from normlift_ns.query.text_encoder import encoder_settings
 
 if TYPE_CHECKING:
@@ -180,10 +180,8 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     folder = trainer.base_dir / FIELD_FOLDER
     files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
     field.save(folder, overwrite=True, beside=run_file_digests(folder, files))
-    question = None
-    if len(options.queries) > 0:
-        question = make_query(field, source.text, options.queries)
-        question = run_query(field, scene.gaussians.means, question).question
+    question = query_to_store(field, scene.gaussians.means, source, options.queries)
+    if question is not None:
         save_query(folder, question)
     model: Any = trainer.config.pipeline.model
     model.semantics = Path(FIELD_FOLDER)

@@ -86,20 +86,9 @@ def make_query(
     Raises:
         ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
-    if negatives is not None and not isinstance(negatives, Sequence):
-        raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
-    if isinstance(negatives, str):
-        raise InputError(
-            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
-        )
-    if rule not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    _check_rules(negatives, rule, threshold)
+    threshold = threshold if threshold is None or isinstance(threshold, str) else check_number("threshold", threshold)
     min_reliability = check_number("min_reliability", min_reliability)
-    if isinstance(threshold, str):
-        if threshold != "auto":
-            raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
-    elif threshold is not None:
-        threshold = check_number("threshold", threshold)
     check_bool("refined", refined)
     default = default_rule(field)
     if rule == "auto":
@@ -120,6 +109,19 @@ def make_query(
         refined=refined,
         encoder=encoder_digest(field.manifest),
     )
+
+
+def _check_rules(negatives: object, rule: str, threshold: object) -> None:
+    if negatives is not None and not isinstance(negatives, Sequence):
+        raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
+    if isinstance(negatives, str):
+        raise InputError(
+            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
+        )
+    if rule not in ("auto", *RELEVANCY_RULES):
+        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if isinstance(threshold, str) and threshold != "auto":
+        raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
 
 # Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.

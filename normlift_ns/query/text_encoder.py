@@ -187,10 +187,8 @@ def _options(field: HasManifest) -> SourceOptions:
             "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
             "(--text-vectors), or lift again with texts"
         )
-    encoder = (
-        "open_clip" if stored["encoder"] == PRECOMPUTED else stored["encoder"]
-    )  # a placeholder that is never loaded
-    return SourceOptions(**{**stored, "encoder": encoder})
+    placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
+    return SourceOptions(**{**stored, **placeholder})
 
 
 def encoder_name(field: HasManifest) -> str | None:

@@ -129,8 +129,8 @@ class History(Generic[T]):
     """States in chronological order, and the index of the current one.
 
     >>> history = History.of("a").do("b").do("c").undo()
-    >>> history.now, history.undo().now, history.redo().now, history.do("d").can_redo
-    ('b', 'a', 'c', False)
+    >>> history.now, history.undo().now, history.redo().now, history.do("d").redo().now
+    ('b', 'a', 'c', 'd')
     """
 
     states: tuple[T, ...]
@@ -151,16 +151,6 @@ class History(Generic[T]):
     def now(self) -> T:
         """The current state."""
         return self.states[self.index]
-
-    @property
-    def can_undo(self) -> bool:
-        """True if there is an earlier state."""
-        return self.index > 0
-
-    @property
-    def can_redo(self) -> bool:
-        """True if there is a later state, after an undo."""
-        return self.index < len(self.states) - 1
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
         """Make a new state current, and drop undone ones. The state that is current already adds no step.
