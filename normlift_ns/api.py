@@ -125,8 +125,8 @@ def lift_run(
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
     request = LiftRequest(
         open_scene=scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
-        lift=lift, queries=queries, target=RunTarget(output_dir, timestamp, overwrite), check=check, device=device,
-        export=export, report=report, say=say,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
+        device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
 
@@ -140,30 +140,6 @@ def scene_opener(
     return partial(open_scene, config_or_scene, data=data, load_step=load_step)
 
 
-@dataclass(frozen=True)
-class RunTarget:
-    """Directory of a new run."""
-
-    output_dir: str | Path | None = None
-    """Output folder; None: that of the trained run."""
-    timestamp: str | None = None
-    """Name of the run directory; None: the current time, with a number if such a run exists."""
-    overwrite: bool = False
-    """Replace a run directory of that name."""
-
-    def __post_init__(self) -> None:
-        check_bool("overwrite", self.overwrite)
-        if self.output_dir is not None:
-            check_path("output_dir", self.output_dir)
-        if self.timestamp is not None:
-            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
-
-    def directory(self, scene: NerfstudioScene | SplatScene) -> Path:
-        """Return the directory of a run lifted from this scene."""
-        folder = scene.runs_dir if self.output_dir is None else check_path("output_dir", self.output_dir)
-        return run_directory(folder, scene.name, self.timestamp)
-
-
 @dataclass(frozen=True, kw_only=True)
 class LiftRequest:
     """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
@@ -175,7 +151,9 @@ class LiftRequest:
     texts: Mapping[str, Float[Tensor, " d"]] | None = None
     lift: LiftOptions | None = None
     queries: Sequence[str] = ()
-    target: RunTarget = RunTarget()
+    output_dir: str | Path | None = None
+    timestamp: str | None = None
+    overwrite: bool = False
     check: bool = True
     device: str = "auto"
     export: FeatureExport | None = None
@@ -189,6 +167,11 @@ class LiftRequest:
             raise InputError("features replace source; pass only one of the two")
         check_prompt_list("queries", self.queries)
         check_bool("check", self.check)
+        check_bool("overwrite", self.overwrite)
+        if self.output_dir is not None:
+            check_path("output_dir", self.output_dir)
+        if self.timestamp is not None:
+            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
         for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
@@ -254,14 +237,16 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
         source = precomputed_features(request.features, request.texts, scene.train.names)
         if len(request.queries) > 0:
             source.text(request.queries)
-    return PreparedLift(request, scene, source, options, device, request.target.directory(scene))
+    folder = scene.runs_dir if request.output_dir is None else check_path("output_dir", request.output_dir)
+    run_dir = run_directory(folder, scene.name, request.timestamp)
+    return PreparedLift(request, scene, source, options, device, run_dir)
 
 
 def check_target(prepared: PreparedLift) -> None:
     """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
     complete_interrupted_lifts(prepared.run_dir)
-    if prepared.request.target.timestamp is not None:
-        refuse_existing_run(prepared.run_dir, prepared.request.target.overwrite)
+    if prepared.request.timestamp is not None:
+        refuse_existing_run(prepared.run_dir, prepared.request.overwrite)
 
 
 def announce(prepared: PreparedLift) -> None:
@@ -289,17 +274,17 @@ def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
 
 def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTimer) -> LiftedRun:
     """Write the run of a finished lift, and return it."""
-    request, field, target = prepared.request, result.field, prepared.request.target
+    request, field = prepared.request, result.field
     if request.features is None:
         settings = source_settings(prepared.options, prepared.device)
         field = replace(field, manifest={**field.manifest, "source": settings})
     seconds = {**stages.seconds, **result.seconds}
     with stages("write") as step:
         question = query_to_store(field, prepared.scene.gaussians.means, prepared.source, request.queries)
-        exact = target.timestamp is not None
         run_dir = write_run(
             prepared.scene, field, prepared.run_dir,
-            question=question, text_embeddings=prepared.texts, overwrite=target.overwrite, exact_name=exact,
+            question=question, text_embeddings=prepared.texts, overwrite=request.overwrite,
+            exact_name=request.timestamp is not None,
         )  # fmt: skip
         field = field.to("cpu")
         step()
@@ -375,17 +360,29 @@ def write_run(
     with draft_directory(run_dir) as folder:
         if isinstance(source, SplatScene):
             save_splat(folder, source)
-            transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
+            transform, scale, checkpoint = torch.eye(4)[:3], 1.0, splatfacto_checkpoint(source)
+            config_in: Callable[[Path], TrainerConfig] = partial(splat_config, source)
         else:
             if len(source.extra_frames) > 0:
                 write_transforms(folder / EXTRA_IMAGES_FILE, source.extra_frames, ())
-            transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
-        write_text_file(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
-        _write_tensors(folder, source, field, question, text_embeddings)
+            transform, scale = source.dataparser_transform, source.dataparser_scale
+            model = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
+            checkpoint = {"step": source.checkpoint.step, "pipeline": model}
+            config_in = partial(_lifted_config, source)
+        facts = {"transform": transform.tolist(), "scale": scale}
+        write_text_file(folder / "dataparser_transforms.json", json.dumps(facts, indent=4))
+        stored = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
+        with atomic_file(stored) as draft:
+            torch.save(checkpoint, draft)
+        field_dir = folder / FIELD_FOLDER
+        if text_embeddings:
+            write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, text_embeddings)
+        files = [stored, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")]
+        field.save(field_dir, beside=run_file_digests(field_dir, files))
+        if question is not None:
+            save_query(field_dir, question)
         for path in (run_dir,) if exact_name else numbered_paths(run_dir):
-            is_splat = isinstance(source, SplatScene)
-            config = splat_config(source, path) if is_splat else _lifted_config(source, path)
-            write_text_file(folder / "config.yml", add_digest_comment(dump_config(config)), overwrite=True)
+            write_text_file(folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True)
             if commit_directory(folder, path, overwrite=overwrite and exact_name):
                 return path
     refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
@@ -406,31 +403,6 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
     config.pipeline.datamanager.cache_images = "gpu"
     return config
-
-
-def _write_tensors(
-    folder: Path,
-    source: NerfstudioScene | SplatScene,
-    field: SemanticField,
-    question: Query | None,
-    texts: Mapping[str, Tensor] | None,
-) -> None:
-    if isinstance(source, SplatScene):
-        checkpoint = splatfacto_checkpoint(source)
-    else:  # without optimizers
-        model = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
-        checkpoint = {"step": source.checkpoint.step, "pipeline": model}
-    path = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
-    with atomic_file(path) as draft:
-        torch.save(checkpoint, draft)
-    field_dir = folder / FIELD_FOLDER
-    if texts:
-        write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, texts)
-    field.save(
-        field_dir, beside=run_file_digests(field_dir, [path, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")])
-    )
-    if question is not None:
-        save_query(field_dir, question)
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:

@@ -159,7 +159,7 @@ class NormLift:
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import LiftRequest, RunTarget, run_lift, scene_opener  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.api import LiftRequest, run_lift, scene_opener  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
@@ -179,7 +179,9 @@ class NormLift:
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
-                target=RunTarget(self.output_dir, self.timestamp, self.overwrite),
+                output_dir=self.output_dir,
+                timestamp=self.timestamp,
+                overwrite=self.overwrite,
                 check=self.check,
                 device=self.device,
                 export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -238,53 +238,32 @@ class Finding:
         return SelectionStats.of(mask, self.answer.means, scalars.reliability, scalars.weight)
 
 
-@dataclass(frozen=True, eq=False)
-class SelectionStats:
-    """Summary numbers of M selected Gaussians of N.
+class SelectionStats(NamedTuple):
+    """Summary numbers of selected Gaussians.
 
     Positions are in units of the scene, and None if nothing is selected. Means are weighted by W_j, the total weight of
     Gaussian j over all views.
     """
 
-    total: int
-    """N, the number of Gaussians of the scene."""
-    means: Float[np.ndarray, "m 3"]
-    reliability: Float[np.ndarray, " m"]
-    weight: Float[np.ndarray, " m"]
-    """W_j of the selected Gaussians."""
+    fraction: float
+    """Fraction of all Gaussians that is selected, in 0..1."""
+    centroid: list[float] | None
+    """Weighted mean of the selected centers, [x, y, z]."""
+    extent: list[float] | None
+    """Size of the box that holds the central 90 % of the selected centers along each axis."""
+    mean_reliability: float | None
+    """Weighted mean of R over the selected Gaussians."""
 
     @staticmethod
     def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:
-        """Select from arrays or tensors of all Gaussians by a mask."""
-        return SelectionStats(len(mask), *(as_numpy(x[mask]) for x in (means, reliability, weight)))
-
-    @property
-    def fraction(self) -> float:
-        """Fraction of all Gaussians that is selected, in 0..1."""
-        return len(self.means) / self.total
-
-    @property
-    def centroid(self) -> list[float] | None:
-        """Weighted mean of the selected centers, [x, y, z]."""
-        return (self._normalized_weight @ self.means.astype(np.float64)).tolist() if len(self.means) > 0 else None
-
-    @property
-    def extent(self) -> list[float] | None:
-        """Size of the box that holds the central 90 % of the selected centers along each axis."""
-        if len(self.means) == 0:
-            return None
-        low, high = np.quantile(self.means.astype(np.float64), _CENTRAL, axis=0)
-        return (high - low).tolist()
-
-    @property
-    def mean_reliability(self) -> float | None:
-        """Weighted mean of R over the selected Gaussians."""
-        return float(self._normalized_weight @ self.reliability.astype(np.float64)) if len(self.means) > 0 else None
-
-    @cached_property
-    def _normalized_weight(self) -> Float[np.ndarray, " m"]:
-        weight = self.weight.astype(np.float64) + 1e-12
-        return weight / weight.sum()
+        """Summarize a selection, from arrays or tensors of all Gaussians."""
+        centers, reliability, weight = (as_numpy(x[mask]).astype(np.float64) for x in (means, reliability, weight))
+        fraction = len(centers) / len(mask)
+        if len(centers) == 0:
+            return SelectionStats(fraction, None, None, None)
+        share = (weight + 1e-12) / (weight + 1e-12).sum()
+        low, high = np.quantile(centers, _CENTRAL, axis=0)
+        return SelectionStats(fraction, (share @ centers).tolist(), (high - low).tolist(), float(share @ reliability))
 
 
 def run_query(field: QueryField, means: Any, question: Query) -> Answer:
