@@ -7,6 +7,7 @@ import operator
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -409,7 +410,10 @@ class LiftedRun:
         Raises:
             ValueError: `part` is not a part of this run.
         """
-        mask = part.mask if isinstance(part, Answer | Finding) else _as_tensor(part)
+        mask = part.mask if isinstance(part, Answer | Finding) else None
+        if mask is None:
+            with suppress(TypeError, ValueError, RuntimeError, OverflowError):
+                mask = torch.as_tensor(part)
         if mask is None or mask.dtype != torch.bool or mask.shape != (len(self.field),):
             actual = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
             raise InputError(
@@ -470,14 +474,6 @@ class LiftedRun:
 def _answer_of(part: Any) -> Answer | None:
     """Return the answer of a part; None for a mask."""
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
-
-
-def _as_tensor(values: Any) -> Tensor | None:
-    """Return values as a tensor; None if that is impossible."""
-    try:
-        return torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        return None
 
 
 def load_field(

@@ -162,14 +162,12 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     else:
         lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}")
     faint = int((selection & ~drawn.to(selection.device)).sum())
-    if faint > 0:
-        lines.append(f"{faint:,} of them are never drawn or exported (opacity below 1/255).")
+    counts = [(faint, "of them are never drawn or exported (opacity below 1/255).")]
     if state.answer is not None and state.prompts_select and state.shown is None:
         several = int((state.answer.selected.sum(dim=1) > 1).sum())
-        if several > 0:
-            lines.append(f"{several:,} of them are selected by several prompts.")
-    if hidden > 0:
-        lines.append(f"{hidden:,} Gaussians are hidden.")
+        counts.append((several, "of them are selected by several prompts."))
+    counts.append((hidden, "Gaussians are hidden."))
+    lines += [f"{count:,} {text}" for count, text in counts if count > 0]
     if state.warning:
         lines.append(escape_mdx(state.warning))
     return "\n\n".join(lines)
