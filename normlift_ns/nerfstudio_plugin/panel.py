@@ -25,13 +25,12 @@ from normlift_ns.analysis.vote_records import RecordedVotes
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.relevancy import RELEVANCY_RULES
-from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
-from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.encoders.registry import LazyTextEncoder
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT, TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
+from normlift_ns.lifted_run import open_scene
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for
@@ -412,7 +411,7 @@ _DELAY = 0.1
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:
     """Return the explanations of a lifted run.
 
-    The run is opened a second time at the first explanation, without nerfstudio and with its images.
+    The run is opened a second time at the first explanation, with its images.
 
     Args:
         folder: folder of the semantic field; None: the run is not stored yet.
@@ -422,21 +421,10 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
     def votes() -> RecordedVotes:
         if folder is None or field is None:
             raise InputError("The run is not stored yet, so the images behind the selection are unknown.")
-        run = folder.parent
-        scene = (
-            open_saved_splat(run)
-            if is_saved_splat(run)
-            else load_nerfstudio_scene(run / "config.yml", make_nerfstudio_views=_no_aria)
-        )
-        return RecordedVotes(scene, field.to("cpu"), cache_folder(run))
+        scene = open_scene(folder.parent / "config.yml")
+        return RecordedVotes(scene, field.to("cpu"), cache_folder(folder.parent))
 
     return Explanation(votes)
-
-
-def _no_aria(*_: Any) -> Any:
-    raise InputError(
-        "Images of Aria cameras (FISHEYE624) cannot be shown here. Use ns-normlift-view or ns-normlift-query --why."
-    )
 
 
 def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:

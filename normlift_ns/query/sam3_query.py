@@ -83,17 +83,9 @@ class MaskEvidence:
     inside: Bool[Tensor, "q s"]
     """True for the cells inside the masks of each prompt."""
 
-    def answer(self, text: int, views: Sequence[int] | None = None) -> MaskResult:
-        """Lift the masks of one prompt.
-
-        Args:
-            text: index of the prompt.
-            views: indices of the views to use (default: all).
-        """
+    def answer(self, text: int) -> MaskResult:
+        """Lift the masks of the prompt with this index."""
         evidence, inside = self.evidence, self.inside[text]
-        if views is not None:
-            inside = inside[evidence.columns_of(views)]
-            evidence = evidence.select_views(views)
         column, weight = evidence.rows.column.long(), evidence.rows.weight.double()
         row, view = evidence.rows.row_index(), evidence.region_view[column].long()
         within = inside[column]
