@@ -26,7 +26,6 @@ from normlift_ns.data.nerfstudio.config_classes import (
     NormLiftModelConfig,
     TrainerConfig,
     VanillaPipelineConfig,
-    ViewerConfig,
 )
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatScene, save_splat, splatfacto_checkpoint
@@ -186,25 +185,13 @@ class PreparedLift:
     scene: NerfstudioScene | SplatScene
     source: FeatureSource
     options: SourceOptions
+    lift: LiftOptions
     device: str
     run_dir: Path
-
-    @property
-    def lift(self) -> LiftOptions:
-        """Options of the lift."""
-        return self.request.lift or LiftOptions()
-
-    @property
-    def texts(self) -> Mapping[str, Float[Tensor, " d"]] | None:
-        """Prompts of the user's own features, with their embeddings."""
-        return self.source.texts if isinstance(self.source, PrecomputedFeatures) else None
-
-    @property
-    def encoder(self) -> dict[str, Any]:
-        """Options that queries need to encode prompts as the features were encoded."""
-        if self.request.features is None:
-            return encoder_settings(self.options)
-        return precomputed_settings(TEXT_EMBEDDINGS_FILE if self.texts else None)
+    texts: Mapping[str, Float[Tensor, " d"]] | None
+    """Prompts of the user's own features, with their embeddings."""
+    encoder: Mapping[str, Any]
+    """Options that queries need to encode prompts as the features were encoded."""
 
 
 def run_lift(request: LiftRequest) -> LiftedRun:
@@ -239,7 +226,11 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
             source.text(request.queries)
     folder = scene.runs_dir if request.output_dir is None else check_path("output_dir", request.output_dir)
     run_dir = run_directory(folder, scene.name, request.timestamp)
-    return PreparedLift(request, scene, source, options, device, run_dir)
+    texts = source.texts if isinstance(source, PrecomputedFeatures) else None
+    own = precomputed_settings(TEXT_EMBEDDINGS_FILE if texts else None)
+    encoder = encoder_settings(options) if request.features is None else own
+    lift = request.lift or LiftOptions()
+    return PreparedLift(request, scene, source, options, lift, device, run_dir, texts, encoder)
 
 
 def check_target(prepared: PreparedLift) -> None:
@@ -442,6 +433,5 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
         relative_model_dir=Path(CHECKPOINT_DIR),
         data=cameras,
         pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )

@@ -568,17 +568,13 @@ def open_run(
     check_run(folder)
     device, scene = choose_device(device), open_scene(load_config, data=data)
     loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
-    changed = changed_cameras_warning(loaded, scene)
-    for remark in (*scene.remarks, *([] if changed is None else [changed])):
+    for remark in (*scene.remarks, *_changed_cameras(loaded, scene)):
         warnings.warn(remark, stacklevel=2)
     return LiftedRun(folder, scene, with_text_source(loaded, text_embeddings=vectors, template=text_template), device)
 
 
-def changed_cameras_warning(field: SemanticField, scene: Scene) -> str | None:
-    """Return a warning if the cameras differ from those of the lift.
-
-    Return None if they do not, or if the field does not record its cameras.
-    """
+def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
+    """Return a warning if the cameras differ from those that the field records of the lift."""
     changed = [
         split
         for split, key, views in (
@@ -588,9 +584,9 @@ def changed_cameras_warning(field: SemanticField, scene: Scene) -> str | None:
         if (recorded := field.manifest.get(key)) is not None and cameras_differ(recorded, camera_summary(views.cameras))
     ]
     if len(changed) == 0:
-        return None
-    return (
+        return []
+    return [
         f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
         "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
         "Restore the dataset, give its path with --data, or lift again"
-    )
+    ]

@@ -104,21 +104,17 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
                 "(--text-vectors)"
             )
         return vectors
-    kind = _kind(options.encoder)
-    recorded = _identity(field.manifest.get("features"))
-    if kind.texts is not None:
-        return kind.texts(options, device, cache, recorded)
-    return _cached_texts(kind, options, device, cache, recorded)
-
-
-def _kind(name: str) -> EncoderKind:
     try:
-        return encoder_kind(name)
+        kind = encoder_kind(options.encoder)
     except InputError as error:
         raise InputError(
             f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
             "a file of text vectors from that encoder (--text-vectors)"
         ) from None
+    recorded = _identity(field.manifest.get("features"))
+    if kind.texts is not None:
+        return kind.texts(options, device, cache, recorded)
+    return _cached_texts(kind, options, device, cache, recorded)
 
 
 def _cached_texts(

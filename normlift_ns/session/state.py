@@ -280,9 +280,8 @@ class JobQueue:
 
     def close(self) -> None:
         """Discard the waiting jobs and accept no further ones."""
-        with self._lock:
-            self._ended = True
-            self._jobs.clear()
+        self._ended = True
+        self.clear()
 
     def _run(self) -> None:
         while True:
