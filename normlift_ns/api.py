@@ -32,6 +32,7 @@ from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatSc
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.encoders.langsplat import check_unique_stems
 from normlift_ns.encoders.precomputed import PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
@@ -220,6 +221,8 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
             "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
             f"{type(scene).__name__}"
         )
+    if request.export is not None:
+        check_unique_stems(scene.train.names)
     if source is None:
         source = precomputed_features(request.features, request.texts, scene.train.names)
         if len(request.queries) > 0:
