@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from normlift_ns.analysis.explain import Why as Why
     from normlift_ns.analysis.objects import Floaters as Floaters
     from normlift_ns.api import lift_run as lift_run
-    from normlift_ns.api import open_run as open_run
-    from normlift_ns.api import open_scene as open_scene
     from normlift_ns.core.consensus import Consensus as Consensus
     from normlift_ns.core.consensus import consensus as consensus
     from normlift_ns.core.evidence import Evidence as Evidence
@@ -34,6 +32,8 @@ if TYPE_CHECKING:
     from normlift_ns.evaluation.coverage import coverage as coverage
     from normlift_ns.evaluation.studies import refine_variant as refine_variant
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
+    from normlift_ns.lifted_run import open_run as open_run
+    from normlift_ns.lifted_run import open_scene as open_scene
     from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
     from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
     from normlift_ns.options import LiftOptions as LiftOptions
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from normlift_ns.options import SplatOptions as SplatOptions
     from normlift_ns.query.engine import Answer as Answer
     from normlift_ns.query.engine import Finding as Finding
-    from normlift_ns.query.histogram import Histogram as Histogram
+    from normlift_ns.query.engine import Histogram as Histogram
     from normlift_ns.rasterization.rasterize import Contributors as Contributors
     from normlift_ns.rasterization.rasterize import contributors as contributors
     from normlift_ns.rasterization.rasterize import rasterize_evidence as rasterize_evidence
@@ -53,72 +53,30 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _HOMES = {
-    "normlift_ns.analysis.explain": ("Why",),
-    "normlift_ns.analysis.objects": ("Floaters",),
-    "normlift_ns.api": (
-        "lift_run",
-        "open_run",
-        "open_scene",
-    ),
-    "normlift_ns.core.consensus": (
-        "Consensus",
-        "consensus",
-    ),
-    "normlift_ns.core.evidence": ("Evidence",),
-    "normlift_ns.core.field": ("SemanticField",),
-    "normlift_ns.core.gaussians": (
-        "Camera",
-        "GaussianScene",
-    ),
-    "normlift_ns.core.lift": (
-        "Lifted",
-        "Scalars",
-        "lift",
-    ),
-    "normlift_ns.core.neighbors": (
-        "Neighbors",
-        "nearest_neighbors",
-    ),
-    "normlift_ns.core.refine": (
-        "refine",
-        "unsupported",
-    ),
-    "normlift_ns.core.relevancy": ("relevancy",),
-    "normlift_ns.core.scene": (
-        "Scene",
-        "View",
-    ),
-    "normlift_ns.data.open_splat": ("open_splat",),
-    "normlift_ns.errors": ("InputError",),
-    "normlift_ns.evaluation.coverage": (
-        "Coverage",
-        "coverage",
-    ),
-    "normlift_ns.evaluation.studies": ("refine_variant",),
-    "normlift_ns.lifted_run": ("LiftedRun",),
-    "normlift_ns.options": (
-        "BACKGROUND_WORDS",
-        "CANONICAL_NEGATIVES",
-        "LiftOptions",
-        "RefineConfig",
-        "SourceOptions",
-        "SplatOptions",
-    ),
-    "normlift_ns.query.engine": (
-        "Answer",
-        "Finding",
-    ),
-    "normlift_ns.query.histogram": ("Histogram",),
-    "normlift_ns.rasterization.rasterize": (
-        "Contributors",
-        "contributors",
-        "rasterize_evidence",
-        "render",
-    ),
-    "normlift_ns.rasterization.settings": ("RasterSettings",),
+    "analysis.explain": "Why",
+    "analysis.objects": "Floaters",
+    "api": "lift_run",
+    "core.consensus": "Consensus consensus",
+    "core.evidence": "Evidence",
+    "core.field": "SemanticField",
+    "core.gaussians": "Camera GaussianScene",
+    "core.lift": "Lifted Scalars lift",
+    "core.neighbors": "Neighbors nearest_neighbors",
+    "core.refine": "refine unsupported",
+    "core.relevancy": "relevancy",
+    "core.scene": "Scene View",
+    "data.open_splat": "open_splat",
+    "errors": "InputError",
+    "evaluation.coverage": "Coverage coverage",
+    "evaluation.studies": "refine_variant",
+    "lifted_run": "LiftedRun open_run open_scene",
+    "options": "BACKGROUND_WORDS CANONICAL_NEGATIVES LiftOptions RefineConfig SourceOptions SplatOptions",
+    "query.engine": "Answer Finding Histogram",
+    "rasterization.rasterize": "Contributors contributors rasterize_evidence render",
+    "rasterization.settings": "RasterSettings",
 }
 """Public names by the module that defines them."""
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_HOME = {name: f"normlift_ns.{module}" for module, names in _HOMES.items() for name in names.split()}
 
 __all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

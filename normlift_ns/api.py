@@ -1,131 +1,67 @@
-"""Python API: open a trained scene or a lifted run, and lift features."""
+"""Lifting into a new run: the function `lift_run`, its request and its checks, and the directory that it writes."""
 
 from __future__ import annotations
 
-import os
-import warnings
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.device import choose_device
-from normlift_ns.core.field import SemanticField
-from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
-from normlift_ns.data.extra_images import add_stored_images
-from normlift_ns.data.images import SplitViews
-from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
-from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
+from normlift_ns.core.device import choose_device, init_cuda
+from normlift_ns.core.field import SemanticField, fingerprint
+from normlift_ns.core.scene import Scene
+from normlift_ns.data.alignment import alignment_warning, measure_alignment
+from normlift_ns.data.extra_images import EXTRA_IMAGES_FILE
+from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
+from normlift_ns.data.nerfstudio.config_classes import (
+    FullImageDatamanagerConfig,
+    NerfstudioDataParserConfig,
+    NormLiftModelConfig,
+    TrainerConfig,
+    VanillaPipelineConfig,
+)
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatScene, save_splat, splatfacto_checkpoint
+from normlift_ns.data.transforms import write_transforms
+from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
+from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport
-from normlift_ns.io.atomic import complete_interrupted_writes
-from normlift_ns.io.run_dir import check_run, recorded_gsplat_version
-from normlift_ns.lifted_run import LiftedRun, load_field
-from normlift_ns.options import LiftOptions, SourceOptions, check_number, check_path
-from normlift_ns.pipeline import LiftRequest, RunTarget, run_lift
-from normlift_ns.progress import ProgressCallback
-from normlift_ns.query.text_encoder import with_text_source
-
-
-def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
-    """Open a trained splatfacto run or a lifted run, from any working directory.
-
-    For a splat without a nerfstudio run, see `open_splat`.
-
-    Args:
-        load_config: config.yml of the run.
-        data: current path of the dataset, if it was moved.
-        load_step: step of the checkpoint, the last one if None.
-    Raises:
-        FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
-        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
-            of the run.
-
-    >>> scene = open_scene(config)
-    >>> len(scene.train), scene.train[1].image.shape
-    (12, torch.Size([120, 160, 3]))
-    """
-    config = check_path("load_config", load_config)
-    data = None if data is None else check_path("data", data)
-    load_step = None if load_step is None else check_number("load_step", load_step, int)
-    run_dir = Path(os.path.abspath(config)).parent
-    if not run_dir.exists():
-        complete_interrupted_writes(run_dir.parent)  # a lift was killed while it replaced the run
-    if config.is_file() and is_saved_splat(run_dir):
-        scene = open_saved_splat(run_dir, data=data, load_step=load_step)
-    else:
-        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
-        scene = add_stored_images(scene, run_dir)
-    rules = recorded_gsplat_version(run_dir)
-    return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
-
-
-def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
-    from normlift_ns.nerfstudio_plugin.views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
-
-    return nerfstudio_views(*run)
-
-
-def open_run(
-    load_config: str | Path,
-    *,
-    data: str | Path | None = None,
-    device: str = "auto",
-    text_vectors: str | Path | None = None,
-    text_template: str | None = None,
-) -> LiftedRun:
-    """Open a lifted run, from any working directory.
-
-    Args:
-        load_config: config.yml of the run.
-        data: current path of the dataset, if it was moved.
-        device: device of the text encoder (auto, cpu or cuda).
-        text_vectors: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
-        text_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
-            lift.
-    Raises:
-        FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
-
-    >>> run = open_run(config)
-    >>> answer = run.ask("red", "yellow", min_reliability=0.3)
-    >>> answer["yellow"].objects[0].size > 20
-    True
-    """
-    folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
-    vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
-    check_run(folder)
-    device, scene = choose_device(device), open_scene(load_config, data=data)
-    loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
-    changed = changed_cameras_warning(loaded, scene)
-    for remark in (*scene.remarks, *([] if changed is None else [changed])):
-        warnings.warn(remark, stacklevel=2)
-    return LiftedRun(folder, scene, with_text_source(loaded, text_embeddings=vectors, template=text_template), device)
-
-
-def changed_cameras_warning(field: SemanticField, scene: Scene) -> str | None:
-    """Return a warning if the cameras differ from those of the lift.
-
-    Return None if they do not, or if the field does not record its cameras.
-    """
-    changed = [
-        split
-        for split, key, views in (
-            ("training", "cameras", scene.train),
-            ("held-out", "cameras_held_out", scene.held_out),
-        )
-        if (recorded := field.manifest.get(key)) is not None and cameras_differ(recorded, camera_summary(views.cameras))
-    ]
-    if len(changed) == 0:
-        return None
-    return (
-        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
-        "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
-        "Restore the dataset, give its path with --data, or lift again"
-    )
+from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
+from normlift_ns.io.run_dir import (
+    FIELD_FOLDER,
+    TEXT_EMBEDDINGS_FILE,
+    add_digest_comment,
+    cache_folder,
+    complete_interrupted_lifts,
+    refuse_existing_run,
+    run_directory,
+    run_file_digests,
+)
+from normlift_ns.lifted_run import LiftedRun, open_scene, resolve_field_paths
+from normlift_ns.options import (
+    CANONICAL_NEGATIVES,
+    LiftOptions,
+    SourceOptions,
+    check_bool,
+    check_path,
+    check_prompt_list,
+)
+from normlift_ns.pipeline import LiftResult, lift_scene, resolve_gsplat_version
+from normlift_ns.progress import ProgressCallback, StageTimer
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, make_query, save_query
+from normlift_ns.query.text_encoder import encoder_settings, precomputed_settings
+from normlift_ns.rasterization.settings import RasterSettings
 
 
 def lift_run(
@@ -188,8 +124,8 @@ def lift_run(
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
     request = LiftRequest(
         open_scene=scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
-        lift=lift, queries=queries, target=RunTarget(output_dir, timestamp, overwrite), check=check, device=device,
-        export=export, report=report, say=say,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
+        device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
 
@@ -201,3 +137,303 @@ def scene_opener(
     if not isinstance(config_or_scene, str | Path):
         return lambda: config_or_scene
     return partial(open_scene, config_or_scene, data=data, load_step=load_step)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftRequest:
+    """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
+
+    open_scene: Callable[[], Scene]
+    """Opens the trained scene. It is called after all checks that do not need the scene."""
+    source: SourceOptions | None = None
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None
+    texts: Mapping[str, Float[Tensor, " d"]] | None = None
+    lift: LiftOptions | None = None
+    queries: Sequence[str] = ()
+    output_dir: str | Path | None = None
+    timestamp: str | None = None
+    overwrite: bool = False
+    check: bool = True
+    device: str = "auto"
+    export: FeatureExport | None = None
+    report: ProgressCallback = lambda stage, done, total: None
+    say: Callable[[str], None] = lambda text: None
+
+    def __post_init__(self) -> None:
+        if self.features is None and self.texts is not None:
+            raise InputError("texts are for your own features; pass features, too, or omit texts")
+        if self.features is not None and self.source is not None:
+            raise InputError("features replace source; pass only one of the two")
+        check_prompt_list("queries", self.queries)
+        check_bool("check", self.check)
+        check_bool("overwrite", self.overwrite)
+        if self.output_dir is not None:
+            check_path("output_dir", self.output_dir)
+        if self.timestamp is not None:
+            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
+        for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
+
+
+@dataclass(frozen=True)
+class PreparedLift:
+    """Lift whose scene is open and whose inputs are checked."""
+
+    request: LiftRequest
+    scene: NerfstudioScene | SplatScene
+    source: FeatureSource
+    options: SourceOptions
+    lift: LiftOptions
+    device: str
+    run_dir: Path
+    texts: Mapping[str, Float[Tensor, " d"]] | None
+    """Prompts of the user's own features, with their embeddings."""
+    encoder: Mapping[str, Any]
+    """Options that queries need to encode prompts as the features were encoded."""
+
+
+def run_lift(request: LiftRequest) -> LiftedRun:
+    """Lift features onto a trained scene, write the lifted run, and return it."""
+    prepared, stages = prepare_lift(request), StageTimer(request.report)
+    check_target(prepared)
+    announce(prepared)
+    check_alignment(prepared, stages)
+    result = lift_scene(
+        prepared.scene, prepared.source, prepared.lift, cache_folder(prepared.run_dir), device=prepared.device,
+        encoder=prepared.encoder, export=request.export, report=request.report,
+    )  # fmt: skip
+    return write_lifted_run(prepared, result, stages)
+
+
+def prepare_lift(request: LiftRequest) -> PreparedLift:
+    """Load encoders, open the scene, and name the new run; nothing is written."""
+    device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
+    init_cuda(device)
+    source = None if request.features is not None else make_source(options, device)  # raises before the scene loads
+    if source is not None and len(request.queries) > 0:
+        source.text(request.queries)
+    scene = request.open_scene()
+    if not isinstance(scene, NerfstudioScene | SplatScene):
+        raise TypeError(
+            "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
+            f"{type(scene).__name__}"
+        )
+    if request.export is not None:
+        check_unique_stems(scene.train.names)
+    if source is None:
+        source = precomputed_features(request.features, request.texts, scene.train.names)
+        if len(request.queries) > 0:
+            source.text(request.queries)
+    folder = scene.runs_dir if request.output_dir is None else check_path("output_dir", request.output_dir)
+    run_dir = run_directory(folder, scene.name, request.timestamp)
+    texts = source.texts if isinstance(source, PrecomputedFeatures) else None
+    own = precomputed_settings(TEXT_EMBEDDINGS_FILE if texts else None)
+    encoder = encoder_settings(options) if request.features is None else own
+    lift = request.lift or LiftOptions()
+    return PreparedLift(request, scene, source, options, lift, device, run_dir, texts, encoder)
+
+
+def check_target(prepared: PreparedLift) -> None:
+    """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
+    complete_interrupted_lifts(prepared.run_dir)
+    if prepared.request.timestamp is not None:
+        refuse_existing_run(prepared.run_dir, prepared.request.overwrite)
+
+
+def announce(prepared: PreparedLift) -> None:
+    """Report the size of the lift, and the warnings of the scene."""
+    scene, most, say = prepared.scene, prepared.lift.max_views, prepared.request.say
+    used = "" if most is None else f"{min(most, len(scene.train))} of "
+    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
+    for remark in scene.remarks:
+        say(f"Warning: {remark}")
+
+
+def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
+    """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
+    if not prepared.request.check:
+        return
+    scene = prepared.scene
+    with stages("check") as step:
+        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
+        match = measure_alignment(scene, settings, device=prepared.device)
+        warning = alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+        step()
+    if warning is not None:
+        prepared.request.say(f"Warning: {warning}")
+
+
+def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTimer) -> LiftedRun:
+    """Write the run of a finished lift, and return it."""
+    request, field = prepared.request, result.field
+    if request.features is None:
+        settings = source_settings(prepared.options, prepared.device)
+        field = replace(field, manifest={**field.manifest, "source": settings})
+    seconds = {**stages.seconds, **result.seconds}
+    with stages("write") as step:
+        question = query_to_store(field, prepared.scene.gaussians.means, prepared.source, request.queries)
+        run_dir = write_run(
+            prepared.scene, field, prepared.run_dir,
+            question=question, text_embeddings=prepared.texts, overwrite=request.overwrite,
+            exact_name=request.timestamp is not None,
+        )  # fmt: skip
+        field = field.to("cpu")
+        step()
+    seconds["write"] = stages.seconds["write"]
+    return LiftedRun(
+        run_dir, prepared.scene, resolve_field_paths(field, run_dir / FIELD_FOLDER), prepared.device, seconds
+    )
+
+
+def query_to_store(
+    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
+) -> Query | None:
+    """Return the query that a new run stores for these prompts; None without prompts.
+
+    Raises:
+        ValueError: the source encodes the prompts in another dimension than the features.
+    """
+    if len(queries) == 0:
+        return None
+    length = source.text(queries).shape[1]
+    if length != field.dimension:
+        raise InputError(
+            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; name the model "
+            "of the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+    negatives = None
+    if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet
+        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
+    return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
+
+
+# Directory of a lifted run: the files that stock nerfstudio loads, and the semantic field.
+
+
+def write_run(
+    source: NerfstudioScene | SplatScene,
+    field: SemanticField,
+    run_dir: Path,
+    *,
+    question: Query | None = None,
+    text_embeddings: Mapping[str, Tensor] | None = None,
+    overwrite: bool = False,
+    exact_name: bool = True,
+) -> Path:
+    """Write a lifted run, completely or not at all, and return its directory.
+
+    The directory holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
+    without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
+    checkpoint also has its cameras in transforms.json, and other settings for reopening it in splat.json.
+
+    Relative paths in the config of the source run stay relative. Stock ns-* commands therefore run from the directory
+    that the source run was trained in; ns-normlift commands run from any directory.
+
+    Args:
+        run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
+        question: query to render as relevancy_0, relevancy_1, …
+        text_embeddings: embeddings provided by the user, by prompt.
+        overwrite: replace an existing directory.
+        exact_name: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
+    Raises:
+        FileExistsError: the directory exists, `exact_name` is True and `overwrite` is False.
+        ValueError: the field was lifted from other Gaussians.
+        OSError: writing failed, for instance because the disk is full; no files are left then.
+    """
+    complete_interrupted_lifts(run_dir)
+    if exact_name:
+        refuse_existing_run(run_dir, overwrite)
+    if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
+        raise InputError(
+            f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
+            f"{source.checkpoint_path}; lift that checkpoint again."
+        )
+    with draft_directory(run_dir) as folder:
+        if isinstance(source, SplatScene):
+            save_splat(folder, source)
+            transform, scale, checkpoint = torch.eye(4)[:3], 1.0, splatfacto_checkpoint(source)
+            config_in: Callable[[Path], TrainerConfig] = partial(splat_config, source)
+        else:
+            if len(source.extra_frames) > 0:
+                write_transforms(folder / EXTRA_IMAGES_FILE, source.extra_frames, ())
+            transform, scale = source.dataparser_transform, source.dataparser_scale
+            model = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
+            checkpoint = {"step": source.checkpoint.step, "pipeline": model}
+            config_in = partial(_lifted_config, source)
+        facts = {"transform": transform.tolist(), "scale": scale}
+        write_text_file(folder / "dataparser_transforms.json", json.dumps(facts, indent=4))
+        stored = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
+        with atomic_file(stored) as draft:
+            torch.save(checkpoint, draft)
+        field_dir = folder / FIELD_FOLDER
+        if text_embeddings:
+            write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, text_embeddings)
+        files = [stored, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")]
+        field.save(field_dir, beside=run_file_digests(field_dir, files))
+        if question is not None:
+            save_query(field_dir, question)
+        for path in (run_dir,) if exact_name else numbered_paths(run_dir):
+            write_text_file(folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True)
+            if commit_directory(folder, path, overwrite=overwrite and exact_name):
+                return path
+    refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
+    raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
+
+
+def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
+    config, location = deepcopy(source.config), source.location
+    config.method_name = "normlift"
+    config.output_dir = location.relative_to_root(run_dir.parents[2])
+    config.timestamp = run_dir.name
+    config.relative_model_dir = Path(CHECKPOINT_DIR)
+    config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
+    config.pipeline.model = NormLiftModelConfig(**{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)})
+    if location.data_moved or config.output_dir.is_absolute():
+        set_dataset(config, location.data)  # a relative path would not be found
+    skip_seed_points(config)
+    # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
+    config.pipeline.datamanager.cache_images = "gpu"
+    return config
+
+
+def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
+    """Return the config of a run lifted from a PLY file or gsplat checkpoint, for which nerfstudio has written none.
+
+    Stock nerfstudio loads the cameras in the run directory with it, without transforming them.
+
+    All paths except that of the field are absolute, because there is no training directory for relative paths.
+    """
+    cameras = run_dir / TRANSFORMS_FILE
+    dataparser = NerfstudioDataParserConfig(
+        data=cameras,
+        downscale_factor=1,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+        load_3D_points=False,
+    )
+    model = NormLiftModelConfig(
+        sh_degree=max(1, scene.splat.degree),
+        background_color=scene.background_name,
+        rasterize_mode=scene.rasterize_mode,
+        semantics=Path(FIELD_FOLDER),
+    )
+    datamanager = FullImageDatamanagerConfig(
+        data=cameras,
+        dataparser=dataparser,
+        cache_images="gpu",  # means the pipeline's device; "cpu" would pin memory, which needs CUDA
+        cache_images_type="uint8",
+    )
+    return TrainerConfig(
+        method_name="normlift",
+        experiment_name=scene.name,
+        output_dir=run_dir.parents[2],
+        timestamp=run_dir.name,
+        relative_model_dir=Path(CHECKPOINT_DIR),
+        data=cameras,
+        pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model),
+        vis="viewer",
+    )

@@ -79,23 +79,24 @@ def describe_error(error: BaseException) -> tuple[str, int]:
     >>> describe_error(InputError("beta must be positive, got -1"))
     ('beta must be positive, got -1', 1)
     """
+    message = _user_message(error)
+    return (_report_bug(error), EXIT_INTERNAL_ERROR) if message is None else (message, EXIT_USER_ERROR)
+
+
+def _user_message(error: BaseException) -> str | None:
+    """Return the message of a user error; None for an internal error."""
     if isinstance(error, InputError):
-        return str(error), EXIT_USER_ERROR
+        return str(error)
     if isinstance(error, OSError):
         named = error.filename is not None and error.strerror is not None
-        return (f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)), EXIT_USER_ERROR
+        return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
     if isinstance(error, MemoryError):
-        return str(
-            error
-        ) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale", EXIT_USER_ERROR
+        return str(error) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
-        return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu", EXIT_USER_ERROR
+        return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
     if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):
-        return (
-            "this torch was built for NumPy 1, but NumPy 2 is installed; type: pip install 'numpy<2'",
-            EXIT_USER_ERROR,
-        )
-    return _report_bug(error), EXIT_INTERNAL_ERROR
+        return "this torch was built for NumPy 1, but NumPy 2 is installed; type: pip install 'numpy<2'"
+    return None
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,10 +1,13 @@
-"""A lifted run: a trained scene with its semantics, and methods to query, export and render it."""
+"""Opening of a trained scene or a lifted run, and methods to query, export and render a lifted run."""
 
 from __future__ import annotations
 
 import dataclasses
 import operator
+import os
+import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,9 +28,14 @@ from normlift_ns.analysis.objects import (
     find_instances,
     make_catalogue,
 )
+from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.scene import Scene
+from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
+from normlift_ns.data.extra_images import add_stored_images
+from normlift_ns.data.images import SplitViews
+from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
+from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.data.transforms import capture_transforms
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
@@ -41,8 +49,16 @@ from normlift_ns.exports import (
     transfer_labels,
     write_splat_ply,
 )
-from normlift_ns.io.atomic import refuse_run_files
-from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder, field_folder, resolve_manifest_paths, text_cache_folder
+from normlift_ns.io.atomic import complete_interrupted_writes, refuse_run_files
+from normlift_ns.io.run_dir import (
+    FIELD_FOLDER,
+    cache_folder,
+    check_run,
+    field_folder,
+    recorded_gsplat_version,
+    resolve_manifest_paths,
+    text_cache_folder,
+)
 from normlift_ns.options import (
     FLOATER_THRESHOLD,
     MAX_TRANSFER_DISTANCE,
@@ -55,7 +71,7 @@ from normlift_ns.options import (
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
 from normlift_ns.query.question import Query, load_query, make_query, save_query
-from normlift_ns.query.text_encoder import text_encoder_for
+from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
@@ -401,7 +417,10 @@ class LiftedRun:
         Raises:
             ValueError: `part` is not a part of this run.
         """
-        mask = part.mask if isinstance(part, Answer | Finding) else _as_tensor(part)
+        mask = part.mask if isinstance(part, Answer | Finding) else None
+        if mask is None:
+            with suppress(TypeError, ValueError, RuntimeError, OverflowError):
+                mask = torch.as_tensor(part)
         if mask is None or mask.dtype != torch.bool or mask.shape != (len(self.field),):
             actual = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
             raise InputError(
@@ -464,14 +483,6 @@ def _answer_of(part: Any) -> Answer | None:
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
-def _as_tensor(values: Any) -> Tensor | None:
-    """Return values as a tensor; None if that is impossible."""
-    try:
-        return torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        return None
-
-
 def load_field(
     run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
 ) -> SemanticField:
@@ -490,3 +501,99 @@ def load_field(
 def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
     """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
     return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
+
+
+# Opening.
+
+
+def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
+    """Open a trained splatfacto run or a lifted run, from any working directory.
+
+    For a splat without a nerfstudio run, see `open_splat`.
+
+    Args:
+        load_config: config.yml of the run.
+        data: current path of the dataset, if it was moved.
+        load_step: step of the checkpoint, the last one if None.
+    Raises:
+        FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
+        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
+            of the run.
+
+    >>> scene = open_scene(config)
+    >>> len(scene.train), scene.train[1].image.shape
+    (12, torch.Size([120, 160, 3]))
+    """
+    config = check_path("load_config", load_config)
+    data = None if data is None else check_path("data", data)
+    load_step = None if load_step is None else check_number("load_step", load_step, int)
+    run_dir = Path(os.path.abspath(config)).parent
+    if not run_dir.exists():
+        complete_interrupted_writes(run_dir.parent)  # a lift was killed while it replaced the run
+    if config.is_file() and is_saved_splat(run_dir):
+        scene = open_saved_splat(run_dir, data=data, load_step=load_step)
+    else:
+        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
+        scene = add_stored_images(scene, run_dir)
+    rules = recorded_gsplat_version(run_dir)
+    return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
+
+
+def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
+    from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
+
+    return nerfstudio_views(*run)
+
+
+def open_run(
+    load_config: str | Path,
+    *,
+    data: str | Path | None = None,
+    device: str = "auto",
+    text_vectors: str | Path | None = None,
+    text_template: str | None = None,
+) -> LiftedRun:
+    """Open a lifted run, from any working directory.
+
+    Args:
+        load_config: config.yml of the run.
+        data: current path of the dataset, if it was moved.
+        device: device of the text encoder (auto, cpu or cuda).
+        text_vectors: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
+        text_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
+            lift.
+    Raises:
+        FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
+
+    >>> run = open_run(config)
+    >>> answer = run.ask("red", "yellow", min_reliability=0.3)
+    >>> answer["yellow"].objects[0].size > 20
+    True
+    """
+    folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
+    vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
+    check_run(folder)
+    device, scene = choose_device(device), open_scene(load_config, data=data)
+    loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
+    for remark in (*scene.remarks, *_changed_cameras(loaded, scene)):
+        warnings.warn(remark, stacklevel=2)
+    return LiftedRun(folder, scene, with_text_source(loaded, text_embeddings=vectors, template=text_template), device)
+
+
+def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
+    """Return a warning if the cameras differ from those that the field records of the lift."""
+    changed = [
+        split
+        for split, key, views in (
+            ("training", "cameras", scene.train),
+            ("held-out", "cameras_held_out", scene.held_out),
+        )
+        if (recorded := field.manifest.get(key)) is not None and cameras_differ(recorded, camera_summary(views.cameras))
+    ]
+    if len(changed) == 0:
+        return []
+    return [
+        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
+        "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
+        "Restore the dataset, give its path with --data, or lift again"
+    ]

@@ -230,14 +230,7 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
     """Return the value in the declared type of the field."""
     origin, choices = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        if value is None and type(None) in choices:
-            return None
-        kinds = [choice for choice in choices if choice is not type(None)]
-        words = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
-        others = [kind for kind in kinds if get_origin(kind) is not Literal]
-        if len(others) == 0:  # Rule | Literal["auto"]
-            return _check_choice(name, value, words)
-        return value if isinstance(value, str) and value in words else _convert(name, value, others[0])
+        return _convert_union(name, value, choices)
     if origin is Literal:
         return _check_choice(name, value, choices)
     if origin is tuple:
@@ -245,6 +238,17 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
             raise _error(name, "a list", value)
         return tuple(_convert(name, item, choices[0]) for item in value)
     return _convert_scalar(name, value, hint)
+
+
+def _convert_union(name: str, value: Any, choices: Sequence[Any]) -> Any:
+    """Return the value in one of several types: None, words, and at most one other."""
+    if value is None and type(None) in choices:
+        return None
+    words = [word for choice in choices if get_origin(choice) is Literal for word in get_args(choice)]
+    others = [choice for choice in choices if get_origin(choice) is not Literal and choice is not type(None)]
+    if len(others) == 0:  # Rule | Literal["auto"]
+        return _check_choice(name, value, words)
+    return value if isinstance(value, str) and value in words else _convert(name, value, others[0])
 
 
 def _convert_scalar(name: str, value: Any, hint: type) -> Any:

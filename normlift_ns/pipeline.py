@@ -1,16 +1,16 @@
-"""Pipeline from a trained scene and a source of 2D features to a lifted run. Read this module first.
+"""Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first.
 
-`lift_scene` has the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `run_lift` opens the
-scene before them, and writes the run after them. Both run in one process; `distributed.lift` runs the same steps in
+`lift_scene` has the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `api.run_lift` opens
+the scene before them, and writes the run after them. Both run in one process; `distributed.lift` runs the same steps in
 several.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -21,18 +21,13 @@ from jaxtyping import Float, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.consensus import SAMPLING_SEED, Consensus, consensus, with_original_reliability
-from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import clamp_k, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
-from normlift_ns.data.alignment import alignment_warning, measure_alignment
-from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import SplatScene
-from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
-from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import check_unique_stems
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import (
@@ -42,32 +37,14 @@ from normlift_ns.evidence_collection import (
     ViewObservations,
     sample_evenly,
 )
-from normlift_ns.io.run_dir import (
-    FIELD_FOLDER,
-    TEXT_EMBEDDINGS_FILE,
-    cache_folder,
-    complete_interrupted_lifts,
-    refuse_existing_run,
-    run_directory,
-)
-from normlift_ns.lifted_run import LiftedRun, resolve_field_paths
 from normlift_ns.options import (
-    CANONICAL_NEGATIVES,
     LiftOptions,
     RefineConfig,
-    SourceOptions,
-    check_bool,
-    check_path,
-    check_prompt_list,
 )
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
-from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import Query, make_query
-from normlift_ns.query.text_encoder import encoder_settings, precomputed_settings
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.run_writer import write_run
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features below which to warn: something is wrong, or almost no pixel was labeled."""
@@ -349,208 +326,6 @@ def with_cost(field: SemanticField, stages: StageTimer, device: str) -> Semantic
     return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
 
 
-# Lifting into a new run.
-
-
-@dataclass(frozen=True)
-class RunTarget:
-    """Directory of a new run."""
-
-    output_dir: str | Path | None = None
-    """Output folder; None: that of the trained run."""
-    timestamp: str | None = None
-    """Name of the run directory; None: the current time, with a number if such a run exists."""
-    overwrite: bool = False
-    """Replace a run directory of that name."""
-
-    def __post_init__(self) -> None:
-        check_bool("overwrite", self.overwrite)
-        if self.output_dir is not None:
-            check_path("output_dir", self.output_dir)
-        if self.timestamp is not None:
-            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
-
-    def directory(self, scene: NerfstudioScene | SplatScene) -> Path:
-        """Return the directory of a run lifted from this scene."""
-        folder = scene.runs_dir if self.output_dir is None else check_path("output_dir", self.output_dir)
-        return run_directory(folder, scene.name, self.timestamp)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LiftRequest:
-    """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
-
-    open_scene: Callable[[], Scene]
-    """Opens the trained scene. It is called after all checks that do not need the scene."""
-    source: SourceOptions | None = None
-    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None
-    texts: Mapping[str, Float[Tensor, " d"]] | None = None
-    lift: LiftOptions | None = None
-    queries: Sequence[str] = ()
-    target: RunTarget = RunTarget()
-    check: bool = True
-    device: str = "auto"
-    export: FeatureExport | None = None
-    report: ProgressCallback = lambda stage, done, total: None
-    say: Callable[[str], None] = lambda text: None
-
-    def __post_init__(self) -> None:
-        if self.features is None and self.texts is not None:
-            raise InputError("texts are for your own features; pass features, too, or omit texts")
-        if self.features is not None and self.source is not None:
-            raise InputError("features replace source; pass only one of the two")
-        check_prompt_list("queries", self.queries)
-        check_bool("check", self.check)
-        for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
-
-
-@dataclass(frozen=True)
-class PreparedLift:
-    """Lift whose scene is open and whose inputs are checked."""
-
-    request: LiftRequest
-    scene: NerfstudioScene | SplatScene
-    source: FeatureSource
-    options: SourceOptions
-    device: str
-    run_dir: Path
-
-    @property
-    def lift(self) -> LiftOptions:
-        """Options of the lift."""
-        return self.request.lift or LiftOptions()
-
-    @property
-    def texts(self) -> Mapping[str, Float[Tensor, " d"]] | None:
-        """Prompts of the user's own features, with their embeddings."""
-        return self.source.texts if isinstance(self.source, PrecomputedFeatures) else None
-
-    @property
-    def encoder(self) -> dict[str, Any]:
-        """Options that queries need to encode prompts as the features were encoded."""
-        if self.request.features is None:
-            return encoder_settings(self.options)
-        return precomputed_settings(TEXT_EMBEDDINGS_FILE if self.texts else None)
-
-
-def run_lift(request: LiftRequest) -> LiftedRun:
-    """Lift features onto a trained scene, write the lifted run, and return it."""
-    prepared, stages = prepare_lift(request), StageTimer(request.report)
-    check_target(prepared)
-    announce(prepared)
-    check_alignment(prepared, stages)
-    result = lift_scene(
-        prepared.scene, prepared.source, prepared.lift, cache_folder(prepared.run_dir), device=prepared.device,
-        encoder=prepared.encoder, export=request.export, report=request.report,
-    )  # fmt: skip
-    return write_lifted_run(prepared, result, stages)
-
-
-def prepare_lift(request: LiftRequest) -> PreparedLift:
-    """Load encoders, open the scene, and name the new run; nothing is written."""
-    device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
-    init_cuda(device)
-    source = None if request.features is not None else make_source(options, device)  # raises before the scene loads
-    if source is not None and len(request.queries) > 0:
-        source.text(request.queries)
-    scene = request.open_scene()
-    if not isinstance(scene, NerfstudioScene | SplatScene):
-        raise TypeError(
-            "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
-            f"{type(scene).__name__}"
-        )
-    if request.export is not None:
-        _refuse_equal_stems(scene.train.names)
-    if source is None:
-        source = precomputed_features(request.features, request.texts, scene.train.names)
-        if len(request.queries) > 0:
-            source.text(request.queries)
-    return PreparedLift(request, scene, source, options, device, request.target.directory(scene))
-
-
-def check_target(prepared: PreparedLift) -> None:
-    """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
-    complete_interrupted_lifts(prepared.run_dir)
-    if prepared.request.target.timestamp is not None:
-        refuse_existing_run(prepared.run_dir, prepared.request.target.overwrite)
-
-
-def announce(prepared: PreparedLift) -> None:
-    """Report the size of the lift, and the warnings of the scene."""
-    scene, most, say = prepared.scene, prepared.lift.max_views, prepared.request.say
-    used = "" if most is None else f"{min(most, len(scene.train))} of "
-    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
-    for remark in scene.remarks:
-        say(f"Warning: {remark}")
-
-
-def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
-    """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
-    if not prepared.request.check:
-        return
-    scene = prepared.scene
-    with stages("check") as step:
-        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
-        match = measure_alignment(scene, settings, device=prepared.device)
-        warning = alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
-        step()
-    if warning is not None:
-        prepared.request.say(f"Warning: {warning}")
-
-
-def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTimer) -> LiftedRun:
-    """Write the run of a finished lift, and return it."""
-    request, field, target = prepared.request, result.field, prepared.request.target
-    if request.features is None:
-        settings = source_settings(prepared.options, prepared.device)
-        field = replace(field, manifest={**field.manifest, "source": settings})
-    seconds = {**stages.seconds, **result.seconds}
-    with stages("write") as step:
-        question = _question(field, prepared.scene.gaussians.means, prepared.source, request.queries)
-        exact = target.timestamp is not None
-        run_dir = write_run(
-            prepared.scene, field, prepared.run_dir,
-            question=question, text_embeddings=prepared.texts, overwrite=target.overwrite, exact_name=exact,
-        )  # fmt: skip
-        field = field.to("cpu")
-        step()
-    seconds["write"] = stages.seconds["write"]
-    return LiftedRun(
-        run_dir, prepared.scene, resolve_field_paths(field, run_dir / FIELD_FOLDER), prepared.device, seconds
-    )
-
-
-def _refuse_equal_stems(names: Sequence[str]) -> None:
-    """Raise if two images have the same stem, because LangSplat's format names files by it."""
-    stems = [Path(name).stem for name in names]
-    for i, stem in enumerate(stems):
-        if stem in stems[:i]:
-            raise InputError(
-                f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
-                "Rename one of the images, or lift without --export-langsplat."
-            )
-
-
-def _question(
-    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
-) -> Query | None:
-    if len(queries) == 0:
-        return None
-    length = source.text(queries).shape[1]
-    if length != field.dimension:
-        raise InputError(
-            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; name the model "
-            "of the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
-        )
-    negatives = None
-    if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet
-        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
-    return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
-
-
 # Warm-up of kernels in the background, while images are read and networks process them.
 
 
@@ -572,13 +347,15 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
 
     Errors are suppressed here, because the lift itself will raise them again.
     """
+    x, y = torch.arange(camera.width), torch.arange(camera.height)
+    labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     sample = GaussianScene(*(array[:_WARM_UP_GAUSSIANS] for array in arrays))
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
             evidence = rasterize_evidence(
-                sample, [camera], [_quarters(camera)], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
+                sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
                 rasterize_mode=config.rasterize_mode, settings=config.settings, dtype=config.dtype,
                 weight_power=config.weight_power,
             )  # fmt: skip
@@ -594,9 +371,3 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
     thread = Thread(target=work, name="kernel warm-up", daemon=True)
     thread.start()
     return thread
-
-
-def _quarters(camera: Camera) -> torch.Tensor:
-    """Return labels of the four quarters of an image."""
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    return (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()

@@ -7,7 +7,8 @@ requested.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, distributions
@@ -83,23 +84,19 @@ def installed_names(group: str) -> list[str]:
 
 @cache
 def _entry_points(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    """Return the entry points of the packages on a path. Cached, because a search through hundreds of packages takes 20
-    ms, and a command needs it often."""
-    return tuple(_discover(group, path))
+    """Return the entry points of the packages on a path. Packages with damaged metadata are skipped.
 
-
-def _discover(group: str, path: Sequence[str]) -> Iterator[EntryPoint]:
-    """Yield the entry points of a group. Packages with damaged metadata are skipped."""
+    Cached, because a search through hundreds of packages takes 20 ms, and a command needs it often.
+    """
+    points: list[EntryPoint] = []
     names: set[str] = set()
     for package in distributions(path=list(path)):
-        try:
+        with suppress(Exception):  # reading third-party metadata may raise anything
             text = package.read_text("entry_points.txt")
-            if text is None or group not in text or package.name in names:
-                continue
-            names.add(package.name)  # the first on the path is the one that Python imports
-            yield from [point for point in package.entry_points if point.group == group]
-        except Exception:  # reading third-party metadata may raise anything
-            continue
+            if text is not None and group in text and package.name not in names:
+                names.add(package.name)  # the first on the path is the one that Python imports
+                points += [point for point in package.entry_points if point.group == group]
+    return tuple(points)
 
 
 def _package(point: EntryPoint) -> str:

@@ -26,7 +26,7 @@ from nerfstudio.cameras.cameras import Cameras
 from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
 from normlift_ns.core.relevancy import relevancy
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.panel_view import prompt_table, status_mdx, visible_mask
+from normlift_ns.nerfstudio_plugin.panel import prompt_table, status_mdx, visible_mask
 from normlift_ns.options import CANONICAL_NEGATIVES, Storage
 from normlift_ns.query import engine
 from normlift_ns.query.question import Query

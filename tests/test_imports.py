@@ -26,11 +26,10 @@ LAYERS = (
     ("rendering",),
     ("exports",),
     ("session", "lifted_run"),
-    ("run_writer",),
     ("pipeline",),
+    ("api",),
     ("planning", "viewer", "distributed"),
     ("nerfstudio_plugin",),
-    ("api",),
     ("method_configs", "plugin"),
     ("evaluation", "demo"),
     ("__init__",),
@@ -46,14 +45,14 @@ TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
     **dict.fromkeys(("errors", "registry", "options", "plugin", "scripts"), frozenset()),
     **dict.fromkeys(("progress",), frozenset({"torch"})),
-    **dict.fromkeys(("api", "pipeline", "run_writer"), TENSORS),
+    **dict.fromkeys(("api", "pipeline"), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},
     "kernels": TENSORS | {"triton"},
     "core": BASE,
     "rasterization": TENSORS | {"numpy", "numba", "gsplat", "typing_extensions"},
     "encoders": BASE | {"xxhash", "open_clip", "PIL", "huggingface_hub", "torchvision", "skimage"},
     "segmentation": BASE | {"skimage", "PIL", "huggingface_hub", "torchvision"},
-    "data": BASE | {"msgspec", "cv2", "PIL", "plyfile", "yaml"},
+    "data": BASE | {"msgspec", "cv2", "PIL", "plyfile", "yaml", "nerfstudio"},
     "distributed": TENSORS,
     "evidence_collection": TENSORS | {"xxhash"},
     "analysis": BASE | {"trimesh", "PIL", "plyfile"},
@@ -71,7 +70,7 @@ FOREIGN = {
     "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
 }
 """What is not of this package and not of Python, by layer."""
-KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/capture.py")
+KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "data/nerfstudio/dataset_views.py", "demo/capture.py")
 UNIX_ONLY = {"resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton"}
 FOR_A_GPU = ("kernels", "rasterization/triton", "rasterization/gsplat")
 """May import Triton when they are loaded."""

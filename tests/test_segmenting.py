@@ -49,9 +49,6 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         reliability = vector / total * n_eff / (n_eff + 1)
         torch.testing.assert_close(answer.scalars.reliability[known], reliability[known], **close)
         assert answer.voting_views.tolist() == there.tolist()
-        again = found.answer(text, views=[0, 2])
-        torch.testing.assert_close(again.relevancy[known], share[known], **close)
-        assert bool((again.scalars.reliability >= answer.scalars.reliability)[known].all())
     mask = torch.zeros(1, 24, 40, dtype=torch.bool)
     with pytest.raises(ValueError, match="2 sets for 3 cameras"):
         mask_evidence(scene, cameras, [mask, mask])

@@ -13,13 +13,12 @@ from rich.table import Table
 
 from normlift_ns.analysis.explain import ViewVote, Why
 from normlift_ns.analysis.objects import Catalogue
-from normlift_ns.api import open_run
 from normlift_ns.cli.common import CONSOLE, info, plain_text
 from normlift_ns.core.device import choose_device
 from normlift_ns.encoders.cache import CachedTextMasks
 from normlift_ns.io.atomic import atomic_files, safe_file_name
 from normlift_ns.io.run_dir import cache_folder
-from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.lifted_run import LiftedRun, open_run
 from normlift_ns.query.engine import Answer, run_query
 from normlift_ns.query.question import Query
 from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, SegmentationResult, query_sam3

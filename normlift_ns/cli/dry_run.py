@@ -8,7 +8,6 @@ from typing import NamedTuple, Protocol
 
 from rich.table import Table
 
-from normlift_ns.api import open_scene
 from normlift_ns.cli.common import info
 from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.scene import Scene
@@ -17,6 +16,7 @@ from normlift_ns.data.open_splat import SplatScene
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source
 from normlift_ns.io.run_dir import cache_folder, run_directory
+from normlift_ns.lifted_run import open_scene
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import resolve_gsplat_version
 from normlift_ns.planning import Plan, make_plan, measure_capture, missing_weights, time_kernel_loading

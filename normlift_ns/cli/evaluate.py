@@ -104,9 +104,9 @@ class NormLiftEval:
 
     def _load(self, device: str, names: list[tuple[str, str]]) -> Iterator[EvaluatedRun]:
         """Yield the runs, and add the name and the checkpoint of each to a list."""
-        from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (--help should not wait for torch)
 
         for config in self.load_config:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)

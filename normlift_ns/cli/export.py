@@ -103,8 +103,8 @@ class NormLiftExport:
         outputs = self._outputs()
         self._check_outputs(outputs)
         info_opening(self.load_config)
-        from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.exports import EXPORTERS, read_cloud  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)

@@ -159,9 +159,8 @@ class NormLift:
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import scene_opener  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.api import LiftRequest, run_lift, scene_opener  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
-        from normlift_ns.pipeline import LiftRequest, RunTarget, run_lift  # noqa: PLC0415
 
         import_time = time.perf_counter()
         message_times: list[float] = []
@@ -180,7 +179,9 @@ class NormLift:
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
-                target=RunTarget(self.output_dir, self.timestamp, self.overwrite),
+                output_dir=self.output_dir,
+                timestamp=self.timestamp,
+                overwrite=self.overwrite,
                 check=self.check,
                 device=self.device,
                 export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),
@@ -243,9 +244,9 @@ class NormLift:
         splat = self.load_ply or self.load_gsplat
         if splat is None and self.add_images is None:
             return cast(Path, self.load_config)
-        from normlift_ns.api import open_scene  # noqa: PLC0415 (as above)
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_scene  # noqa: PLC0415 (as above)
 
         if splat is not None:
             scene: Any = open_splat(splat, self.splat, say=info_progress)

@@ -140,14 +140,14 @@ class NormLiftQuery:
         run = open_with()
         if run is not None:
             return run
-        from normlift_ns.api import open_run  # noqa: PLC0415 (as above)
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (as above)
 
         means = open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()
         return cast("QuickRun", open_with(means=means))
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
         """Load everything that renders need, and return a function that renders and saves them."""
-        from normlift_ns.api import open_run  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
         from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415

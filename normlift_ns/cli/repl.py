@@ -15,7 +15,7 @@ from rich.table import Table
 from normlift_ns.cli.common import CONSOLE, info, plain_text, print_error
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.query.arrays import QuickRun
-from normlift_ns.query.histogram import draw_histogram
+from normlift_ns.query.engine import draw_histogram
 from normlift_ns.query.question import Query
 
 _HISTORY = "history"

@@ -70,7 +70,7 @@ class NormLiftView:
 
     def open(self, door: Door) -> None:
         """Load the run and start to serve pages, including those that are already waiting; return immediately."""
-        from normlift_ns.api import open_run  # noqa: PLC0415 (pages load while torch is imported)
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (pages load while torch is imported)
         from normlift_ns.session.selection import SelectionContext  # noqa: PLC0415
         from normlift_ns.viewer.person import People  # noqa: PLC0415
         from normlift_ns.viewer.shared import Run, make_records  # noqa: PLC0415

@@ -293,19 +293,10 @@ class Evidence:
             FileNotFoundError: if the file does not exist.
             ValueError: if it is not an evidence file, or is damaged.
         """
-        return Evidence.read(Path(path), key=key)[0]
-
-    @staticmethod
-    def read(path: Path, *, key: str = "", remedy: str = "rasterize again") -> tuple[Evidence, str | None]:
-        """Read a file like `load`, and also return its digest, or None for a file of version 0.1.
-
-        Args:
-            key: as in `load`.
-            remedy: what the message suggests if the file is damaged.
-        """
-        arrays = read_evidence(path, key=key, remedy=remedy)
+        remedy = "rasterize again"
+        arrays = read_evidence(Path(path), key=key, remedy=remedy)
         try:
-            return Evidence.of_arrays(arrays), arrays.digest
+            return Evidence.of_arrays(arrays)
         except ValueError as error:
             raise InputError(f"{path} is damaged ({error}); {remedy}") from error
 

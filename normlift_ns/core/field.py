@@ -213,9 +213,8 @@ class SemanticField:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
-        (folder / MANIFEST_FILE).unlink(
-            missing_ok=True
-        )  # a folder without a manifest is incomplete and may be overwritten
+        # a folder without a manifest is incomplete and may be overwritten
+        (folder / MANIFEST_FILE).unlink(missing_ok=True)
         digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
@@ -125,16 +124,12 @@ class Correlation(NamedTuple):
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
     """Compute Spearman's rank correlation, with ties at their mean rank."""
-    from scipy.stats import spearmanr  # noqa: PLC0415 (takes a second, and only studies need it)
-
-    return _correlation(spearmanr, a, b)
+    return _correlation("spearmanr", a, b)
 
 
 def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
     """Compute Kendall's tau-b in O(n log n) steps."""
-    from scipy.stats import kendalltau  # noqa: PLC0415 (as in `spearman_test`)
-
-    return _correlation(kendalltau, a, b)
+    return _correlation("kendalltau", a, b)
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
@@ -161,8 +156,10 @@ def bin_means(
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 
 
-def _correlation(correlate: Callable[..., Any], a: Tensor, b: Tensor) -> Correlation:
+def _correlation(name: str, a: Tensor, b: Tensor) -> Correlation:
+    from scipy import stats  # noqa: PLC0415 (takes a second, and only studies need it)
+
     if not all(len(x) > 1 and bool((x != x[0]).any()) for x in (a, b)):
         return Correlation(math.nan, math.nan)
-    result = correlate(*(x.detach().cpu().double().numpy() for x in (a, b)))
+    result = getattr(stats, name)(*(x.detach().cpu().double().numpy() for x in (a, b)))
     return Correlation(float(result.statistic), float(result.pvalue))

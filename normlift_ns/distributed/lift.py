@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
+from normlift_ns.api import LiftRequest, announce, check_alignment, check_target, prepare_lift, write_lifted_run
 from normlift_ns.core.consensus import (
     CHANCE_AGREEMENT,
     Consensus,
@@ -48,12 +49,8 @@ from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import RefineConfig
 from normlift_ns.pipeline import (
-    LiftRequest,
     LiftResult,
-    announce,
-    check_alignment,
     check_directions,
-    check_target,
     consensus_facts,
     consensus_options,
     count_directions,
@@ -62,11 +59,9 @@ from normlift_ns.pipeline import (
     lift_provenance,
     lift_statistics,
     plan_collection,
-    prepare_lift,
     start_kernel_warm_up,
     vote_shares,
     with_cost,
-    write_lifted_run,
 )
 from normlift_ns.progress import ProgressCallback, StageTimer
 

@@ -50,19 +50,14 @@ class LazyLpips(torch.nn.Module):
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
         """Return the LPIPS of images [B, 3, H, W] in 0..1; NaN, with a single warning, if the weights are missing."""
         if self.available and not self._metric:
-            self._build()
-        if not self.available:
-            return image.new_tensor(torch.nan)
-        return self._metric[0].to(image.device)(image, reference)
+            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
 
-    def _build(self) -> None:
-        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
-
-        try:
-            self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
-        except (ImportError, OSError) as error:
-            self.available = False
-            warnings.warn(f"LPIPS is skipped: its weights cannot be downloaded ({error})", stacklevel=2)
+            try:
+                self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
+            except (ImportError, OSError) as error:
+                self.available = False
+                warnings.warn(f"LPIPS is skipped: its weights cannot be downloaded ({error})", stacklevel=2)
+        return self._metric[0].to(image.device)(image, reference) if self.available else image.new_tensor(torch.nan)
 
 
 # splatfacto's model with a semantic field, as loaded by ns-viewer, ns-render, ns-eval and ns-export.

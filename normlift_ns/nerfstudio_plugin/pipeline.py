@@ -15,8 +15,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from normlift_ns.api import query_to_store
 from normlift_ns.data.checkpoint import numpy_scalar_globals
 from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
+from normlift_ns.data.nerfstudio.dataset_views import DatasetViews, nerfstudio_views
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.encoders.base import FeatureSource
@@ -25,12 +27,10 @@ from normlift_ns.errors import describe_error
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, add_digest_comment, cache_folder, run_file_digests
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
-from normlift_ns.nerfstudio_plugin.panel_view import rerender_clients
-from normlift_ns.nerfstudio_plugin.views import DatasetViews, nerfstudio_views
+from normlift_ns.nerfstudio_plugin.panel import rerender_clients
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import make_query, save_query
+from normlift_ns.query.question import save_query
 from normlift_ns.query.text_encoder import encoder_settings
 
 if TYPE_CHECKING:
@@ -179,10 +179,8 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     folder = trainer.base_dir / FIELD_FOLDER
     files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
     field.save(folder, overwrite=True, beside=run_file_digests(folder, files))
-    question = None
-    if len(options.queries) > 0:
-        question = make_query(field, source.text, options.queries)
-        question = run_query(field, scene.gaussians.means, question).question
+    question = query_to_store(field, scene.gaussians.means, source, options.queries)
+    if question is not None:
         save_query(folder, question)
     model: Any = trainer.config.pipeline.model
     model.semantics = Path(FIELD_FOLDER)

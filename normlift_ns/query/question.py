@@ -86,15 +86,9 @@ def make_query(
     Raises:
         ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
-    _check_negatives(negatives)
-    if rule not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    _check_rules(negatives, rule, threshold)
+    threshold = threshold if threshold is None or isinstance(threshold, str) else check_number("threshold", threshold)
     min_reliability = check_number("min_reliability", min_reliability)
-    if isinstance(threshold, str):
-        if threshold != "auto":
-            raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
-    elif threshold is not None:
-        threshold = check_number("threshold", threshold)
     check_bool("refined", refined)
     default = default_rule(field)
     if rule == "auto":
@@ -117,13 +111,17 @@ def make_query(
     )
 
 
-def _check_negatives(negatives: object) -> None:
+def _check_rules(negatives: object, rule: str, threshold: object) -> None:
     if negatives is not None and not isinstance(negatives, Sequence):
         raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
     if isinstance(negatives, str):
         raise InputError(
             f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
         )
+    if rule not in ("auto", *RELEVANCY_RULES):
+        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if isinstance(threshold, str) and threshold != "auto":
+        raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
 
 # Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.
@@ -139,13 +137,13 @@ _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-
 NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
 
-class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
-    """The JSON in the file's metadata."""
+class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "form"}):
+    """The JSON in the file's metadata: a `Query` without its embeddings."""
 
     texts: Annotated[tuple[NonBlankText, ...], msgspec.Meta(min_length=1)]
     negatives: tuple[NonBlankText, ...]
     refined: bool
-    form: RelevancyRule
+    rule: RelevancyRule
     threshold: float
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)]
     encoder: str | None = None
@@ -168,18 +166,12 @@ def save_query(folder: Path, question: Query) -> Path:
         raise InputError(
             'the query cannot be stored: its threshold is "auto"; run the query, and store that of its answer'
         )
-    metadata = _Metadata(
-        question.texts, question.negatives, question.refined, question.rule, question.threshold,
-        question.min_reliability, question.encoder,
-    )  # fmt: skip
+    metadata = _Metadata(**{name: getattr(question, name) for name in _Metadata.__struct_fields__})
     rows = zip(_VECTORS, (question.embeddings, question.negative_embeddings))
-    vectors = {name: value for name, value in rows if value is not None}
-    arrays = {name: value.astype(np.float32) for name, value in vectors.items()}
+    arrays = {name: value.astype(np.float32) for name, value in rows if value is not None}
     try:
         encoded = msgspec.json.encode(metadata).decode()
-        decoded = _decode(encoded, arrays)
-        if (folder / MANIFEST_FILE).exists():
-            _check_encoder(decoded, read_manifest(folder)[0])
+        _decode(folder, encoded, arrays)
     except (ValueError, TypeError) as error:
         raise InputError(f"the query cannot be stored: {error}") from error
     save_arrays(folder / QUERIES_FILE, arrays, {_METADATA_KEY: encoded}, overwrite=True)
@@ -201,19 +193,17 @@ def load_query(folder: Path) -> Query | None:
         arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
         if set(metadata) != {_METADATA_KEY}:
             raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
-        question = _decode(metadata[_METADATA_KEY], arrays)
-        if (folder / MANIFEST_FILE).exists():
-            _check_encoder(question, read_manifest(folder)[0])
-        return question
+        return _decode(folder, metadata[_METADATA_KEY], arrays)
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
 
 
-def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Query:
+def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     """Return the query with this metadata and these embeddings.
 
     Raises:
-        ValueError: the metadata or an embedding is not valid, or they do not fit together.
+        ValueError: the metadata or an embedding is not valid, or they do not fit together, or not the field in the
+            folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)
     if not math.isfinite(metadata.threshold):
@@ -225,16 +215,16 @@ def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Query:
         raise InputError(
             f"it has {len(metadata.negatives)} negatives, but {'no' if negative is None else 'also'} negative_vectors"
         )
-    if RELEVANCY_RULES[metadata.form].needs_negatives and negative is None:
-        raise InputError(f"rule {metadata.form!r} needs negatives, but it has none")
+    if RELEVANCY_RULES[metadata.rule].needs_negatives and negative is None:
+        raise InputError(f"rule {metadata.rule!r} needs negatives, but it has none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
     _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
     if negative is not None:
         _check_vectors("negative_vectors", negative, metadata.negatives, size)
-    return Query(
-        metadata.texts, arrays["vectors"], metadata.negatives, negative, metadata.form, metadata.threshold,
-        metadata.min_reliability, metadata.refined, metadata.encoder,
-    )  # fmt: skip
+    question = Query(embeddings=arrays["vectors"], negative_embeddings=negative, **msgspec.structs.asdict(metadata))
+    if (folder / MANIFEST_FILE).exists():
+        _check_encoder(question, read_manifest(folder)[0])
+    return question
 
 
 def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:

@@ -83,18 +83,9 @@ class MaskEvidence:
     inside: Bool[Tensor, "q s"]
     """True for the cells inside the masks of each prompt."""
 
-    def answer(self, text: int, views: Sequence[int] | None = None, *, beta: float = 1.0) -> MaskResult:
-        """Lift the masks of one prompt.
-
-        Args:
-            text: index of the prompt.
-            views: indices of the views to use (default: all).
-            beta: as in `lift`.
-        """
+    def answer(self, text: int) -> MaskResult:
+        """Lift the masks of the prompt with this index."""
         evidence, inside = self.evidence, self.inside[text]
-        if views is not None:
-            inside = inside[evidence.columns_of(views)]
-            evidence = evidence.select_views(views)
         column, weight = evidence.rows.column.long(), evidence.rows.weight.double()
         row, view = evidence.rows.row_index(), evidence.region_view[column].long()
         within = inside[column]
@@ -116,7 +107,7 @@ class MaskEvidence:
         sides = torch.where(votes[evidence.region_view.long()], 2 * evidence.region_view + (~inside).int(), -1)
         side_view = torch.arange(evidence.num_views, dtype=torch.int32, device=inside.device).repeat_interleave(2)
         table = torch.eye(2, device=inside.device, dtype=evidence.rows.weight.dtype).repeat(evidence.num_views, 1)
-        scalars = lift(evidence.regroup(sides[None], side_view), table, beta=beta, unlabeled="dilute").scalars
+        scalars = lift(evidence.regroup(sides[None], side_view), table, unlabeled="dilute").scalars
         relevancy = torch.where(scalars.norm > 0, share(votes), 0.0).to(scalars.norm.dtype)
         return MaskResult(relevancy, scalars, votes & has_mask)
 
@@ -130,7 +121,6 @@ def mask_evidence(
     rasterize_mode: RasterizeMode = "classic",
     settings: RasterSettings | None = None,
     backend: BackendName = "auto",
-    on_view_done: Callable[[], None] = lambda: None,
 ) -> MaskEvidence:
     """Rasterize the evidence of the masks of Q prompts, once for all prompts.
 
@@ -139,7 +129,6 @@ def mask_evidence(
         masks: for each view, one mask per prompt; empty if the prompt was not found.
         valid_pixels: for each view, the pixels to use; None for all.
         rasterize_mode, settings, backend: as in `rasterize_evidence`.
-        on_view_done: called after each view.
     Raises:
         ValueError: there are no views, or the masks do not match the number or size of the cameras.
     """
@@ -168,7 +157,6 @@ def mask_evidence(
         rasterize_mode=rasterize_mode,
         settings=settings,
         backend=backend,
-        progress=lambda *_: on_view_done(),
     )
     return MaskEvidence(evidence, torch.cat(inside, dim=1).to(scene.means.device))
 
@@ -230,7 +218,6 @@ def query_sam3(
     min_reliability: float = 0.0,
     settings: RasterSettings | None = None,
     device: str = "cpu",
-    done: Callable[[], None] = lambda: None,
 ) -> SegmentationResult:
     """Segment evenly spaced training views with SAM 3, and lift the masks.
 
@@ -241,7 +228,6 @@ def query_sam3(
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         settings: constants of the rasterizer.
         device: device to rasterize on.
-        done: called after each view.
     Raises:
         FileNotFoundError: an image does not exist.
         ValueError: an image is damaged, or a prompt is too long.
@@ -252,7 +238,6 @@ def query_sam3(
         masks.append(find_masks(view.image, texts).cpu())
         cameras.append(view.camera)
         counted.append(view.mask)
-        done()
     gaussians = scene.gaussians.to(device)
     evidence = mask_evidence(
         gaussians, cameras, masks, valid_pixels=counted, rasterize_mode=scene.rasterize_mode, settings=settings

@@ -110,21 +110,17 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
                 "(--text-vectors)"
             )
         return vectors
-    kind = _kind(options.encoder)
-    recorded = _identity(field.manifest.get("features"))
-    if kind.texts is not None:
-        return kind.texts(options, device, cache, recorded)
-    return _cached_texts(kind, options, device, cache, recorded)
-
-
-def _kind(name: str) -> EncoderKind:
     try:
-        return encoder_kind(name)
+        kind = encoder_kind(options.encoder)
     except InputError as error:
         raise InputError(
             f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
             "a file of text vectors from that encoder (--text-vectors)"
         ) from None
+    recorded = _identity(field.manifest.get("features"))
+    if kind.texts is not None:
+        return kind.texts(options, device, cache, recorded)
+    return _cached_texts(kind, options, device, cache, recorded)
 
 
 def _cached_texts(
@@ -192,10 +188,8 @@ def _options(field: HasManifest) -> SourceOptions:
             "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
             "(--text-vectors), or lift again with texts"
         )
-    encoder = (
-        "open_clip" if stored["encoder"] == PRECOMPUTED else stored["encoder"]
-    )  # a placeholder that is never loaded
-    return SourceOptions(**{**stored, "encoder": encoder})
+    placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
+    return SourceOptions(**{**stored, **placeholder})
 
 
 def encoder_name(field: HasManifest) -> str | None:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Finding
-from normlift_ns.query.histogram import Histogram
+from normlift_ns.query.engine import Finding, Histogram
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click, join_prompts

@@ -159,7 +159,7 @@ def unoccluded_viewpoint(
     for position in _candidates(np.asarray(first), np.asarray(target.center), np.asarray(up, float)):
         occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
         if occlusion < least:
-            best, least = (float(position[0]), float(position[1]), float(position[2])), occlusion
+            best, least = _as_position(position), occlusion
         if least <= _MAX_OCCLUSION:
             break
     return best
@@ -180,8 +180,12 @@ def viewpoint(
     length = float(np.linalg.norm(offset))
     offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])
     distance = max(target.extent, 1e-6) / np.tan(field_of_view / 2)
-    position = center + offset * distance
-    return float(position[0]), float(position[1]), float(position[2])
+    return _as_position(center + offset * distance)
+
+
+def _as_position(point: np.ndarray) -> Position:
+    x, y, z = point.tolist()
+    return x, y, z
 
 
 def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:

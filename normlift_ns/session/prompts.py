@@ -87,33 +87,30 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
         ValueError: there are no prompts, or too many.
         OSError, MemoryError: the encoder cannot be loaded.
     """
-    texts, known_vectors = split_prompts(text), known_vectors or {}
+    texts, vectors = split_prompts(text), dict(known_vectors or {})
     if len(texts) == 0:
         raise InputError("Type what to look for, then press Ask.")
     if len(texts) > MAX_PROMPTS:
         raise InputError(f"{len(texts)} prompts were typed; ask at most {MAX_PROMPTS} at a time.")
-    new = [one for one in texts if one not in known_vectors]
+    new, errors = [one for one in texts if one not in vectors], {}
     try:
-        vectors: dict[str, Any] = dict(zip(new, read(new) if len(new) > 0 else []))
+        vectors |= zip(new, read(new) if len(new) > 0 else [])
     except ValueError:
-        vectors = {one: _read_alone(one, read) for one in new}
-    return tuple(_row(one, known_vectors[one] if one in known_vectors else vectors[one]) for one in texts)
+        for one in new:
+            try:
+                vectors[one] = _read_alone(one, read)
+            except ValueError as error:
+                errors[one] = str(error)
+    return tuple(
+        Prompt(one, error=errors[one]) if one in errors else Prompt(one, np.asarray(vectors[one], np.float32))
+        for one in texts
+    )
 
 
 def _read_alone(text: str, read: EncodeTexts) -> Any:
-    """Return the vector of a text, or an error message."""
     if is_click(text):
-        return f"{text!r} is not a click of this session or run; click the scene again."
-    try:
-        return read([text])[0]
-    except ValueError as error:
-        return str(error)
-
-
-def _row(text: str, result: Any) -> Prompt:
-    if isinstance(result, str):
-        return Prompt(text, error=result)
-    return Prompt(text, np.asarray(result, np.float32))
+        raise InputError(f"{text!r} is not a click of this session or run; click the scene again.")
+    return read([text])[0]
 
 
 def build_query(
@@ -138,30 +135,30 @@ def build_query(
     Raises:
         ValueError: no row has a vector; as `make_query`.
     """
-    valid = [prompt for prompt in prompts if prompt.vector is not None]
-    if len(valid) == 0:
-        raise InputError(prompts[0].error if len(prompts) > 0 else "Type what to look for, then press Ask.")
-    options: dict[str, Any] = {"min_reliability": min_reliability, "refined": refined}
-    if all(prompt.is_click for prompt in valid):
-        threshold = CLICK_THRESHOLD if threshold is None else threshold
-        question = _question(field, valid, read, negatives=(), rule="cosine", threshold=threshold, **options)
-        return tuple(prompts), question
-    options |= {"negatives": negatives, "rule": rule, "threshold": threshold}
-    question = _question(field, valid, read, **options)
-    if not RELEVANCY_RULES[question.rule].needs_negatives or not any(prompt.is_click for prompt in valid):
-        return tuple(prompts), question
-    error: dict[str, Any] = {"vector": None, "error": _CLICK_RULE}
-    rows = tuple(replace(p, **error) if p.is_click and p.vector is not None else p for p in prompts)
-    return rows, _question(field, [prompt for prompt in rows if prompt.vector is not None], read, **options)
+    rows = tuple(prompts)
+    clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
+    if len(clicks) == 0:
+        raise InputError(rows[0].error if len(rows) > 0 else "Type what to look for, then press Ask.")
+    if all(clicks):
+        negatives, rule, threshold = (), "cosine", CLICK_THRESHOLD if threshold is None else threshold
+    options = {"negatives": negatives, "rule": rule, "threshold": threshold}
+    options |= {"min_reliability": min_reliability, "refined": refined}
+    question = _question(field, rows, read, options)
+    if any(clicks) and RELEVANCY_RULES[question.rule].needs_negatives:
+        error: dict[str, Any] = {"vector": None, "error": _CLICK_RULE}
+        rows = tuple(replace(p, **error) if p.is_click and p.vector is not None else p for p in rows)
+        question = _question(field, rows, read, options)
+    return rows, question
 
 
-def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, **options: Any) -> Query:
-    vectors: dict[str, Any] = {prompt.text: prompt.vector for prompt in prompts}
+def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, options: Mapping[str, Any]) -> Query:
+    """Return the query of the rows that have a vector."""
+    vectors: dict[str, Any] = {prompt.text: prompt.vector for prompt in prompts if prompt.vector is not None}
 
-    def rows(texts: Sequence[str]) -> np.ndarray:
+    def encode(texts: Sequence[str]) -> np.ndarray:
         return np.stack([vectors[text] if text in vectors else read([text])[0] for text in texts])
 
-    return make_query(field, rows, list(vectors), **options)
+    return make_query(field, encode, list(vectors), **options)
 
 
 def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
@@ -188,7 +185,5 @@ def merge_queries(stored: Query | None, asked: Query) -> Query:
             f"{asked.rule}, other negatives or other features, and cannot be saved with them. Replace the stored "
             "prompts, or ask again with the same settings."
         )
-    rows: dict[str, Any] = {
-        prompt.text: prompt.vector for prompt in (*prompts_of_query(stored), *prompts_of_query(asked))
-    }
+    rows = {text: row for query in (stored, asked) for text, row in zip(query.texts, query.embeddings)}
     return replace(asked, texts=tuple(rows), embeddings=np.stack(list(rows.values())))

@@ -103,6 +103,8 @@ class SelectionContext:
         return self._grown(selected, steps, refined) if steps > 0 else self._shrunk(selected, -steps)
 
     def _grown(self, selected: Bool[Tensor, " n"], steps: int, refined: bool) -> Bool[Tensor, " n"]:
+        from scipy.sparse import csgraph  # noqa: PLC0415 (a lift does not need it)
+
         rows = (selected & self.field.valid(refined=refined)).nonzero().squeeze(1)
         if len(rows) == 0:
             return selected
@@ -111,23 +113,23 @@ class SelectionContext:
             return selected
         seeds = selected.cpu().numpy()
         candidates = seeds | self.similar_to(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
-        _, labels = _components(self._graph(candidates))
+        _, labels = csgraph.connected_components(self._graph(candidates), directed=False)
         reached = np.zeros(labels.max() + 1, bool)
         reached[labels[seeds]] = True
         return torch.from_numpy(reached[labels] & candidates).to(selected.device)
 
     def _shrunk(self, selected: Bool[Tensor, " n"], steps: int) -> Bool[Tensor, " n"]:
-        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415 (a lift does not need it)
+        from scipy.sparse import csgraph  # noqa: PLC0415 (as above)
 
         rows = np.flatnonzero(selected.cpu().numpy())
         graph = self._graph(selected.cpu().numpy())[rows][:, rows]
-        count, labels = _components(graph)
+        count, labels = csgraph.connected_components(graph, directed=False)
         means = np.nan_to_num(self.means.detach().double().cpu().numpy()[rows])
         size = np.bincount(labels, minlength=count)
         center = np.stack([np.bincount(labels, x, count) / size for x in means.T], axis=1)
         order = np.lexsort((((means - center[labels]) ** 2).sum(axis=1), labels))
         middles = order[np.unique(labels[order], return_index=True)[1]]
-        hops = dijkstra(graph, directed=False, indices=middles, unweighted=True, min_only=True)
+        hops = csgraph.dijkstra(graph, directed=False, indices=middles, unweighted=True, min_only=True)
         farthest = np.zeros(count)
         np.maximum.at(farthest, labels, hops)
         inner = torch.from_numpy(rows[hops * _FRACTIONS <= farthest[labels] * (_FRACTIONS - steps)])
@@ -137,7 +139,7 @@ class SelectionContext:
 
     def _graph(self, mask: np.ndarray) -> Any:
         """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
-        from scipy.sparse import csr_array  # noqa: PLC0415 (a lift does not need it)
+        from scipy.sparse import csr_array  # noqa: PLC0415 (as above)
 
         first, second = self._edges
         inside = mask[first] & mask[second]
@@ -154,12 +156,6 @@ class SelectionContext:
         near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
         first, slot = np.nonzero(near)
         return first.astype(np.int32), neighbors.index.numpy()[first, slot]
-
-
-def _components(graph: Any) -> tuple[int, np.ndarray]:
-    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415 (as above)
-
-    return components_of_graph(graph, directed=False)
 
 
 @dataclass(frozen=True)

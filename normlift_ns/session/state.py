@@ -129,8 +129,8 @@ class History(Generic[T]):
     """States in chronological order, and the index of the current one.
 
     >>> history = History.of("a").do("b").do("c").undo()
-    >>> history.now, history.undo().now, history.redo().now, history.do("d").can_redo
-    ('b', 'a', 'c', False)
+    >>> history.now, history.undo().now, history.redo().now, history.do("d").redo().now
+    ('b', 'a', 'c', 'd')
     """
 
     states: tuple[T, ...]
@@ -151,16 +151,6 @@ class History(Generic[T]):
     def now(self) -> T:
         """The current state."""
         return self.states[self.index]
-
-    @property
-    def can_undo(self) -> bool:
-        """True if there is an earlier state."""
-        return self.index > 0
-
-    @property
-    def can_redo(self) -> bool:
-        """True if there is a later state, after an undo."""
-        return self.index < len(self.states) - 1
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
         """Make a new state current, and drop undone ones. The state that is current already adds no step.
@@ -197,11 +187,10 @@ class History(Generic[T]):
 # Request tokens that discard stale results: a number per user that increases with every request.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RequestToken:
     """Token of one request."""
 
-    number: int
     description: str
     """Description of the request, shown while it runs."""
 
@@ -217,38 +206,36 @@ class RequestTokens:
     """
 
     _lock: Lock = field(default_factory=Lock, repr=False)
-    _last: RequestToken = RequestToken(0, "")
-    _running: bool = False
+    _running: RequestToken | None = None
 
     def start(self, description: str) -> RequestToken:
         """Return a new token; all earlier ones become stale."""
         with self._lock:
-            self._last, self._running = RequestToken(self._last.number + 1, description), True
-            return self._last
+            self._running = token = RequestToken(description)
+            return token
 
     def is_current(self, token: RequestToken) -> bool:
         """Return whether the result of a request is still wanted."""
-        with self._lock:
-            return self._running and token.number == self._last.number
+        return self._running is token
 
     def finish(self, token: RequestToken) -> bool:
         """End a request; return whether its result is still wanted."""
         with self._lock:
-            current = self._running and token.number == self._last.number
-            self._running = self._running and not current
+            current = self._running is token
+            self._running = None if current else self._running
             return current
 
     def cancel(self) -> bool:
         """Make the running request stale; return whether there was one."""
         with self._lock:
-            running, self._running = self._running, False
-            return running
+            running, self._running = self._running, None
+            return running is not None
 
     @property
     def busy(self) -> str:
         """Description of the running request; empty if there is none."""
-        with self._lock:
-            return self._last.description if self._running else ""
+        running = self._running
+        return "" if running is None else running.description
 
 
 # Job queue that keeps slow work out of viser's few threads, which serve all pages.
@@ -293,9 +280,8 @@ class JobQueue:
 
     def close(self) -> None:
         """Discard the waiting jobs and accept no further ones."""
-        with self._lock:
-            self._ended = True
-            self._jobs.clear()
+        self._ended = True
+        self.clear()
 
     def _run(self) -> None:
         while True:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from normlift_ns.analysis.explain import RecordedVotes, ViewVote
 from normlift_ns.errors import InputError, escape_unprintable
-from normlift_ns.query.histogram import Histogram
+from normlift_ns.query.engine import Histogram
 from normlift_ns.rendering.colors import clip_text
 from normlift_ns.session.actions import diagnose_prompts
 from normlift_ns.session.objects import ObjectList, ObjectRow
@@ -111,7 +111,7 @@ def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
         color: color of the bars above the threshold, RGB in 0..1.
 
     >>> values = np.array([0.1] * 60 + [0.9] * 10)
-    >>> from normlift_ns.query.histogram import relevancy_histogram
+    >>> from normlift_ns.query.engine import relevancy_histogram
     >>> counts = relevancy_histogram(values, np.ones(70, bool), threshold=0.5, limit=None)
     >>> histogram_svg(counts, (1, 0, 0)).count("#ff0000")
     1

@@ -24,6 +24,7 @@ from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import array_digest, check_array, load_arrays, save_arrays
 from normlift_ns.io.atomic import text_digest
+from normlift_ns.io.field import read_evidence
 from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
 from tests.examples import FACTOR, examples
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
@@ -239,7 +240,7 @@ def test_a_product_never_reads_outside_of_its_table() -> None:
 def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     digest = evidence.save(path, key="a")
-    assert digest == Evidence.read(path, key="a")[1] != evidence.save(tmp_path / "f.safetensors")
+    assert digest == read_evidence(path, key="a").digest != evidence.save(tmp_path / "f.safetensors")
     for key in ("", "b"):
         with pytest.raises(ValueError, match=r"is damaged.*digest"):
             Evidence.load(path, key=key)

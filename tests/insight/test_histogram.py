@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from normlift_ns import InputError, SemanticField
 from normlift_ns.query import engine
-from normlift_ns.query.histogram import (
+from normlift_ns.query.engine import (
     HISTOGRAM_BINS,
     draw_histogram,
     presence_limit,

@@ -10,17 +10,19 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from normlift_ns import SemanticField, lift, rasterize_evidence
+from normlift_ns.api import write_run
+from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.io.run_dir import run_directory
 from normlift_ns.lifted_run import load_field
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import ENCODER_KEYS
-from normlift_ns.run_writer import write_run
 from tests.captures import SHARED
-from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
+from tests.nerfstudio_plugin.stock_run import StockRun, relocate_config, train_splatfacto, write_dataset
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -95,23 +97,19 @@ def capture(request: pytest.FixtureRequest) -> Path:
 
 def opened(config: Path, **how: Any) -> Any:
     """The scene of a run."""
-    from normlift_ns.api import open_scene  # noqa: PLC0415
+    from normlift_ns.lifted_run import open_scene  # noqa: PLC0415
 
     return open_scene(config, **how)
 
 
 def read(path: Path) -> Any:
     """config.yml in nerfstudio's classes."""
-    from normlift_ns.nerfstudio_plugin.views import read_nerfstudio_config  # noqa: PLC0415
-
-    return read_nerfstudio_config(path)
+    return yaml.load(dump_config(read_trainer_config(path)), Loader=yaml.Loader)
 
 
 def set_up(config: Path) -> Any:
     """The pipeline that stock nerfstudio's `eval_setup` makes of a run, from any directory; takes `registered`."""
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
-
-    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
     return eval_setup(config, update_config_callback=lambda loaded: relocate_config(loaded, config))[1]
 

@@ -31,6 +31,9 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.data.nerfstudio.config import with_absolute_paths
+from normlift_ns.data.nerfstudio.config_file import locate_run
+from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.rasterization import projection
 from normlift_ns.rasterization.projection import assign_tiles, prepare_gaussians, project
 from normlift_ns.rasterization.rasterize import view_colors
@@ -204,3 +207,12 @@ def rasterization(**how: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     if how["render_mode"] == "RGB+ED":
         channels.append(image[..., -1:] / alpha.clamp(min=1e-10))
     return torch.cat(channels, dim=-1)[None], alpha[None], {"means2d": projected.means2d}
+
+
+def relocate_config(config: Any, path: Path) -> Any:
+    """Make the paths of a loaded config absolute, for `eval_setup` from any directory."""
+    location = locate_run(config, path)
+    config = with_absolute_paths(config, location)
+    if getattr(config.pipeline.model, "semantics", None) is not None:
+        config.pipeline.model.semantics = location.run_dir / FIELD_FOLDER
+    return config

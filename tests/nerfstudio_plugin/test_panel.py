@@ -24,7 +24,7 @@ from plyfile import PlyData
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.exports import TrainedSplat
-from normlift_ns.nerfstudio_plugin.panel_view import prompt_table
+from normlift_ns.nerfstudio_plugin.panel import prompt_table
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, load_query
@@ -104,12 +104,12 @@ def viewer(viewed: tuple[Any, Any]) -> Any:
 @pytest.fixture
 def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The pipeline as loaded; what the panel writes goes to a folder of the test."""
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel_view._DELAY", 0.01)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel._DELAY", 0.01)
     model, output = viewed[0].model, viewed[1].control_panel._output_render
     field = model.field
     model.config.semantics = tmp_path / "run" / "normlift"
     model.config.semantics.mkdir(parents=True)
-    model.normlift._asker.encoder.clear()
+    model.normlift._encoder.clear()
     output.set_options(["rgb", "overlay"])
     output.value = "rgb"
     model.normlift._widgets.rule.value = "auto"
@@ -122,7 +122,7 @@ def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.fixture
 def panel(pipeline: Any) -> Any:
     panel = pipeline.model.normlift
-    panel._asker.encoder.append(Words())
+    panel._encoder.append(Words())
     return panel
 
 
@@ -177,7 +177,7 @@ def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: An
     assert labels[:3] == ["Prompts", "Ask", "Cancel"]
     assert parse_object(pipeline, ViewerElement, "x") == []  # nothing far down in another tab
     assert [element for _, element in parse_object(pipeline, ViewerControl, "x")] == [panel.control]
-    assert (panel._asker.encoder, panel._widgets.prompts.value, panel._widgets.threshold.value) == ([], "left", 0.5)
+    assert (panel._encoder, panel._widgets.prompts.value, panel._widgets.threshold.value) == ([], "left", 0.5)
     expected = run_query(pipeline.model.field, pipeline.model.means, asking("left")).selected[:, 0]
     assert torch.equal(chosen(pipeline), expected)
     assert f"**{int(expected.sum())}** of 60" in said(panel)
@@ -363,7 +363,7 @@ def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
 
 def listed(panel: Any) -> list[Any]:
     """The buttons of the found objects, once they are listed for what is selected."""
-    until(lambda: panel._details._turns.busy == "")
+    until(lambda: panel._detail_turns.busy == "")
     with panel._lock:  # which is held from then on, until they are shown
         return [group for _, group in panel._widgets.rows._rows if group.visible]
 
@@ -418,7 +418,7 @@ def test_floaters_are_selected(panel: Any, pipeline: Any, monkeypatch: pytest.Mo
 
 def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_path: Path, panel: Any) -> None:
     import normlift_ns as nl  # noqa: PLC0415
-    from normlift_ns.nerfstudio_plugin.panel_view import explanation_of_run  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.panel import explanation_of_run  # noqa: PLC0415
 
     for prompts in ("up", "left"):
         ask(panel, prompts)

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from normlift_ns.api import _lifted_config
 from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
@@ -28,7 +29,6 @@ from normlift_ns.data.nerfstudio.dataparsers import apply_pose_adjustments, norm
 from normlift_ns.data.nerfstudio.load import TrainedViews
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.run_writer import _lifted_config
 from tests.examples import examples
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun
@@ -37,9 +37,7 @@ GREY = torch.tensor([0.2, 0.4, 0.7])
 
 
 def as_nerfstudios(config: Any) -> Any:
-    from normlift_ns.nerfstudio_plugin import views as module  # noqa: PLC0415
-
-    return module.to_nerfstudio_config(config)
+    return yaml.load(dump_config(config), Loader=yaml.Loader)
 
 
 def test_mirrors_have_the_fields_and_defaults_of_nerfstudios_classes() -> None:
@@ -115,7 +113,7 @@ def assert_equal(datamanager: config_classes.FullImageDatamanagerConfig, folder:
     """The views and the world of a data set are those of nerfstudio's own data manager."""
     from nerfstudio.cameras.cameras import CameraType  # noqa: PLC0415
 
-    from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
+    from normlift_ns.data.nerfstudio.dataset_views import DatasetViews  # noqa: PLC0415
 
     config = config_classes.TrainerConfig(pipeline=config_classes.VanillaPipelineConfig(datamanager=datamanager))
     manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(device="cpu", test_mode="test")

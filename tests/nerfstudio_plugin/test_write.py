@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from normlift_ns import SemanticField
+from normlift_ns.api import write_run
 from normlift_ns.io import atomic
 from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.query.question import Query, load_query
-from normlift_ns.run_writer import write_run
 from tests.nerfstudio_plugin.conftest import field_of, opened, read, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 from tests.processes import killed_at

@@ -15,6 +15,7 @@ import pytest
 import normlift_ns as nl
 from normlift_ns.cli import evaluate, export, lift, query
 from tests.golden.summary import differences, without_news
+from tests.nerfstudio_plugin.stock_run import relocate_config
 from tests.scripts.conftest import run_entry
 
 QUERIES = {"lifted": ("--text", "red", "sky blue", "--threshold", 0.4), "trained": ("--text", "red")}
@@ -54,8 +55,6 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
 @pytest.mark.usefixtures("nerfstudio")
 def test_stock_nerfstudio_loads_them(config: Path) -> None:
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
-
-    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
     pipeline = eval_setup(config, update_config_callback=lambda loaded: relocate_config(loaded, config))[1]
     run = nl.open_run(config)

@@ -17,7 +17,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.api import open_run
 from normlift_ns.cli import batch
 from normlift_ns.cli.batch import (
     WHOLE_LIST,
@@ -35,6 +34,7 @@ from normlift_ns.cli.batch import (
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.file_lock import ClaimState, read_claim_states, read_jsonl, try_claim
+from normlift_ns.lifted_run import open_run
 from tests.processes import FORK, killed_at
 from tests.scripts import stand_in
 from tests.scripts.conftest import SMALL, run_entry, said, wait_for

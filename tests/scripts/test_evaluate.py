@@ -43,7 +43,7 @@ def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_nothing_is_replaced_unasked(little_lifted, capture, tmp_path, monkeypatch, capsys):
     masks = ("--protocol", "masks", "--labels", capture / "instance", "--study", "sweeps", "signals")
     coverage = ("--protocol", "none", "--study", "coverage")
-    monkeypatch.setattr("normlift_ns.api.open_run", None)  # refused before anything is opened
+    monkeypatch.setattr("normlift_ns.lifted_run.open_run", None)  # refused before anything is opened
     monkeypatch.chdir(tmp_path)
     plots = ("scores.json", "scores_sweeps.svg", "scores_signals.svg", "output.json")
     coverages = ("scores_coverage_camera_path.json", "scores_coverage_pose_5.png")

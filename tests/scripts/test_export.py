@@ -17,6 +17,7 @@ from normlift_ns.analysis.objects import connected_components
 from normlift_ns.cli import export
 from normlift_ns.exports import answer_instances
 from normlift_ns.rendering.figures import view_mask
+from tests.nerfstudio_plugin.stock_run import relocate_config
 from tests.scripts.conftest import run_entry, said
 
 EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "class_id", "instance_id"]
@@ -32,7 +33,6 @@ def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
-    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
     setup = ns_export.eval_setup
 
@@ -148,7 +148,7 @@ def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_p
 
 
 def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("normlift_ns.api.open_run", None)  # refused before anything is opened
+    monkeypatch.setattr("normlift_ns.lifted_run.open_run", None)  # refused before anything is opened
     for existing in ("splat.ply", "splat_rows.npy", "splat_names.json", "splat_objects.json"):
         (tmp_path / existing).write_text("mine")
         assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.query.histogram import relevancy_histogram
+from normlift_ns.query.engine import relevancy_histogram
 from normlift_ns.session import actions
 from normlift_ns.session.prompts import Prompt, build_query
 from normlift_ns.session.state import State

@@ -1,4 +1,4 @@
-"""Configs and training views of a run as nerfstudio makes them."""
+"""Images and cameras of a run as nerfstudio itself makes them, without lens distortion. Imports nerfstudio."""
 
 from __future__ import annotations
 
@@ -12,53 +12,13 @@ from jaxtyping import Bool, Float, UInt8
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from normlift_ns.data.images import SplitViews
-from normlift_ns.data.nerfstudio import config as plain
-from normlift_ns.data.nerfstudio.config import dump_config, locate_run
+from normlift_ns.data.nerfstudio.config import dump_config
 from normlift_ns.data.nerfstudio.load import camera_type_error
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.errors import InputError
-from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
-
-
-def read_nerfstudio_config(path: Path) -> TrainerConfig:
-    """Read a config.yml into nerfstudio's classes.
-
-    Raises:
-        FileNotFoundError, ValueError: as `normlift_ns.data.nerfstudio.config.read_trainer_config`.
-    """
-    return to_nerfstudio_config(plain.read_trainer_config(path))
-
-
-def to_nerfstudio_config(config: Any) -> TrainerConfig:
-    """Convert a config that normlift_ns has read and checked to nerfstudio's classes."""
-    # Loader is safe here: dump_config wrote the text, and it names allowed classes only
-    return yaml.load(dump_config(config), Loader=yaml.Loader)
-
-
-def relocate_config(config: TrainerConfig, config_path: Path, data: Path | None = None) -> TrainerConfig:
-    """Return a copy of the config with absolute paths, valid from any directory, and without seed points.
-
-    It also works with stock nerfstudio:
-    `eval_setup(path, update_config_callback=lambda config: rerooted(config, path))`.
-
-    Raises:
-        FileNotFoundError: as `locate`.
-    """
-    location = locate_run(config, config_path, data)
-    config = plain.with_absolute_paths(config, location)
-    model: Any = config.pipeline.model
-    if isinstance(model, NormLiftModelConfig) and model.semantics is not None:
-        model.semantics = location.run_dir / FIELD_FOLDER
-    return config
-
-
-# Images and cameras of a run as splatfacto trained on them, without lens distortion.
-
 
 _SUPPORTED_CAMERAS = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
 
@@ -157,9 +117,9 @@ def nerfstudio_views(
         poses: camera-to-world poses of the training views.
         background: RGB in 0..1 behind images with an alpha channel.
     """
-    manager: Any = to_nerfstudio_config(config).pipeline.datamanager.setup(
-        device="cpu", test_mode="test", world_size=1, local_rank=0
-    )
+    # Loader is safe here: dump_config wrote the text, and it names allowed classes only
+    datamanager = yaml.load(dump_config(config.pipeline.datamanager), Loader=yaml.Loader)
+    manager = datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
     held_out = manager.eval_dataset
     return (
         DatasetViews(manager.train_dataset, folder, poses, background),
