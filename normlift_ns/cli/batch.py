@@ -11,12 +11,12 @@ import os
 import re
 import secrets
 import shlex
-import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -28,7 +28,7 @@ from rich.table import Table
 from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command, run_command_process
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
-from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, exit_with_parent
+from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.file_lock import (
@@ -403,37 +403,23 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
     ):
         try:
             while True:
-                try:
+                with suppress(subprocess.TimeoutExpired):
                     return process.wait(interval)
-                except subprocess.TimeoutExpired:
-                    if not on_tick():
-                        _terminate(process)
-                        return None
-        except BaseException:  # Ctrl-C or SIGTERM
-            _terminate(process)
-            raise
+                if not on_tick():
+                    return None
+        finally:  # also after Ctrl-C or SIGTERM
+            end_processes([process], _GRACE)
 
 
 def failure_reason(code: int, log: Path) -> str:
     """Return why a process failed: the signal that killed it, or the last line that it printed."""
     if code < 0:
-        name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-        hint = ", perhaps because the system ran out of memory" if -code == signal.SIGKILL else ""
-        return f"its process was killed by {name}{hint}; see its output in {log}"
+        return f"its process was killed by {describe_signal(-code)}; see its output in {log}"
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _TAIL))
         lines = file.read().decode("utf8", "replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip() != ""), "")
     return last or f"its process ended with exit code {code} and without output"
-
-
-def _terminate(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(_GRACE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 # Worker that lifts captures of a list, possibly alongside other workers.

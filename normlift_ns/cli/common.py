@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import warnings
+from argparse import ArgumentError, ArgumentParser
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import fields, is_dataclass
@@ -122,26 +123,17 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
     >>> split_output_flags(["--k", "8", "--quiet", "--log-file", "a.log"])
     (['--k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
     """
-    rest, quiet, log_file = [], False, None
-    indices = iter(range(len(words)))
-    for i in indices:
-        following = words[i + 1] if i + 1 < len(words) else "--"
-        if words[i] == "--":  # the rest is for another command
-            return [*rest, *words[i:]], OutputSettings(quiet, log_file)
-        if words[i] == "--quiet":
-            quiet = following != "False"
-            if not following.startswith("-"):
-                if following not in ("True", "False"):
-                    raise InputError(f"--quiet must be True or False, got {following!r}")
-                next(indices)
-        elif words[i] in ("--log-file", "--log_file"):
-            if following.startswith("--"):
-                raise InputError("--log-file needs a file name")
-            log_file = Path(following)
-            next(indices)
-        else:
-            rest.append(words[i])
-    return rest, OutputSettings(quiet, log_file)
+    end = words.index("--") if "--" in words else len(words)  # the rest is for another command
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--quiet", nargs="?", const="True", default="False")
+    parser.add_argument("--log-file", "--log_file", type=Path)
+    try:
+        flags, rest = parser.parse_known_args(words[:end])
+    except ArgumentError:
+        raise InputError("--log-file needs a file name") from None
+    if flags.quiet not in ("True", "False"):
+        raise InputError(f"--quiet must be True or False, got {flags.quiet!r}")
+    return [*rest, *words[end:]], OutputSettings(flags.quiet == "True", flags.log_file)
 
 
 @contextmanager

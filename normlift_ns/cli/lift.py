@@ -28,6 +28,7 @@ from normlift_ns.cli.common import (
     print_error,
     run_command,
     run_command_process,
+    split_output_flags,
 )
 from normlift_ns.cli.preflight import (
     check_new_run,
@@ -138,8 +139,10 @@ class NormLift:
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
+            first, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
+            others = split_output_flags(first)[0]  # only the first process writes the log file
             code = launch_processes(
-                [sys.executable, "-m", "normlift_ns.cli.lift", *sys.argv[1:]], self.num_devices, print_error
+                [[*program, *words] for words in (first, *[others] * (self.num_devices - 1))], print_error
             )
             if code > 0:
                 sys.exit(code)

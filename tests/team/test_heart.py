@@ -11,14 +11,9 @@ from typing import Any
 
 import pytest
 
-from normlift_ns.distributed import launch as module
-from normlift_ns.distributed.launch import (
-    HEARTBEAT_TIMEOUT,
-    Heartbeat,
-    PeerFailure,
-    describe_failure,
-    rank_and_world_size,
-)
+from normlift_ns.distributed import heartbeat as module
+from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat, PeerFailure
+from normlift_ns.distributed.launch import describe_failure, rank_and_world_size
 from normlift_ns.errors import InputError
 
 
