@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -23,9 +24,7 @@ from normlift_ns.core.consensus import consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.core.lift import lift
-from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.refine import clamp_k, refine
+from normlift_ns.core.refine import clamp_k
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
@@ -36,14 +35,21 @@ from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_w
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,
+    ViewObservations,
     batch_evidence,
     evidence_keys,
     observe_views,
     sample_evenly,
 )
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
-from normlift_ns.pipeline import choose_raster_config, start_kernel_warm_up
-from normlift_ns.progress import peak_gib
+from normlift_ns.pipeline import (
+    choose_raster_config,
+    consensus_options,
+    lift_features,
+    start_kernel_warm_up,
+    vote_directions,
+)
+from normlift_ns.progress import StageTimer, peak_gib
 from normlift_ns.rasterization.evidence_cache import views_in_cache
 
 # Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
@@ -237,8 +243,8 @@ def _cached(cached: int, views: int) -> str:
 # Cost of consensus, lift, neighbors, vote and storage, extrapolated from two samples of the Gaussians.
 
 
-Timed = Callable[[Callable[[], Any]], tuple[float, Any]]
-"""Does some work; returns its seconds and its result."""
+Clock = Callable[[], float]
+"""Returns seconds."""
 _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
 """Gaussians in the larger sample."""
 _SAMPLE_RATIO = 4
@@ -247,22 +253,13 @@ _MAX_SAMPLE_VIEWS = 64
 """Maximum number of views in the samples. The cost of more views is extrapolated in proportion."""
 
 
-@dataclass(frozen=True)
-class _Costs:
-    """Cost of one sample: seconds and number of items of every stage, and stored bytes."""
-
-    seconds: dict[str, float]
-    items: dict[str, float]
-    stored: int
-
-
 def measure_core(
     gaussians: GaussianScene,
     evidence: Evidence,
     features: Float[Tensor, "s d"],
     options: LiftOptions,
     views: int,
-    time: Timed,
+    clock: Clock,
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each stage of the core of a lift, and the bytes that it stores.
 
@@ -283,20 +280,15 @@ def measure_core(
     for count in 2 * (most // _SAMPLE_RATIO, most):  # the first two only load or compile kernels for these sizes
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
         rows = rows.to(gaussians.means.device)
-        parts = {"rows": evidence.rows.select_rows(rows), "unlabeled": evidence.unlabeled.select_rows(rows)}
-        sample = replace(evidence, **parts, num_excluded=0)
-        costs.append(_costs(gaussians.means[rows], sample, times, table, options, time))
+        sample = replace(evidence.select_gaussians(rows), num_excluded=0)
+        costs.append(_costs(gaussians.means[rows], sample, times, table, options, clock))
     items = _items(evidence, times, len(gaussians), options)
     counts = {name: value * (factor if name != "neighbors" else 1.0) for name, value in items.items()}
     counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
     counts["consensus"] *= factor
-    small, large = costs[2:]
-    rates = {
-        name: _rate((small.items[name], seconds), (large.items[name], large.seconds[name]), counts[name])
-        for name, seconds in small.seconds.items()
-    }
-    stored = _rate((small.items["store"], small.stored), (large.items["store"], large.stored), counts["store"])
-    return rates, stored
+    (small, few, few_bytes), (large, many, many_bytes) = costs[2:]
+    rates = {name: _rate((few[name], small[name]), (many[name], large[name]), counts[name]) for name in small}
+    return rates, _rate((few["store"], few_bytes), (many["store"], many_bytes), counts["store"])
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
@@ -313,33 +305,30 @@ def _costs(
     times: int,
     features: Float[Tensor, "s d"],
     options: LiftOptions,
-    timed: Timed,
-) -> _Costs:
-    """Run all stages of a lift that follow the evidence, on some Gaussians."""
-    evidence = Evidence.merge(*[sample] * times)
-    lift_kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
-    seconds: dict[str, float] = {}
+    clock: Clock,
+) -> tuple[dict[str, float], dict[str, float], int]:
+    """Run all stages of a lift that follow the evidence, on some Gaussians.
+
+    Returns:
+        Seconds of every stage, number of its items, and stored bytes.
+    """
+    stages, evidence = StageTimer(lambda stage, done, total: None, clock), Evidence.merge(*[sample] * times)
+    views = ViewObservations(evidence, features, torch.zeros(len(features), dtype=torch.int64))
     table, copied = features, None
     if options.consensus:
-        kwargs = {
-            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
-        }  # fmt: skip
-        seconds["consensus"], result = timed(lambda: consensus(evidence, features, **kwargs))
-        table = result.features
-    seconds["lift"], lifted = timed(lambda: lift(evidence, table, **lift_kwargs))
-    if options.consensus:
-        seconds["lift"] += timed(lambda: lift(evidence, features, **lift_kwargs))[0]
+        with stages("consensus"):
+            table = consensus(
+                evidence, features, sample=options.consensus_sample, **consensus_options(options)
+            ).features
+    with stages("lift"):
+        lifted, own = lift_features(views, table, options)
     if options.refine:
         vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-        seconds["neighbors"], neighbors = timed(lambda: nearest_neighbors(means, vote.k))
-        own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-        seconds["vote"], copied = timed(
-            lambda: refine(means, lifted.directions, reliability, vote, own=own, neighbors=neighbors)
-        )
-    store_kwargs = {"tolerance": options.tolerance, "storage": options.storage}
-    seconds["store"], field = timed(lambda: SemanticField.build(lifted, means, copied, **store_kwargs))
+        copied, _ = vote_directions(means, lifted, own, vote, stages)
+    with stages("store"):
+        field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
     stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
-    return _Costs(seconds, _items(sample, times, len(means), options), stored_bytes)
+    return stages.seconds, _items(sample, times, len(means), options), stored_bytes
 
 
 def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:
@@ -427,8 +416,7 @@ def diagnose_versions() -> Diagnostic:
 def _required_packages() -> list[str]:
     """Return the names of the packages that normlift_ns requires; none in a source tree."""
     required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()
-    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
-    return ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
+    return [re.split(r"[^\w.-]", requirement)[0] for requirement in required if "extra ==" not in requirement]
 
 
 def _version(name: str) -> str | None:
@@ -511,7 +499,6 @@ def _free_memory() -> int | None:
 # The results are discarded, and nothing is downloaded. Cached views are read, not computed again.
 
 
-Clock = Callable[[], float]
 _Result = TypeVar("_Result")
 _MAX_VIEWS = 4
 """Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
@@ -531,16 +518,6 @@ class _Observed(NamedTuple):
 
     block: ViewBatch
     seconds: float
-
-
-class _Rasterized(NamedTuple):
-    """Evidence of some views, and what it cost."""
-
-    evidence: Evidence
-    seconds: float
-    cached_seconds: float
-    """Seconds to read it from the cache."""
-    write_bytes_s: float
 
 
 def time_kernel_loading(
@@ -589,7 +566,10 @@ def measure_capture(
 
     chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
     observe_cached = partial(observe, source=cached_only(source, cache))
-    cached = _cached_views(chosen if options.reuse_evidence else (), observe_cached)
+    cached: dict[int, ViewBatch] = {}
+    for index in chosen if options.reuse_evidence else ():
+        with suppress(NotCachedError):
+            cached[index] = observe_cached([index]).block
     new = [index for index in chosen if index not in cached]
     batch = segmentation_workers(source)
     encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
@@ -600,13 +580,20 @@ def measure_capture(
     def rasterize(folder: Path) -> Evidence:
         return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
-    rasterized = _measure_evidence(rasterize, timed, cuda=cuda)
-    evidence, count = rasterized.evidence, len(block.cameras)
+    count = len(block.cameras)
+    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:
+        folder, file = Path(name), Path(name) / "again.safetensors"
+        if cuda:  # kernels for labels like these are compiled once for all lifts
+            rasterize(folder / "first")
+        evidence_s, evidence = timed(lambda: rasterize(folder))
+        cached_evidence_s, _ = timed(lambda: rasterize(folder))
+        write_s, _ = timed(lambda: evidence.save(file))
+        write_bytes_s = file.stat().st_size / max(write_s, 1e-6)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
-    rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
+    rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), clock)
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
     return Measurements(
-        device=_device_name(device),
+        device=torch.cuda.get_device_name(device) if cuda else f"{device}, {torch.get_num_threads()} threads",
         views=len(used),
         gaussians=len(gaussians),
         dimension=block.features[0].shape[1],
@@ -618,14 +605,15 @@ def measure_capture(
         features_s=_per_view(observed),
         cached_features_s=cached_s,
         cached_features_share=len(cached) / len(chosen),
-        evidence_s=rasterized.seconds / count,
-        cached_evidence_s=rasterized.cached_seconds / count,
+        evidence_s=evidence_s / count,
+        cached_evidence_s=cached_evidence_s / count,
         cached_evidence_share=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
-        write_bytes_s=rasterized.write_bytes_s,
-        view_bytes=_map_bytes(block) / count,
+        write_bytes_s=write_bytes_s,
+        view_bytes=sum(4 * rows.numel() + 2 * labels.numel() for labels, rows in zip(block.labels, block.features))
+        / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
         measured_views=max(count, len(observed.block.cameras)),
@@ -636,32 +624,6 @@ def _per_view(observed: _Observed) -> float | None:
     """Return the seconds for each view; None without views."""
     count = len(observed.block.cameras)
     return observed.seconds / count if count > 0 else None
-
-
-def _map_bytes(block: ViewBatch) -> int:
-    """Return the size of labels and features in the cache."""
-    return sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
-
-
-def _cached_views(indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed]) -> dict[int, ViewBatch]:
-    """Return the views that can be observed from the cache, by index."""
-    cached: dict[int, ViewBatch] = {}
-    for index in indices:
-        with suppress(NotCachedError):
-            cached[index] = observe([index]).block
-    return cached
-
-
-def _measure_evidence(rasterize: Callable[[Path], Evidence], timed: Timed, *, cuda: bool) -> _Rasterized:
-    """Rasterize some views into a temporary folder, read them from there, and write their evidence once more."""
-    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:
-        folder, file = Path(name), Path(name) / "again.safetensors"
-        if cuda:  # kernels for labels like these are compiled once for all lifts
-            rasterize(folder / "first")
-        seconds, evidence = timed(lambda: rasterize(folder))
-        cached_seconds, _ = timed(lambda: rasterize(folder))
-        saved_s, _ = timed(lambda: evidence.save(file))
-        return _Rasterized(evidence, seconds, cached_seconds, file.stat().st_size / max(saved_s, 1e-6))
 
 
 def _observe_loaded(
@@ -702,12 +664,6 @@ def _evidence_cached(
         hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, drawing))
         share += sum(hits) / max(1, len(hits)) * views / chosen
     return share
-
-
-def _device_name(device: str) -> str:
-    if torch.device(device).type != "cuda":
-        return f"{device}, {torch.get_num_threads()} threads"
-    return torch.cuda.get_device_name(device)
 
 
 def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple[float, _Result]:

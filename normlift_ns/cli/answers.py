@@ -1,55 +1,70 @@
-"""Tables and files that ns-normlift-query and ns-normlift-export make of an answer."""
+"""Tables that ns-normlift-query prints of an answer, and images of the votes for it. Only the images need torch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-from PIL import Image
 from rich.table import Table
 
-from normlift_ns.analysis.catalogue import Catalogue
-from normlift_ns.analysis.explain import ViewVote, Why
-from normlift_ns.api import open_run
-from normlift_ns.cli.common import CONSOLE, info, plain_text
-from normlift_ns.core.device import choose_device
-from normlift_ns.encoders.cache import CachedTextMasks
+from normlift_ns.cli.common import CONSOLE, format_number, info, plain_text
 from normlift_ns.io.atomic import atomic_files, safe_file_name
-from normlift_ns.io.run_dir import cache_folder
-from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.query.engine import Answer, run_query
+from normlift_ns.query.histogram import draw_histogram
 from normlift_ns.query.question import Query
-from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, SegmentationResult, query_sam3
-from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.rendering.figures import unique_file_names
-from normlift_ns.segmentation.checkpoint import TEXT_PROMPT_FAMILIES, check_sam_checkpoint
+
+if TYPE_CHECKING:
+    from normlift_ns.analysis.catalogue import Catalogue
+    from normlift_ns.analysis.explain import ViewVote, Why
+    from normlift_ns.analysis.vote_records import RecordedVotes
+
+
+def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
+    """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
+    rule = f"{question.rule} > {question.threshold:.4g}"
+    CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=CONSOLE.width < 100))
+    for row in rows:
+        if row["stands_out"] is False:
+            top, limit = row["histogram"]["top"], row["histogram"]["limit"]
+            position = "" if row["nearest"] is None else f" at {format_number(row['nearest'])}"
+            info(
+                f"{row['text']}: probably not in this scene. The nearest match{position} has relevancy {top:.3f}; "
+                f"objects in a scene usually reach at least {limit:.3g}."
+            )
+
+
+def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
+    """Return a table with one row per prompt.
+
+    Args:
+        rows: Rows of `Answer.to_json`.
+        rule: Selection rule for the title, such as lerf > 0.5.
+        threshold: Threshold that each histogram marks with a bar |.
+        narrow: Leave out the histograms.
+    """
+    result = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
+    wrapped = ("text", "centroid", "extent")
+    for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
+        justify = "left" if name == "text" else "right"
+        result.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
+    if not narrow:
+        result.add_column("histogram", no_wrap=True)
+    result.add_column("suggested", justify="right", no_wrap=True)
+    for row in rows:
+        names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
+        *cells, suggested = (format_number(row[name]) for name in names)
+        bins = row["histogram"]
+        bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
+        histogram = () if narrow else (plain_text(bars),)
+        result.add_row(plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
+    return result
+
+
+# ns-normlift-query --objects: the objects in a selection.
+
 
 _MAX_ROWS = 40
 """Largest number of objects in the table."""
-
-
-def find_catalog(config: Path, data: Path | None, question: Query, metres_per_unit: float | None) -> Catalogue:
-    """Return the objects that a query selects; opens the whole run, because best views need the cameras of the scene.
-
-    Raises:
-        FileNotFoundError, ValueError: Same as in `open_run` and `LiftedRun.catalogue`.
-    """
-    run = open_run(config, data=data)
-    result = run_query(run.field, run.scene.gaussians.means, question)
-    return run.catalogue(result, metres_per_unit=metres_per_unit)
-
-
-def query_metadata(question: Query) -> dict[str, Any]:
-    """Return the query settings for the catalog file."""
-    return {
-        "texts": list(question.texts),
-        "relevancy": question.rule,
-        "threshold": question.threshold,
-        "min_reliability": question.min_reliability,
-    }
 
 
 def print_catalog(catalog: Catalogue) -> None:
@@ -87,26 +102,10 @@ IMAGES_PER_GROUP = 3
 _LARGEST_WEIGHT = "weighs most"
 
 
-def explain_answer(config: Path, data: Path | None, answer: Answer) -> tuple[LiftedRun, list[Why | None]]:
-    """Open the whole run, and explain the selection of every prompt by the votes of its images.
-
-    Returns:
-        The run, and one explanation per prompt; None for a prompt that selects nothing.
-    Raises:
-        FileNotFoundError, ValueError: Same as in `open_run` and `LiftedRun.why`.
-    """
-    run, refined = open_run(config, data=data), answer.question.refined
-    masks = torch.as_tensor(answer.selected).T
-    return run, [run.votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
-
-
-def explanation_to_json(run: LiftedRun, why: Why | None) -> dict[str, Any] | None:
-    """Return an explanation as plain types, with image names."""
-    if why is None:
-        return None
+def explanation_to_json(names: Sequence[str], why: Why) -> dict[str, Any]:
+    """Return an explanation as plain types, with the names of the images."""
     row = why.to_json()
-    views = [{"photograph": run.votes.names[view["view"]], **view} for view in row["views"]]
-    return {**row, "views": views}
+    return {**row, "views": [{"photograph": names[view["view"]], **view} for view in row["views"]]}
 
 
 def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
@@ -115,7 +114,7 @@ def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
 
 
 def save_vote_images(
-    run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
+    recorded: RecordedVotes, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
 ) -> list[Path]:
     """Write the images of the largest weights and disagreements, all or none; return their paths.
 
@@ -126,7 +125,11 @@ def save_vote_images(
         OSError: A file cannot be written.
         FileNotFoundError, ValueError: Same as in `Votes.pictures`.
     """
-    names = unique_file_names(run.votes.names)
+    from PIL import Image  # noqa: PLC0415 (the tables do not need it)
+
+    from normlift_ns.rendering.figures import unique_file_names  # noqa: PLC0415
+
+    names = unique_file_names(recorded.names)
     votes: dict[Path, ViewVote] = {}
     for index, (text, why) in enumerate(zip(texts, reasons)):
         for kind, group in ({} if why is None else _votes_to_show(why)).items():
@@ -136,14 +139,14 @@ def save_vote_images(
     if len(votes) == 0:
         return []
     with atomic_files(*votes, overwrite=overwrite) as drafts:
-        for draft, picture in zip(drafts, run.votes.pictures(votes.values())):
+        for draft, picture in zip(drafts, recorded.pictures(votes.values())):
             Image.fromarray(picture.image.numpy()).save(draft, format="PNG")
     return list(votes)
 
 
-def print_explanations(run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
+def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
     """Print a table of images, and a sentence per prompt about their agreement."""
-    result = explanation_table(run.votes.names, texts, reasons, narrow=CONSOLE.width < 120)
+    result = explanation_table(names, texts, reasons, narrow=CONSOLE.width < 120)
     if result.row_count > 0:
         CONSOLE.print(result)
     for text, why in zip(texts, reasons):
@@ -172,40 +175,13 @@ def explanation_table(
     return result
 
 
-# ns-normlift-query --segment: SAM 3's masks for the same prompts, lifted and compared with the run's answer.
-
-
-def segment_with_sam3(
-    config: Path, data: Path | None, answer: Answer, *, model: str, views: int, device: str
-) -> tuple[SegmentationResult, list[dict[str, Any]]]:
-    """Segment training views with SAM 3 for the prompts of an answer, and lift the masks.
-
-    Args:
-        config: Config of the lifted run.
-        data: Current path of the dataset, if it was moved.
-        answer: The run's answer to the same prompts.
-        model: Weights of SAM 3: a folder, or a name on the Hugging Face hub.
-        views: Largest number of training views.
-        device: auto, cpu or cuda.
-    Returns:
-        The lifted masks, and their summary for every prompt.
-    Raises:
-        FileNotFoundError, ValueError: as in `check_sam_checkpoint`, `open_run`, `query_sam3` and `Sam3Network.load`.
-    """
-    device = choose_device(device)
-    check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
-    run = open_run(config, data=data)
-    info(f"Running SAM 3 on {min(views, len(run.scene.train))} of {len(run.scene.train)} training views")
-    settings, min_reliability = RasterSettings.recorded(run.field.manifest), answer.question.min_reliability
-    cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
-    kwargs = {"views": views, "min_reliability": min_reliability, "settings": settings, "device": device}
-    segmented = query_sam3(run.scene, cached.find, answer.question.texts, **kwargs)
-    rows = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(answer.selected))
-    return segmented, [{"model": model, **row} for row in rows]
+# ns-normlift-query --segment: SAM 3's masks for the same prompts.
 
 
 def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
     """Print the table of SAM 3's answer."""
+    from normlift_ns.query.sam3_query import MIN_MASK_FRACTION  # noqa: PLC0415 (loads torch)
+
     limit = max(row["min_reliability"] for row in rows)
     reliable = f" and reliability at least {limit:g}" if limit > 0 else ""
     table = Table(
@@ -214,22 +190,8 @@ def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> No
     for name in ("text", "Gaussians", "centroid", "extent", "peak", "agreement", "reliability", "found in", "IoU"):
         table.add_column(name, justify="left" if name == "text" else "right")
     for text, row in zip(texts, rows):
-        vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
-        numbers = (_format(row[name]) for name in ("peak", "agreement", "mean_reliability"))
+        names = ("centroid", "extent", "peak", "agreement", "mean_reliability")
+        numbers = (format_number(row[name]) for name in names)
         views = f"{len(row['found_in'])} of {len(row['views'])} views, {len(row['agree'])} agree"
-        table.add_row(plain_text(text), f"{row['fraction']:.2%}", *vectors, *numbers, views, _format(row["iou"]))
+        table.add_row(plain_text(text), f"{row['fraction']:.2%}", *numbers, views, format_number(row["iou"]))
     CONSOLE.print(table)
-
-
-def _format(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def sam3_arrays(segmented: SegmentationResult) -> dict[str, np.ndarray]:
-    """Return relevancy, reliability and agreement of every Gaussian, as arrays of shape [N, Q]."""
-    columns = {
-        "segment_relevancy": [answer.relevancy for answer in segmented.answers],
-        "segment_reliability": [answer.scalars.reliability for answer in segmented.answers],
-        "segment_agreement": [answer.scalars.c_inter for answer in segmented.answers],
-    }
-    return {name: torch.stack(tensors, dim=1).cpu().numpy() for name, tensors in columns.items()}

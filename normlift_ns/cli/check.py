@@ -15,7 +15,7 @@ from rich.text import Text
 
 import normlift_ns
 from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command, run_command_process
-from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.lift import NormLift, print_plan
 from normlift_ns.cli.preflight import check_writable_file
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
 from normlift_ns.io.atomic import refuse_existing, write_text_file
@@ -59,7 +59,6 @@ class NormLiftCheck(NormLift):
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None
         from normlift_ns import planning  # noqa: PLC0415
-        from normlift_ns.cli.dry_run import compare_cameras, open_capture, plan_lift  # noqa: PLC0415
         from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.encoders.build import make_source  # noqa: PLC0415
         from normlift_ns.planning import Diagnostic  # noqa: PLC0415
@@ -74,7 +73,7 @@ class NormLiftCheck(NormLift):
         source = _try(rows, "2D features", lambda: make_source(options, device))
         missing = [] if source is None else planning.missing_weights(options, device)
         rows += [] if source is None else [planning.diagnose_weights(missing)]
-        opened = _try(rows, "capture", lambda: open_capture(self, start_time))
+        opened = _try(rows, "capture", lambda: self.open_capture(start_time))
         if opened is None:
             return rows, None
         scene = opened.scene
@@ -83,14 +82,14 @@ class NormLiftCheck(NormLift):
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
         if self.check:
-            warning = _try(rows, "cameras", lambda: (compare_cameras(self, opened, device),))
+            warning = _try(rows, "cameras", lambda: (self.compare_cameras(opened, device),))
             if warning == (None,):
                 rows.append(Diagnostic("cameras", "ok", "three images match renders from their cameras"))
             elif warning is not None:
                 rows.append(Diagnostic("cameras", "warning", str(warning[0])))
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
-        plan = _try(rows, "plan", lambda: plan_lift(self, opened, source, device))
+        plan = _try(rows, "plan", lambda: self.make_plan(opened, source, device))
         if plan is not None:
             rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]
         return rows, plan
@@ -133,11 +132,8 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
     CONSOLE.print(table)
     if plan is None:
         info("Correct the errors above to see how long the lift will take.")
-        return
-    from normlift_ns.cli.dry_run import describe_needs, plan_table  # noqa: PLC0415
-
-    CONSOLE.print(plan_table(plan))
-    info(describe_needs(plan))
+    else:
+        print_plan(plan)
 
 
 def _to_json(rows: list[Diagnostic], plan: Plan | None) -> str:

@@ -352,6 +352,17 @@ def plain_text(value: object) -> Text:
     return Text(escape_unprintable(str(value)))
 
 
+def format_number(value: float | Sequence[float] | None) -> str:
+    """Return a number or a vector as a cell of a table; a dash stands for None and for an empty vector.
+
+    >>> format_number(0.12345), format_number([1, 2.5]), format_number(None)
+    ('0.123', '1.00 2.50', '-')
+    """
+    if isinstance(value, Sequence):
+        return " ".join(f"{x:.2f}" for x in value) or "-"
+    return "-" if value is None else f"{value:.3f}"
+
+
 def info(text: str) -> None:
     """Print a line on standard output without wrapping."""
     CONSOLE.print(plain_text(text), soft_wrap=True)

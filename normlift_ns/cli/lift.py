@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from rich.console import Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -48,12 +48,15 @@ from normlift_ns.distributed.launch import (
     rank_and_world_size,
 )
 from normlift_ns.errors import InputError
+from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
     from normlift_ns.distributed.communicator import TorchCommunicator
+    from normlift_ns.encoders.base import FeatureSource
     from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.planning import Plan
     from normlift_ns.progress import ProgressCallback
 
 
@@ -81,7 +84,12 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
         raise
 
 
-# ns-normlift: lift 2D features onto a trained splat to make it searchable with text.
+class OpenedCapture(NamedTuple):
+    """An opened capture and the seconds that each stage has taken so far."""
+
+    scene: Scene
+    run_dir: Path
+    stage_seconds: dict[str, float]
 
 
 @dataclass
@@ -151,13 +159,67 @@ class NormLift:
             return self._lift(team)
 
     def _plan(self) -> None:
+        """Print what the lift needs, without lifting anything."""
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.cli.dry_run import describe_needs, dry_run, plan_table  # noqa: PLC0415 (loads torch)
+        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (loads torch)
+        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
+        from normlift_ns.planning import missing_weights  # noqa: PLC0415
 
-        plan = dry_run(self, start_time)
-        CONSOLE.print(plan_table(plan))
-        info(describe_needs(plan))
+        device = choose_device(self.device)
+        init_cuda(device)
+        options = self.source.looking_for(self.queries)
+        source = make_source(options, device)
+        missing = missing_weights(options, device)
+        if len(missing) > 0:
+            raise FileNotFoundError(
+                f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
+                "Download them first, or give local files with --encoder-pretrained and --sam-model."
+            )
+        opened = self.open_capture(start_time)
+        warning = self.compare_cameras(opened, device) if self.check else None
+        if warning is not None:
+            info(f"Warning: {warning}")
+        print_plan(self.make_plan(opened, source, device))
+
+    def open_capture(self, start_time: float) -> OpenedCapture:
+        """Open the capture to plan a lift of it.
+
+        Args:
+            start_time: Start of the command by `time.perf_counter`.
+        """
+        from normlift_ns.api import open_scene  # noqa: PLC0415 (as above)
+
+        import_time = time.perf_counter()
+        trained = self.open_trained()
+        scene = open_scene(trained, data=self.data, load_step=self.load_step) if isinstance(trained, Path) else trained
+        run_dir = run_directory(self.output_dir or scene.runs_dir, scene.name, self.timestamp)
+        seconds = {"start": import_time - start_time, "open": time.perf_counter() - import_time}
+        return OpenedCapture(scene, run_dir, seconds)
+
+    def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
+        """Return a warning if images and renders of three views differ; add the time to that of the stages."""
+        from normlift_ns.data.alignment import alignment_warning, measure_alignment  # noqa: PLC0415 (as above)
+        from normlift_ns.data.open_splat import SplatScene  # noqa: PLC0415
+        from normlift_ns.pipeline import resolve_gsplat_version  # noqa: PLC0415
+        from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
+        from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
+
+        scene = opened.scene
+        opened.stage_seconds["kernels"] = time_kernel_loading(scene, self.lift, device=device)
+        start = time.perf_counter()
+        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, self.lift))
+        match = measure_alignment(scene, settings, device=device)
+        opened.stage_seconds["check"] = time.perf_counter() - start
+        return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+
+    def make_plan(self, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
+        """Estimate the lift from a short measurement of the opened capture."""
+        from normlift_ns.planning import make_plan, measure_capture  # noqa: PLC0415 (as above)
+
+        scene, run_dir, seconds = opened
+        facts = measure_capture(scene, source, self.lift, cache_folder(run_dir), device=device, before=seconds)
+        return make_plan(facts, num_devices=self.num_devices)
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
@@ -291,6 +353,26 @@ def progress_bars() -> Iterator[ProgressCallback]:
             progress.update(tasks[stage], completed=done, total=total)
 
         yield report
+
+
+def print_plan(plan: Plan) -> None:
+    """Print the stages of a plan with their seconds and what is cached, and a sentence about memory and disk."""
+    table = Table("stage", title=f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}")
+    table.add_column("seconds", justify="right")
+    table.add_column("cached")
+    for stage in plan.stages:
+        table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
+    table.add_section()
+    table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
+    CONSOLE.print(table)
+    gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
+    subject = f"{plan.num_devices} processes share the work. Each" if plan.num_devices > 1 else "The lift"
+    space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
+    info(f"{subject} needs about {gpu}{space}.")
+
+
+def _views(count: int) -> str:
+    return f"{count} view{'s' * (count != 1)}"
 
 
 def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:

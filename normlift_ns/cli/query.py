@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import glob
 import json
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from normlift_ns.cli.common import info, info_opening, run_command, run_command_process
+from normlift_ns.cli.common import info, info_opening, print_error, run_command, run_command_process
 from normlift_ns.cli.preflight import check_distinct_paths, check_lifted_run, check_writable_file, check_writable_folder
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, refuse_existing, safe_file_name, write_text_file
-from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
 from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
 
 if TYPE_CHECKING:
+    from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.query.arrays import QuickRun
     from normlift_ns.query.engine import Answer
     from normlift_ns.query.question import Query
@@ -86,8 +89,6 @@ class NormLiftQuery:
         """Run the query, write files, print the table and return its rows."""
         self._check()
         info_opening(self.load_config)
-        from normlift_ns.cli.repl import answer_lines, run_repl  # noqa: PLC0415 (--help should not wait for NumPy)
-
         run = self._open()
         if self.stdin:
             answer_lines(run, self.ask.rules())
@@ -99,8 +100,8 @@ class NormLiftQuery:
 
     def _answer(self, run: QuickRun) -> list[dict[str, Any]]:
         """Answer --text, write files, print the table and return its rows."""
-        from normlift_ns.cli.repl import print_answer  # noqa: PLC0415
-        from normlift_ns.query.question import save_query  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.cli.answers import print_answer  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.query.question import save_query  # noqa: PLC0415
 
         result = run.ask(self.text, **self.ask.rules())
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
@@ -133,60 +134,107 @@ class NormLiftQuery:
             from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
 
             choose_device(self.device)
+        vectors, template = self.ask.text_vectors, self.ask.text_template
         open_with = partial(
-            open_quick, self.load_config, device=self.device, text_vectors=self.ask.text_vectors,
-            text_template=self.ask.text_template,
-        )  # fmt: skip
-        run = open_with()
-        if run is not None:
-            return run
+            open_quick, self.load_config, device=self.device, text_vectors=vectors, text_template=template
+        )
+        return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
+
+    @cached_property
+    def _run(self) -> LiftedRun:
+        """The run with its scene, which most answers do not need."""
         from normlift_ns.api import open_run  # noqa: PLC0415 (as above)
 
-        means = open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()
-        return cast("QuickRun", open_with(means=means))
+        return open_run(self.load_config, data=self.data)
+
+    def _answer_with_scene(self, question: Query) -> Answer:
+        from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
+
+        return run_query(self._run.field, self._run.scene.gaussians.means, question)
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
         """Load everything that renders need, and return a function that renders and saves them."""
-        from normlift_ns.api import open_run  # noqa: PLC0415
-        from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415
 
-        run, folder = open_run(self.load_config, data=self.data), cast(Path, self.render_dir)
-        cameras = training_cameras(run.scene, self.render_views)
-        result = run_query(run.field, run.scene.gaussians.means, question)
-        settings = RasterSettings.recorded(run.field.manifest)
-        return lambda: save_overlays(run.scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
+        scene, folder = self._run.scene, cast(Path, self.render_dir)
+        cameras = training_cameras(scene, self.render_views)
+        result, settings = self._answer_with_scene(question), RasterSettings.recorded(self._run.field.manifest)
+        return lambda: save_overlays(scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add an explanation to every row, write the images, and return a function that prints the explanations."""
-        from normlift_ns.cli.answers import explain_answer, explanation_to_json, print_explanations, save_vote_images  # noqa: PLC0415
+        """Add an explanation to every row, write the images, and return a function that prints the explanations.
 
-        run, reasons = explain_answer(self.load_config, self.data, result)
-        for row, reason in zip(rows, reasons):
-            row["why"] = explanation_to_json(run, reason)
+        A prompt that selects nothing has no explanation.
+        """
+        import torch  # noqa: PLC0415
+
+        from normlift_ns.cli import answers  # noqa: PLC0415
+
+        votes, refined = self._run.votes, result.question.refined
+        masks = torch.as_tensor(result.selected).T
+        reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
+        for row, why in zip(rows, reasons):
+            row["why"] = None if why is None else answers.explanation_to_json(votes.names, why)
         if self.why_dir is not None:
-            save_vote_images(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
-        return lambda: print_explanations(run, self.text, reasons)
+            answers.save_vote_images(votes, self.text, reasons, self.why_dir, overwrite=self.overwrite)
+        return lambda: answers.print_explanations(votes.names, self.text, reasons)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
-        """Add SAM 3's answer to every row, and return its arrays and a function that prints it."""
-        from normlift_ns.cli.answers import print_sam3_table, sam3_arrays, segment_with_sam3  # noqa: PLC0415
+        """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
 
-        kwargs = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
-        segmented, summaries = segment_with_sam3(self.load_config, self.data, result, **kwargs)
+        Returns:
+            The arrays of the lifted masks, and a function that prints the summaries.
+        """
+        import torch  # noqa: PLC0415
+
+        from normlift_ns.cli.answers import print_sam3_table  # noqa: PLC0415
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415
+        from normlift_ns.encoders.cache import CachedTextMasks  # noqa: PLC0415
+        from normlift_ns.query.sam3_query import query_sam3  # noqa: PLC0415
+        from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
+        from normlift_ns.segmentation.checkpoint import TEXT_PROMPT_FAMILIES, check_sam_checkpoint  # noqa: PLC0415
+
+        model, device = self.segment_model or DEFAULT_SAM3, choose_device(self.device)
+        check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
+        run, question = self._run, result.question
+        count = len(run.scene.train)
+        info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
+        cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
+        segmented = query_sam3(
+            run.scene, cached.find, question.texts,
+            views=self.segment_views, min_reliability=question.min_reliability,
+            settings=RasterSettings.recorded(run.field.manifest), device=device,
+        )  # fmt: skip
+        summaries = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(result.selected))
         for row, summary in zip(rows, summaries):
-            row["segment"] = summary
-        return sam3_arrays(segmented), lambda: print_sam3_table(self.text, summaries)
+            row["segment"] = {"model": model, **summary}
+        columns = {
+            "segment_relevancy": [answer.relevancy for answer in segmented.answers],
+            "segment_reliability": [answer.scalars.reliability for answer in segmented.answers],
+            "segment_agreement": [answer.scalars.c_inter for answer in segmented.answers],
+        }
+        arrays = {name: torch.stack(tensors, dim=1).cpu().numpy() for name, tensors in columns.items()}
+        return arrays, lambda: print_sam3_table(self.text, summaries)
 
     def _list_objects(self, question: Query) -> Callable[[], None]:
-        """Find objects, write their files, and return a function that prints them."""
-        from normlift_ns.analysis.catalogue import write_catalogue  # noqa: PLC0415 (as above)
-        from normlift_ns.cli.answers import find_catalog, print_catalog, query_metadata  # noqa: PLC0415
+        """Find objects, write their files, and return a function that prints them.
 
-        catalog = find_catalog(self.load_config, self.data, question, self.metres_per_unit)
+        This opens the whole run, because best views need the cameras of the scene.
+        """
+        from normlift_ns.analysis.catalogue import write_catalogue  # noqa: PLC0415 (as above)
+        from normlift_ns.cli.answers import print_catalog  # noqa: PLC0415
+
+        answer = self._answer_with_scene(question)
+        catalog = self._run.catalogue(answer, metres_per_unit=self.metres_per_unit)
         if self.objects_dir is not None:
-            write_catalogue(catalog, self.objects_dir, question=query_metadata(question), overwrite=self.overwrite)
+            metadata = {
+                "texts": list(question.texts),
+                "relevancy": question.rule,
+                "threshold": question.threshold,
+                "min_reliability": question.min_reliability,
+            }
+            write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 
     def _check(self) -> None:
@@ -247,6 +295,84 @@ class NormLiftQuery:
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 
 
+def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> None:
+    """Answer prompts that a user types, one per line, until Ctrl-D; invalid prompts print an error message.
+
+    Args:
+        run: The lifted run.
+        rules: Keyword arguments of `QuickRun.ask`.
+        keep_history: Store prompts in the history file.
+    """
+    from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
+    from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
+
+    from normlift_ns.cli.answers import print_answer  # noqa: PLC0415
+
+    file = _history_file() if keep_history else None
+    session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
+    info(f"{len(run.field.arrays['source']):,} Gaussians. Type one prompt per line; Ctrl-D quits.")
+    while True:
+        try:
+            text = session.prompt("> ").strip()
+        except KeyboardInterrupt:
+            continue
+        except EOFError:
+            return
+        if text == "":
+            continue
+        try:
+            answer = run.ask([text], **rules)
+        except (InputError, OSError, MemoryError) as error:
+            print_error(str(error))
+        else:
+            print_answer(answer.to_json(), answer.question)
+
+
+def _history_file() -> Path | None:
+    """Return the history file, which only the user can read; None if it cannot be created."""
+    with suppress(OSError):
+        folder = user_state_folder()
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            os.close(os.open(folder / "history", os.O_RDWR | os.O_CREAT, 0o600))
+            (folder / "history").chmod(0o600)
+            return folder / "history"
+    return None
+
+
+def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes] | None = None) -> None:
+    """Answer one prompt per line, and print each answer immediately as one line of JSON; skip empty lines.
+
+    Args:
+        run: The lifted run.
+        rules: Keyword arguments of `QuickRun.ask`.
+        lines: The prompts; None: lines of standard input.
+    Raises:
+        ValueError: Some lines failed; the JSON line of each has an `error`.
+    """
+    stdin: Any = sys.stdin  # None if it is closed
+    source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
+    if sys.stdout is None:
+        raise InputError("standard output is closed; --stdin prints its answers there")
+    failed = total = 0
+    for line in source:
+        text = line.decode("utf8", "replace").lstrip("\ufeff").strip()  # byte order mark of files from Windows
+        if text == "":
+            continue
+        total += 1
+        try:
+            answer = run.ask([text], **rules)
+            (row,) = answer.to_json()
+            output = {**row, "rule": answer.question.rule, "threshold": answer.question.threshold}
+        except InputError as error:
+            failed += 1
+            output = {"text": text, "error": str(error)}
+        sys.stdout.write(json.dumps(output) + "\n")
+        sys.stdout.flush()
+    if failed > 0:
+        raise InputError(f"{failed} of {total} lines could not be answered; see their `error` for the reasons")
+
+
 def _write_json(path: Path, rows: list[dict[str, Any]], question: Query, overwrite: bool) -> None:
     rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
     write_text_file(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
@@ -270,10 +396,5 @@ def entrypoint() -> None:
     run_command(NormLiftQuery)
 
 
-def main() -> None:
-    """Run ns-normlift-query as a process."""
-    run_command_process(NormLiftQuery)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftQuery)
