@@ -282,10 +282,8 @@ def measure_core(
         rows = rows.to(gaussians.means.device)
         sample = replace(evidence.select_gaussians(rows), num_excluded=0)
         costs.append(_costs(gaussians.means[rows], sample, times, table, options, clock))
-    items = _items(evidence, times, len(gaussians), options)
-    counts = {name: value * (factor if name != "neighbors" else 1.0) for name, value in items.items()}
-    counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
-    counts["consensus"] *= factor
+    counts = _items(evidence, times, len(gaussians), options)
+    counts |= {"consensus": counts["consensus"] * factor**2, "lift": counts["lift"] * factor}
     (small, few, few_bytes), (large, many, many_bytes) = costs[2:]
     rates = {name: _rate((few[name], small[name]), (many[name], large[name]), counts[name]) for name in small}
     return rates, _rate((few["store"], few_bytes), (many["store"], many_bytes), counts["store"])
@@ -379,11 +377,12 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
         return Diagnostic("in view", "error", message, "give the cameras of this splat, or --world-transform")
-    if share < _FEW_IN_VIEW:
-        return Diagnostic(
-            "in view", "warning", message, "the others get no semantics; are these the cameras of the splat?"
-        )
-    return Diagnostic("in view", "ok", message)
+    advice = "the others get no semantics; are these the cameras of the splat?"
+    return (
+        Diagnostic("in view", "warning", message, advice)
+        if share < _FEW_IN_VIEW
+        else Diagnostic("in view", "ok", message)
+    )
 
 
 def diagnose_device(device: str) -> Diagnostic:
@@ -403,13 +402,11 @@ def diagnose_versions() -> Diagnostic:
     missing = [name for name in _required_packages() if _version(name) is None]
     message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
-        return Diagnostic(
-            "versions", "warning", f"{message}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
-        )
+        message = f"{message}; ns-* commands need nerfstudio"
+        return Diagnostic("versions", "warning", message, "pip install nerfstudio==1.1.5")
     if len(missing) > 0:
-        return Diagnostic(
-            "versions", "error", f"{message}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
-        )
+        message = f"{message}; not installed: {', '.join(missing)}"
+        return Diagnostic("versions", "error", message, f"pip install {missing[0]}")
     return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 

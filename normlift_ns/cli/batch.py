@@ -25,7 +25,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.table import Table
 
-from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command, run_command_process
+from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
 from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
@@ -564,8 +564,3 @@ class NormLiftBatch:
 def entrypoint() -> None:
     """Run ns-normlift-batch in a process that continues afterwards."""
     run_command(NormLiftBatch)
-
-
-def main() -> None:
-    """Run ns-normlift-batch as a process."""
-    run_command_process(NormLiftBatch)

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 import normlift_ns
-from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command, run_command_process
+from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
 from normlift_ns.cli.lift import NormLift, print_plan
 from normlift_ns.cli.preflight import check_writable_file
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
@@ -148,8 +148,3 @@ def _to_json(rows: list[Diagnostic], plan: Plan | None) -> str:
 def entrypoint() -> None:
     """Run ns-normlift-check in a process that continues afterwards."""
     run_command(NormLiftCheck)
-
-
-def main() -> None:
-    """Run ns-normlift-check as a process."""
-    run_command_process(NormLiftCheck)

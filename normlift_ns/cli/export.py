@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
-from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
+from normlift_ns.cli.common import (
+    CONSOLE,
+    format_number,
+    info,
+    info_opening,
+    plain_text,
+    run_command,
+    run_command_process,
+)
 from normlift_ns.cli.preflight import (
     check_lifted_run,
     check_readable_file,
@@ -98,8 +106,6 @@ class NormLiftExport:
         check_device(self.device)
         check_prompt_list("text", self.text)
         check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
-        if self.part in ("selection", "rest") and len(self.text) == 0 and not has_stored_queries(self.load_config):
-            raise InputError(f"--part {self.part} needs prompts, and the run stores no queries; give --text")
         outputs = self._outputs()
         self._check_outputs(outputs)
         info_opening(self.load_config)
@@ -184,41 +190,37 @@ class NormLiftExport:
         target = outputs["ply"]
         suffixes = ("rows.npy", "names.json", "objects.json")
         files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
-        refuse_existing(*files, overwrite=self.overwrite, flags="--output-dir or --output-filename")
-        for file in files:
-            check_writable_file(file, "--output-dir")
+        cloud = outputs.get("cloud")
         self._check_answer()
-        if self.masks_dir is not None:
-            check_writable_folder(self.masks_dir, "--masks-dir")
-            if self.part == "clean":
-                raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
-        if self.arrays_dir is not None:
-            check_writable_folder(self.arrays_dir, "--arrays-dir")
-            paths = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
-            refuse_existing(*paths, overwrite=self.overwrite, flags="--arrays-dir")
-        if self.transfer is not None:
-            check_readable_file(self.transfer, "--transfer")
-            path = outputs["cloud"]
-            if path in files:
-                raise InputError(
-                    f"{path} would be both the splat and the labeled cloud; give another --output-filename"
-                )
+        check_readable_file(self.transfer, "--transfer")
+        if self.masks_dir is not None and self.part == "clean":
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        if cloud in files:
+            raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
+        for path in (*files, cloud):
             check_writable_file(path, "--output-dir")
-            refuse_existing(path, overwrite=self.overwrite, flags="--output-dir")
-        for kind in self.exporters:
-            refuse_existing(outputs[kind], overwrite=self.overwrite, flags="--output-dir or --output-filename")
+        check_writable_folder(self.masks_dir, "--masks-dir")
+        check_writable_folder(self.arrays_dir, "--arrays-dir")
+        exported = (outputs[kind] for kind in self.exporters)
+        refuse_existing(*files, *exported, overwrite=self.overwrite, flags="--output-dir or --output-filename")
+        if cloud is not None:
+            refuse_existing(cloud, overwrite=self.overwrite, flags="--output-dir")
+        if self.arrays_dir is not None:
+            arrays = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
+            refuse_existing(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""
         if len(self.text) > 0 or has_stored_queries(self.load_config):
             return
-        flags = [
-            f"--{name.replace('_', '-')}" for name in ("masks_dir", "arrays_dir", "transfer") if getattr(self, name)
-        ]
+        names = ("masks_dir", "arrays_dir", "transfer")
+        flags = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
         for kind in self.exporters:
             from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
             flags += [f"--exporters {kind}"] if EXPORTERS.load(kind).needs_answer else []
+        if self.part in ("selection", "rest"):
+            flags.insert(0, f"--part {self.part}")
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 
@@ -230,18 +232,12 @@ def _objects_table(queries: list[dict[str, Any]]) -> Table:
     for entry in queries:
         for i, item in enumerate(entry["objects"]):
             box = item["box"]
-            sizes = (high - low for low, high in zip(box["min"], box["max"]))
-            vectors = (" ".join(f"{x:.2f}" for x in vector) for vector in (item["centroid"], sizes))
-            numbers = (f"{item['size']:,}", *vectors, f"{item['mean_reliability']:.3f}")
-            table.add_row(plain_text(entry["text"] if i == 0 else ""), str(item["instance_id"]), *numbers)
-        table.add_row(
-            plain_text("" if entry["objects"] else entry["text"]),
-            "smaller",
-            f"{entry['in_smaller_parts']:,}",
-            "",
-            "",
-            "",
-        )
+            sizes = [high - low for low, high in zip(box["min"], box["max"])]
+            numbers = map(format_number, (item["centroid"], sizes, item["mean_reliability"]))
+            text = plain_text(entry["text"] if i == 0 else "")
+            table.add_row(text, str(item["instance_id"]), f"{item['size']:,}", *numbers)
+        text = plain_text("" if entry["objects"] else entry["text"])
+        table.add_row(text, "smaller", f"{entry['in_smaller_parts']:,}")
     return table
 
 
@@ -250,10 +246,5 @@ def entrypoint() -> None:
     run_command(NormLiftExport)
 
 
-def main() -> None:
-    """Run ns-normlift-export as a process."""
-    run_command_process(NormLiftExport)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftExport)

@@ -477,10 +477,5 @@ def entrypoint() -> None:
     run_command(NormLift)
 
 
-def main() -> None:
-    """Run ns-normlift as a process."""
-    run_command_process(NormLift)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLift)

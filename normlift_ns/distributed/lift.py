@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
+from normlift_ns import pipeline
 from normlift_ns.core.consensus import (
     CHANCE_AGREEMENT,
     Consensus,
@@ -47,47 +48,26 @@ from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import RefineConfig
-from normlift_ns.pipeline import (
-    LiftRequest,
-    LiftResult,
-    announce,
-    check_alignment,
-    check_directions,
-    check_target,
-    consensus_facts,
-    consensus_options,
-    count_directions,
-    count_votes,
-    lift_features,
-    lift_provenance,
-    lift_statistics,
-    plan_collection,
-    prepare_lift,
-    start_kernel_warm_up,
-    vote_shares,
-    with_cost,
-    write_lifted_run,
-)
 from normlift_ns.progress import ProgressCallback, StageTimer
 
 
-def run_lift_distributed(team: TorchCommunicator, request: LiftRequest) -> LiftedRun | None:
+def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest) -> LiftedRun | None:
     """Run `run_lift` in several processes, all with the same request. Only rank 0 writes and returns the run."""
-    prepared, stages = prepare_lift(request), StageTimer(request.report)
+    prepared, stages = pipeline.prepare_lift(request), StageTimer(request.report)
     run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
     prepared = replace(prepared, run_dir=run_dir)
     if team.rank == 0:
-        check_target(prepared)
-    announce(prepared)
+        pipeline.check_target(prepared)
+    pipeline.announce(prepared)
     if team.rank == 0:
-        check_alignment(prepared, stages)
+        pipeline.check_alignment(prepared, stages)
     cache, device = cache_folder(run_dir), prepared.device
-    collection = plan_collection(
+    collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
     )
     with team.shared_folder(cache):
         result = lift_scene_distributed(team, collection, device, prepared.encoder, request.report)
-    return None if result is None else write_lifted_run(prepared, result, stages)
+    return None if result is None else pipeline.write_lifted_run(prepared, result, stages)
 
 
 def lift_scene_distributed(
@@ -96,7 +76,7 @@ def lift_scene_distributed(
     device: str,
     encoder: Mapping[str, Any],
     report: ProgressCallback,
-) -> LiftResult | None:
+) -> pipeline.LiftResult | None:
     """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
 
     Args:
@@ -104,34 +84,34 @@ def lift_scene_distributed(
     """
     stages, facts = StageTimer(team.aggregate_progress(report)), {}
     options, means = collection.options, collection.gaussians.means
-    wait_for_kernels = start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
+    wait_for_kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
     portion = Partition.from_means(team, means)
     views = _collect(team, collection, portion, stages, wait_for_kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
             agreed = consensus_distributed(
-                views, portion, sample=options.consensus_sample, **consensus_options(options)
+                views, portion, sample=options.consensus_sample, **pipeline.consensus_options(options)
             )
             step()
-        table, facts = agreed.features, consensus_facts(options, agreed)
+        table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
     with stages("lift") as step:
-        lifted, own = lift_features(views, table, options)
-        check_directions(team.all_reduce(count_directions(lifted)), len(means), collection.source)
+        lifted, own = pipeline.lift_features(views, table, options)
+        pipeline.check_directions(team.all_reduce(pipeline.count_directions(lifted)), len(means), collection.source)
         step()
     copied = None
     if options.refine:
         copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
         facts |= vote_facts
     with stages("store") as step:
-        statistics = lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
-        provenance = lift_provenance(collection, encoder, statistics)
+        statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
+        provenance = pipeline.lift_provenance(collection, encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
             tolerance=options.tolerance, storage=options.storage, provenance=provenance,
         )  # fmt: skip
         step()
-    return None if field is None else LiftResult(with_cost(field, stages, device), stages.seconds)
+    return None if field is None else pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
 
 
 def _collect(
@@ -222,8 +202,8 @@ def vote_distributed(
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        counts = team.all_reduce(count_votes(copied, gaussians, neighbors, reliability))
-    return copied, vote_shares(counts, len(means))
+        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
+    return copied, pipeline.vote_shares(counts, len(means))
 
 
 def build_field_distributed(

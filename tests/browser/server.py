@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-OWN = "from normlift_ns.cli.view import main; main()"
+OWN = "from normlift_ns.cli.start import view; view()"
 STOCK = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
 PATIENCE = 180.0
 """Seconds after which a state that is waited for does not come any more, on a machine with much else to do."""
