@@ -16,9 +16,9 @@ from rich.text import Text
 import normlift_ns
 from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
 from normlift_ns.cli.lift import NormLift, print_plan
-from normlift_ns.cli.preflight import check_writable_file
+from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
-from normlift_ns.io.atomic import refuse_existing, write_text_file
+from normlift_ns.io.atomic import write_text_file
 
 if TYPE_CHECKING:
     from normlift_ns.planning import Diagnostic, Plan
@@ -43,9 +43,7 @@ class NormLiftCheck(NormLift):
             SystemExit: There is an error; the exit code is 1.
         """
         start_time = time.perf_counter()
-        if self.json is not None:
-            check_writable_file(self.json, "--json")
-            refuse_existing(self.json, overwrite=self.overwrite, flags="--json")
+        check_new_files(self.json, overwrite=self.overwrite, flags="--json")
         rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:

@@ -20,8 +20,8 @@ from normlift_ns.cli.common import (
 )
 from normlift_ns.cli.preflight import (
     check_lifted_run,
+    check_new_files,
     check_readable_file,
-    check_writable_file,
     check_writable_folder,
     has_stored_queries,
 )
@@ -197,17 +197,13 @@ class NormLiftExport:
             raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
         if cloud in files:
             raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
-        for path in (*files, cloud):
-            check_writable_file(path, "--output-dir")
         check_writable_folder(self.masks_dir, "--masks-dir")
-        check_writable_folder(self.arrays_dir, "--arrays-dir")
         exported = (outputs[kind] for kind in self.exporters)
-        refuse_existing(*files, *exported, overwrite=self.overwrite, flags="--output-dir or --output-filename")
-        if cloud is not None:
-            refuse_existing(cloud, overwrite=self.overwrite, flags="--output-dir")
+        check_new_files(*files, *exported, overwrite=self.overwrite, flags="--output-dir or --output-filename")
+        check_new_files(cloud, overwrite=self.overwrite, flags="--output-dir")
         if self.arrays_dir is not None:
-            arrays = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
-            refuse_existing(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
+            arrays = (self.arrays_dir / name for name in LABEL_ARRAY_FILES)
+            check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""

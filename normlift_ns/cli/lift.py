@@ -39,14 +39,7 @@ from normlift_ns.cli.preflight import (
     check_unused_options,
     check_writable_folder,
 )
-from normlift_ns.distributed.launch import (
-    LAUNCHED_VARIABLE,
-    PeerFailureError,
-    describe_failure,
-    distributed_context,
-    launch_processes,
-    rank_and_world_size,
-)
+from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
@@ -74,10 +67,6 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
                 CONSOLE.quiet = True
                 warnings.simplefilter("ignore")
             yield team
-    except PeerFailureError as error:
-        if not error.failure.reported:
-            print_error(describe_failure(error.failure))
-        sys.exit(1)
     except (KeyboardInterrupt, TerminatedError):
         if started_by_us:
             sys.exit(1)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from normlift_ns.cli.common import info, info_opening, print_error, run_command, run_command_process
-from normlift_ns.cli.preflight import check_distinct_paths, check_lifted_run, check_writable_file, check_writable_folder
+from normlift_ns.cli.preflight import check_distinct_paths, check_lifted_run, check_new_files, check_writable_folder
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
@@ -244,15 +244,12 @@ class NormLiftQuery:
         check_lifted_run(self.load_config, self.data, self.ask)
         check_distinct_paths(json=self.json, output_path=self.output_path)
         for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
-            if path is not None:
-                refuse_existing(path, overwrite=self.overwrite, flags=flag)
-                check_writable_file(path, flag)
+            check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.why_dir, "--why-dir")
         if self.objects_dir is not None:
-            check_writable_folder(self.objects_dir, "--objects-dir")
-            files = [self.objects_dir / name for name in CATALOG_FILES]
-            refuse_existing(*files, overwrite=self.overwrite, flags="--objects-dir")
+            files = (self.objects_dir / name for name in CATALOG_FILES)
+            check_new_files(*files, overwrite=self.overwrite, flags="--objects-dir")
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:

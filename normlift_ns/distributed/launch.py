@@ -37,14 +37,6 @@ _PR_SET_PDEATHSIG = 1
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
-class PeerFailureError(RuntimeError):
-    """Loss or failure of another process."""
-
-    def __init__(self, lost: PeerFailure) -> None:
-        super().__init__(f"process {lost.rank} ({lost.host}) {'failed' if lost.reported else 'was lost'}")
-        self.failure = lost
-
-
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
     """Return rank and world size from the variables that torchrun and `launch_processes` set; None: a single process.
 
@@ -182,7 +174,7 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
         log: callback for a message that names a lost process, if no other process reports it.
     Raises:
         InputError: if the processes cannot connect, or there are too few GPUs.
-        LostError: if another process fails or is lost.
+        SystemExit: if another process fails or is lost; the exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)
     if ranks is None:
@@ -210,7 +202,9 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
             lost = PeerFailure(rank, True, "this one") if lost is None else lost._replace(reported=True)
         if lost is None:
             raise
-        raise PeerFailureError(lost) from error
+        if not lost.reported:
+            log(describe_failure(lost))
+        raise SystemExit(1) from error
     heart.stop(well=True)
     dist.destroy_process_group()
 
