@@ -136,11 +136,9 @@ class NormLift:
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
-            first, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
-            others = split_output_flags(first)[0]  # only the first process writes the log file
-            code = launch_processes(
-                [[*program, *words] for words in (first, *[others] * (self.num_devices - 1))], print_error
-            )
+            words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
+            other = [*program, *split_output_flags(words)[0]]  # only the first process writes the log file
+            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], print_error)
             if code > 0:
                 sys.exit(code)
             return None
@@ -177,11 +175,8 @@ class NormLift:
         Args:
             start_time: Start of the command by `time.perf_counter`.
         """
-        from normlift_ns.api import open_scene  # noqa: PLC0415 (as above)
-
         import_time = time.perf_counter()
-        trained = self.open_trained()
-        scene = open_scene(trained, data=self.data, load_step=self.load_step) if isinstance(trained, Path) else trained
+        scene = self.open_scene()
         run_dir = run_directory(self.output_dir or scene.runs_dir, scene.name, self.timestamp)
         seconds = {"start": import_time - start_time, "open": time.perf_counter() - import_time}
         return OpenedCapture(scene, run_dir, seconds)
@@ -213,8 +208,7 @@ class NormLift:
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import scene_opener  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
+        from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.pipeline import LiftRequest, RunTarget, run_lift  # noqa: PLC0415
 
         import_time = time.perf_counter()
@@ -225,12 +219,8 @@ class NormLift:
             info_progress(text)
 
         with progress_bars() as report:
-            trained = self.open_trained()
-            is_config = isinstance(trained, Path)
             request = LiftRequest(
-                open_scene=scene_opener(
-                    trained, self.data if is_config else None, self.load_step if is_config else None
-                ),
+                open_scene=self.open_scene,
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
@@ -292,15 +282,13 @@ class NormLift:
             if getattr(options, name) != getattr(default, name, None):
                 raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
 
-    def open_trained(self) -> Path | Scene:
-        """Return the config of the run; for a splat, or with --add-images, the opened scene."""
-        splat = self.load_ply or self.load_gsplat
-        if splat is None and self.add_images is None:
-            return cast(Path, self.load_config)
+    def open_scene(self) -> Scene:
+        """Open the trained scene, with the images of --add-images."""
         from normlift_ns.api import open_scene  # noqa: PLC0415 (as above)
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
 
+        splat = self.load_ply or self.load_gsplat
         if splat is not None:
             scene: Any = open_splat(splat, self.splat, say=info_progress)
         else:
