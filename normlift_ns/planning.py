@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import tempfile
@@ -479,15 +478,11 @@ def _check_capacity(name: str, needed: int, free: int, advice: str) -> Diagnosti
 def _free_memory() -> int | None:
     """Return the bytes that this process may still allocate; None if the system does not report them."""
     limits = []
-    try:
+    with suppress(OSError, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
         limits += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
-    except (OSError, ValueError, IndexError):
-        pass
-    if len(limits) == 0 and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     return min(limits) if len(limits) > 0 else None
 
 

@@ -50,6 +50,7 @@ from normlift_ns.options import check_options, short_repr
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
 """Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
+_SOURCE_NAMES = ("load_config", *_SOURCES.values())
 _NOT_IN_KEY = ("device", "timestamp", "output_dir")
 """Options that do not change what is lifted, only where it is computed or stored."""
 _KEY_LENGTH = 16
@@ -84,7 +85,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         common = _parse(options)
     except InputError as error:
         raise InputError(f"After --: {error}") from None
-    if (name := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
+    if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
             f"--{name.replace('_', '-')} comes after --, where it applies to every capture. Write it into {path}, one "
             "line per capture."
@@ -134,10 +135,6 @@ def _capture_key(command: NormLift) -> str:
     sizes = [(file.name, file.stat().st_size) for file in _scene_files(command) if file.is_file()]
     text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
     return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
-
-
-def _source_names() -> tuple[str, ...]:
-    return "load_config", *_SOURCES.values()
 
 
 def _scene_files(command: NormLift) -> list[Path]:

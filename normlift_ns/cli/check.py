@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 from rich.table import Table
@@ -47,7 +47,9 @@ class NormLiftCheck(NormLift):
         rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:
-            write_text_file(self.json, _to_json(rows, plan), overwrite=self.overwrite)
+            findings = {"version": normlift_ns.__version__, "findings": [asdict(row) for row in rows]}
+            text = json.dumps({**findings, "plan": None if plan is None else plan.to_json()}, indent=1) + "\n"
+            write_text_file(self.json, text, overwrite=self.overwrite)
         if any(row.state == "error" for row in rows):
             raise SystemExit(1)
 
@@ -121,26 +123,13 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
     table = Table("", "", "result", "what to do")
     colors = {"ok": "green", "warning": "yellow", "error": "red"}
     for row in rows:
-        table.add_row(
-            plain_text(row.what),
-            Text(row.state, style=colors[row.state]),
-            plain_text(row.found),
-            plain_text(row.advice),
-        )
+        what, found, advice = map(plain_text, (row.what, row.found, row.advice))
+        table.add_row(what, Text(row.state, style=colors[row.state]), found, advice)
     CONSOLE.print(table)
     if plan is None:
         info("Correct the errors above to see how long the lift will take.")
     else:
         print_plan(plan)
-
-
-def _to_json(rows: list[Diagnostic], plan: Plan | None) -> str:
-    content: dict[str, Any] = {
-        "version": normlift_ns.__version__,
-        "findings": [asdict(row) for row in rows],
-        "plan": None if plan is None else plan.to_json(),
-    }
-    return json.dumps(content, indent=1) + "\n"
 
 
 def entrypoint() -> None:
