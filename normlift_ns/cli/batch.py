@@ -30,19 +30,8 @@ from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
 from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
 from normlift_ns.errors import InputError, escape_unprintable
+from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
-from normlift_ns.io.file_lock import (
-    ABANDONED,
-    BEATS_PER_TIMEOUT,
-    JSONL_SUFFIX,
-    Claim,
-    append_jsonl,
-    finish_claim,
-    iter_claims,
-    read_claim_states,
-    read_jsonl,
-    write_pulse,
-)
 from normlift_ns.io.manifest import read_manifest
 from normlift_ns.io.run_dir import FIELD_FOLDER, run_directory
 from normlift_ns.options import check_options, short_repr
@@ -448,24 +437,25 @@ def lift_captures(
     worker = f"{safe_file_name(socket.gethostname())}_{os.getpid()}_{secrets.token_hex(4)}"
     for name in (_CLAIMS, _LOGS):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    at_start, previous = read_claim_states(folder / _CLAIMS), latest_outcomes(read_jsonl(folder, Outcome))
+    at_start = file_lock.read_claim_states(folder / _CLAIMS)
+    previous = latest_outcomes(file_lock.read_jsonl(folder, Outcome))
     missing = {capture.key: capture for capture in captures if not _is_complete(capture, previous)}
-    for claim in iter_claims(folder / _CLAIMS, list(missing), at_start, timeout):
+    for claim in file_lock.iter_claims(folder / _CLAIMS, list(missing), at_start, timeout):
         capture = missing[claim.key]
         try:
             on_message(f"{capture.name} …")
             outcome = _lift_capture(capture, claim, folder, timeout, worker, command)
         except BaseException:
-            finish_claim(claim, ABANDONED)
+            file_lock.finish_claim(claim, file_lock.ABANDONED)
             raise
         if outcome is None:
             on_message(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
             continue
-        append_jsonl(folder / f"{worker}{JSONL_SUFFIX}", outcome)
-        finish_claim(claim, outcome.state)
+        file_lock.append_jsonl(folder / f"{worker}{file_lock.JSONL_SUFFIX}", outcome)
+        file_lock.finish_claim(claim, outcome.state)
         results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
         on_message(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
-    return latest_outcomes(read_jsonl(folder, Outcome))
+    return latest_outcomes(file_lock.read_jsonl(folder, Outcome))
 
 
 def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
@@ -480,7 +470,7 @@ def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
 
 
 def _lift_capture(
-    capture: Capture, claim: Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
+    capture: Capture, claim: file_lock.Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
 ) -> Outcome | None:
     """Lift a capture unless it is already lifted; return None if another worker has taken over."""
     start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
@@ -494,9 +484,9 @@ def _lift_capture(
         if capture.run_dir is not None and is_lifted(capture.run_dir):
             return outcome("skipped")
         beats = count(1)
-        code = run_logged(
-            [*program, *capture.arguments], log, lambda: write_pulse(claim, next(beats)), patience / BEATS_PER_TIMEOUT
-        )
+        interval = patience / file_lock.BEATS_PER_TIMEOUT
+        command = [*program, *capture.arguments]
+        code = run_logged(command, log, lambda: file_lock.write_pulse(claim, next(beats)), interval)
         if code is None:
             return None
         if code == 0:

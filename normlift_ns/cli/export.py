@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
+from normlift_ns.cli import preflight
 from normlift_ns.cli.common import (
     CONSOLE,
     format_number,
@@ -17,13 +18,6 @@ from normlift_ns.cli.common import (
     plain_text,
     run_command,
     run_command_process,
-)
-from normlift_ns.cli.preflight import (
-    check_lifted_run,
-    check_new_files,
-    check_readable_file,
-    check_writable_folder,
-    has_stored_queries,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_existing
@@ -105,7 +99,7 @@ class NormLiftExport:
         """Write the files and return the path of the PLY file."""
         check_device(self.device)
         check_prompt_list("text", self.text)
-        check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
+        preflight.check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
         outputs = self._outputs()
         self._check_outputs(outputs)
         info_opening(self.load_config)
@@ -192,22 +186,22 @@ class NormLiftExport:
         files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
         cloud = outputs.get("cloud")
         self._check_answer()
-        check_readable_file(self.transfer, "--transfer")
+        preflight.check_readable_file(self.transfer, "--transfer")
         if self.masks_dir is not None and self.part == "clean":
             raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
         if cloud in files:
             raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
-        check_writable_folder(self.masks_dir, "--masks-dir")
-        exported = (outputs[kind] for kind in self.exporters)
-        check_new_files(*files, *exported, overwrite=self.overwrite, flags="--output-dir or --output-filename")
-        check_new_files(cloud, overwrite=self.overwrite, flags="--output-dir")
+        preflight.check_writable_folder(self.masks_dir, "--masks-dir")
+        named = (*files, *(outputs[kind] for kind in self.exporters))
+        preflight.check_new_files(*named, overwrite=self.overwrite, flags="--output-dir or --output-filename")
+        preflight.check_new_files(cloud, overwrite=self.overwrite, flags="--output-dir")
         if self.arrays_dir is not None:
             arrays = (self.arrays_dir / name for name in LABEL_ARRAY_FILES)
-            check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
+            preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""
-        if len(self.text) > 0 or has_stored_queries(self.load_config):
+        if len(self.text) > 0 or preflight.has_stored_queries(self.load_config):
             return
         names = ("masks_dir", "arrays_dir", "transfer")
         flags = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]

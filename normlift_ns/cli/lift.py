@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Column, Table
 from rich.text import Text
 
-from normlift_ns.cli import common
+from normlift_ns.cli import common, preflight
 from normlift_ns.cli.common import (
     CONSOLE,
     TerminatedError,
@@ -29,15 +29,6 @@ from normlift_ns.cli.common import (
     run_command,
     run_command_process,
     split_output_flags,
-)
-from normlift_ns.cli.preflight import (
-    check_new_run,
-    check_readable_file,
-    check_run_config,
-    check_source_options,
-    check_splat_paths,
-    check_unused_options,
-    check_writable_folder,
 )
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
@@ -255,15 +246,15 @@ class NormLift:
             )
         self._check_splat()
         if self.load_config is None:
-            check_splat_paths(self.load_ply, self.load_gsplat, self.splat)
+            preflight.check_splat_paths(self.load_ply, self.load_gsplat, self.splat)
         else:
-            check_run_config(self.load_config, self.data, self.load_step)
+            preflight.check_run_config(self.load_config, self.data, self.load_step)
         if self.add_images is not None and not self.add_images.is_dir():
-            check_readable_file(self.add_images, "--add-images")
-        check_unused_options(self.lift)
-        check_source_options(self.source, self.queries)
-        check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
-        check_writable_folder(self.export_langsplat, "--export-langsplat")
+            preflight.check_readable_file(self.add_images, "--add-images")
+        preflight.check_unused_options(self.lift)
+        preflight.check_source_options(self.source, self.queries)
+        preflight.check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
+        preflight.check_writable_folder(self.export_langsplat, "--export-langsplat")
 
     def _check_splat(self) -> None:
         """Raise InputError unless one trained splat is given, with options that apply to it."""
