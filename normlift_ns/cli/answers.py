@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,8 +116,8 @@ def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
 
 def save_vote_images(
     recorded: RecordedVotes, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
-) -> list[Path]:
-    """Write the images of the largest weights and disagreements, all or none; return their paths.
+) -> None:
+    """Write the images of the largest weights and disagreements, all or none.
 
     The files are <number>_<text>_1_<image>.png … and <number>_<text>_disagrees_1_<image>.png ….
 
@@ -136,12 +137,9 @@ def save_vote_images(
             for rank, vote in enumerate(group, 1):
                 prefix = "" if kind == _LARGEST_WEIGHT else "disagrees_"
                 votes[folder / f"{index}_{safe_file_name(text)}_{prefix}{rank}_{names[vote.view]}.png"] = vote
-    if len(votes) == 0:
-        return []
-    with atomic_files(*votes, overwrite=overwrite) as drafts:
+    with atomic_files(*votes, overwrite=overwrite) if len(votes) > 0 else nullcontext(()) as drafts:
         for draft, picture in zip(drafts, recorded.pictures(votes.values())):
             Image.fromarray(picture.image.numpy()).save(draft, format="PNG")
-    return list(votes)
 
 
 def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command
 from normlift_ns.cli.lift import NormLift
-from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
+from normlift_ns.cli.preflight import check_readable_file, check_writable_folder
 from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
@@ -175,7 +175,7 @@ def _parse(words: Sequence[str]) -> NormLift:
 
 def _run_dir(command: NormLift, timestamp: str) -> Path | None:
     try:
-        name, outputs = new_run_location(command.load_config, command.splat, command.output_dir)
+        name, outputs = command.new_run_location()
         return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
     except (InputError, OSError):  # the process of this capture reports the error
         return None
@@ -279,6 +279,8 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
 
 
 OutcomeState = Literal["done", "failed", "skipped"]
+_STATE_NAMES: dict[OutcomeState, str] = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
+"""Outcomes as words of messages."""
 
 
 @dataclass(frozen=True)
@@ -346,8 +348,7 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
 def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> str:
     """Return the number of lifted, skipped and failed captures as one line."""
     states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
-    words = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
-    return ", ".join(f"{count} {words[state]}" for state in words if (count := states.count(state)) > 0)
+    return ", ".join(f"{count} {word}" for state, word in _STATE_NAMES.items() if (count := states.count(state)) > 0)
 
 
 # Child processes that lift one capture each.
@@ -357,8 +358,6 @@ LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
 """Seconds between terminating a process and killing it."""
-_TAIL = 2**14
-"""Number of bytes at the end of a log file that may contain its last line."""
 
 
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
@@ -401,11 +400,9 @@ def failure_reason(code: int, log: Path) -> str:
     """Return why a process failed: the signal that killed it, or the last line that it printed."""
     if code < 0:
         return f"its process was killed by {describe_signal(-code)}; see its output in {log}"
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - _TAIL))
-        lines = file.read().decode("utf8", "replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip() != ""), "")
-    return last or f"its process ended with exit code {code} and without output"
+    lines = map(str.strip, log.read_bytes().decode("utf8", "replace").split("\n"))
+    *_, last = (f"its process ended with exit code {code} and without output", *filter(None, lines))
+    return last
 
 
 # Worker that lifts captures of a list, possibly alongside other workers.
@@ -453,8 +450,8 @@ def lift_captures(
             continue
         file_lock.append_jsonl(folder / f"{worker}{file_lock.JSONL_SUFFIX}", outcome)
         file_lock.finish_claim(claim, outcome.state)
-        results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
-        on_message(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
+        reason = f": {outcome.message}" if outcome.state == "failed" else ""
+        on_message(f"{capture.name}: {_STATE_NAMES[outcome.state]}{reason} ({outcome.seconds:.1f} s)")
     return latest_outcomes(file_lock.read_jsonl(folder, Outcome))
 
 

@@ -30,9 +30,10 @@ from normlift_ns.cli.common import (
     run_command_process,
     split_output_flags,
 )
+from normlift_ns.data.nerfstudio.config_file import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
-from normlift_ns.io.run_dir import cache_folder, run_directory
+from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ class NormLift:
             preflight.check_readable_file(self.add_images, "--add-images")
         preflight.check_unused_options(self.lift)
         preflight.check_source_options(self.source, self.queries)
-        preflight.check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
+        self._check_new_run()
         preflight.check_writable_folder(self.export_langsplat, "--export-langsplat")
 
     def _check_splat(self) -> None:
@@ -272,6 +273,30 @@ class NormLift:
         for name in names:
             if getattr(options, name) != getattr(default, name, None):
                 raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
+
+    def new_run_location(self) -> tuple[str | None, Path | None]:
+        """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
+
+        Raises:
+            InputError, OSError: The config is invalid or cannot be read.
+        """
+        if self.load_config is not None:
+            paths = read_config_paths(self.load_config)
+            return paths.experiment, self.output_dir or paths.output_dir
+        cameras = (self.splat.colmap or self.splat.transforms or Path()).absolute()
+        name = (cameras.parent if cameras.suffix == ".json" else cameras).name
+        return name or "splat", self.output_dir or Path("outputs")
+
+    def _check_new_run(self) -> None:
+        """Raise if the directory of the new run cannot be written, or if another run exists there."""
+        preflight.check_writable_folder(self.output_dir, "--output-dir")
+        name, outputs = self.new_run_location()
+        run_dir = run_directory(outputs or Path(), name or "run", self.timestamp)
+        if name is None or outputs is None:
+            return
+        if self.timestamp is not None:
+            refuse_existing_run(run_dir, self.overwrite)
+        preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def open_scene(self) -> Scene:
         """Open the trained scene, with the images of --add-images."""

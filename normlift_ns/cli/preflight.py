@@ -11,14 +11,7 @@ from normlift_ns.data.nerfstudio.config_file import check_config_exists, read_co
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.manifest import read_manifest
-from normlift_ns.io.run_dir import (
-    FIELD_FOLDER,
-    cache_folder,
-    field_folder,
-    refuse_existing_run,
-    run_directory,
-    text_cache_folder,
-)
+from normlift_ns.io.run_dir import FIELD_FOLDER, field_folder, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
 _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
@@ -175,36 +168,6 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
 def has_stored_queries(config: Path) -> bool:
     """Return whether a lifted run stores queries."""
     return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
-
-
-def check_new_run(
-    config: Path | None, splat: SplatOptions, output_dir: Path | None, timestamp: str | None, overwrite: bool
-) -> None:
-    """Raise if the directory of a new run cannot be written, or if another run exists there."""
-    check_writable_folder(output_dir, "--output-dir")
-    name, outputs = new_run_location(config, splat, output_dir)
-    run_dir = run_directory(outputs or Path(), name or "run", timestamp)
-    if name is None or outputs is None:
-        return
-    if timestamp is not None:
-        refuse_existing_run(run_dir, overwrite)
-    check_writable_folder(cache_folder(run_dir), "--output-dir")
-
-
-def new_run_location(
-    config: Path | None, splat: SplatOptions, output_dir: Path | None
-) -> tuple[str | None, Path | None]:
-    """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
-
-    Raises:
-        InputError, OSError: The config is invalid or cannot be read.
-    """
-    if config is not None:
-        paths = read_config_paths(config)
-        return paths.experiment, output_dir or paths.output_dir
-    cameras = (splat.colmap or splat.transforms or Path()).absolute()
-    name = (cameras.parent if cameras.suffix == ".json" else cameras).name
-    return name or "splat", output_dir or Path("outputs")
 
 
 def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:

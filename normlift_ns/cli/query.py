@@ -272,17 +272,16 @@ class NormLiftQuery:
         check_prompt_list("text", self.text)
 
     def _check_dependent_options(self) -> None:
-        if len(self.render_views) > 0 and self.render_dir is None:
-            raise InputError("--render-views has no effect without --render-dir; give the folder for the renders")
-        if self.why_dir is not None and not self.why:
-            raise InputError("--why-dir has no effect without --why True; add that flag")
-        for name in ("segment_model", "segment_views"):
-            if self.segment is None and getattr(self, name) != getattr(type(self), name):
-                raise InputError(f"--{name.replace('_', '-')} has no effect without --segment sam3; add that flag")
-        for name in ("objects_dir", "metres_per_unit"):
-            if getattr(self, name) is not None and not self.objects:
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{flag} has no effect without --objects True; add that flag")
+        for name, needed, flag in (
+            ("render_views", self.render_dir, "--render-dir FOLDER"),
+            ("why_dir", self.why, "--why True"),
+            ("segment_model", self.segment, "--segment sam3"),
+            ("segment_views", self.segment, "--segment sam3"),
+            ("objects_dir", self.objects, "--objects True"),
+            ("metres_per_unit", self.objects, "--objects True"),
+        ):
+            if not needed and getattr(self, name) != getattr(type(self), name):
+                raise InputError(f"--{name.replace('_', '-')} has no effect without {flag}; add that flag")
 
     def _existing_renders(self) -> list[Path]:
         """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""
