@@ -45,6 +45,7 @@ from normlift_ns.pipeline import (
     choose_raster_config,
     consensus_options,
     lift_features,
+    plan_collection,
     start_kernel_warm_up,
     vote_directions,
 )
@@ -541,14 +542,11 @@ def measure_capture(
     Raises:
         ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
     """
-    gaussians, views = scene.gaussians.to(device), scene.train
-    drawing = choose_raster_config(scene, gaussians, options)
+    collection = plan_collection(scene, source, options, cache, device=device, export=None)
+    gaussians, used, drawing = collection.gaussians, collection.views, collection.config
     cuda = torch.device(device).type == "cuda"
     timed = partial(_seconds, clock=clock, device=device)
     start_kernel_warm_up(scene, gaussians, options, drawing)()
-    names = set(source.available(views.names))
-    usable = [index for index, name in enumerate(views.names) if name in names]
-    used = [usable[i] for i in sample_evenly(len(usable), options.max_views)]
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
