@@ -18,8 +18,8 @@ from plyfile import PlyData
 from normlift_ns import Camera, InputError, open_run
 from normlift_ns.analysis.catalogue import csv_columns, view_shares
 from normlift_ns.cli import export, query
-from normlift_ns.cli.answers import print_catalog
 from normlift_ns.cli.common import CONSOLE
+from normlift_ns.cli.query import print_catalog
 from normlift_ns.exports import answer_instances
 from normlift_ns.rasterization.rasterize import render
 from tests.scripts.conftest import run_entry, said
