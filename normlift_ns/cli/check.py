@@ -82,11 +82,10 @@ class NormLiftCheck(NormLift):
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
         if self.check:
-            warning = _try(rows, "cameras", lambda: (self.compare_cameras(opened, device),))
-            if warning == (None,):
-                rows.append(Diagnostic("cameras", "ok", "three images match renders from their cameras"))
-            elif warning is not None:
-                rows.append(Diagnostic("cameras", "warning", str(warning[0])))
+            warning = _try(rows, "cameras", lambda: self.compare_cameras(opened, device) or "")
+            if warning is not None:
+                found = warning or "three images match renders from their cameras"
+                rows.append(Diagnostic("cameras", "warning" if warning else "ok", found))
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
         plan = _try(rows, "plan", lambda: self.make_plan(opened, source, device))
@@ -109,9 +108,7 @@ def _try(rows: list[Diagnostic], name: str, function: Callable[[], _Result]) -> 
 
     try:
         return function()
-    except Exception as error:
-        if not isinstance(error, (ValueError, OSError, MemoryError)):
-            raise
+    except (ValueError, OSError, MemoryError) as error:
         message, code = describe_error(error)
         if code == EXIT_INTERNAL_ERROR:
             raise
