@@ -32,7 +32,7 @@ from normlift_ns.encoders.cache import NotCachedError, cached_only
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.weights import has_local_clip_weights, has_local_sam_weights
 from normlift_ns.evidence_collection import (
-    RasterConfig,
+    EvidenceCollection,
     ViewBatch,
     ViewObservations,
     batch_evidence,
@@ -513,13 +513,11 @@ class _Observed(NamedTuple):
     seconds: float
 
 
-def time_kernel_loading(
-    scene: Scene, options: LiftOptions, *, device: str = "cpu", clock: Clock = perf_counter
-) -> float:
+def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
     """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
     gaussians = scene.gaussians.to(device)
     ready = start_kernel_warm_up(scene, gaussians, options, choose_raster_config(scene, gaussians, options))
-    return min(_MAX_LOAD_S, _seconds(ready, clock=clock, device=device)[0])
+    return min(_MAX_LOAD_S, _seconds(ready, clock=perf_counter, device=device)[0])
 
 
 def measure_capture(
@@ -571,6 +569,7 @@ def measure_capture(
     evidence, evidence_s, cached_evidence_s, write_bytes_s = _measure_evidence(rasterize, timed, warm_up=cuda)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
     rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), clock)
+    groups = ((_joined(list(cached.values())), len(cached)), (observed.block, len(new)))
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
     return Measurements(
         device=torch.cuda.get_device_name(device) if cuda else f"{device}, {torch.get_num_threads()} threads",
@@ -587,7 +586,7 @@ def measure_capture(
         cached_features_share=len(cached) / len(chosen),
         evidence_s=evidence_s / count,
         cached_evidence_s=cached_evidence_s / count,
-        cached_evidence_share=_evidence_cached(gaussians, observed, cached, len(chosen), options, drawing, cache),
+        cached_evidence_share=_evidence_cached(collection, groups),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
@@ -654,22 +653,19 @@ def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
     return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
-def _evidence_cached(
-    gaussians: GaussianScene,
-    observed: _Observed,
-    cached: Mapping[int, ViewBatch],
-    chosen: int,
-    options: LiftOptions,
-    drawing: RasterConfig,
-    cache: Path,
-) -> float:
-    """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
-    if not options.reuse_evidence:
+def _evidence_cached(collection: EvidenceCollection, groups: Sequence[tuple[ViewBatch, int]]) -> float:
+    """Return the share of views whose evidence is cached.
+
+    Args:
+        groups: examples of views, and how many views they represent.
+    """
+    if not collection.options.reuse_evidence:
         return 0.0
     share = 0.0
-    for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
-        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, drawing))
-        share += sum(hits) / max(1, len(hits)) * views / chosen
+    for block, views in groups:
+        keys = evidence_keys(collection.gaussians, block, collection.config)
+        hits = views_in_cache(collection.cache / "evidence", keys)
+        share += sum(hits) / max(1, len(hits)) * views / sum(count for _, count in groups)
     return share
 
 
