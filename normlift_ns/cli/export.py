@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from normlift_ns.cli.common import (
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_existing
+from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.options import (
     FLOATER_THRESHOLD,
     LABEL_ARRAY_FILES,
@@ -201,7 +203,8 @@ class NormLiftExport:
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""
-        if len(self.text) > 0 or preflight.has_stored_queries(self.load_config):
+        stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"
+        if len(self.text) > 0 or stored.exists():
             return
         names = ("masks_dir", "arrays_dir", "transfer")
         flags = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]

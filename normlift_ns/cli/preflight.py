@@ -11,7 +11,7 @@ from normlift_ns.data.nerfstudio.config_file import check_config_exists, read_co
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.manifest import read_manifest
-from normlift_ns.io.run_dir import FIELD_FOLDER, field_folder, text_cache_folder
+from normlift_ns.io.run_dir import field_folder, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
 _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
@@ -95,17 +95,6 @@ def check_writable_folder(path: Path | None, flag: str) -> None:
         return
 
 
-def check_distinct_paths(**paths: Path | None) -> None:
-    """Raise InputError if two flags name the same file."""
-    flags: dict[str, str] = {}
-    for name, path in paths.items():
-        target, flag = path and os.path.realpath(path), f"--{name.replace('_', '-')}"
-        if target in flags:
-            raise InputError(f"{flags[target]} and {flag} name the same file, {path}")
-        if target is not None:
-            flags[target] = flag
-
-
 def check_run_config(config: Path, data: Path | None, step: int | None = None, *, written_by: str = "ns-train") -> None:
     """Check a config.yml, its dataset and its checkpoint.
 
@@ -163,11 +152,6 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
         kind = find_encoder_kind(stored.encoder)
         if kind is not None:
             kind.check(stored)
-
-
-def has_stored_queries(config: Path) -> bool:
-    """Return whether a lifted run stores queries."""
-    return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
 
 
 def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:

@@ -25,7 +25,7 @@ from normlift_ns.cli.common import (
     run_command,
     run_command_process,
 )
-from normlift_ns.cli.preflight import check_distinct_paths, check_lifted_run, check_new_files, check_writable_folder
+from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
@@ -251,7 +251,8 @@ class NormLiftQuery:
         check_device(self.device)
         self._check_texts()
         check_lifted_run(self.load_config, self.data, self.ask)
-        check_distinct_paths(json=self.json, output_path=self.output_path)
+        if self.json and self.output_path and os.path.realpath(self.json) == os.path.realpath(self.output_path):
+            raise InputError(f"--json and --output-path name the same file, {self.output_path}")
         for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
             check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
