@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -327,24 +327,17 @@ def progress_bars() -> Iterator[ProgressCallback]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    started: set[str] = set()
+    live = CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
+    progress, tasks = Progress(*columns, console=CONSOLE), dict[str, TaskID]()
 
-    def print_stage(stage: str, done: int, total: int) -> None:
-        if stage not in started:
-            started.add(stage)
-            info_progress(f"{names.get(stage, stage)} …")
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
+            if not live:
+                info_progress(f"{names.get(stage, stage)} …")
+        progress.update(tasks[stage], completed=done, total=total)
 
-    if not CONSOLE.is_terminal or common.output_settings[-1] != common.OutputSettings():
-        yield print_stage
-        return
-    with Progress(*columns, console=CONSOLE) as progress:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
-            progress.update(tasks[stage], completed=done, total=total)
-
+    with progress if live else nullcontext():
         yield report
 
 
