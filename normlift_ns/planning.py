@@ -385,6 +385,13 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     )
 
 
+def diagnose_cameras(warning: str | None) -> Diagnostic:
+    """Return the result of comparing images with renders, from the warning if they differ."""
+    if warning is None:
+        return Diagnostic("cameras", "ok", "three images match renders from their cameras")
+    return Diagnostic("cameras", "warning", warning)
+
+
 def diagnose_device(device: str) -> Diagnostic:
     """Check which device the lift will use."""
     if torch.device(device).type == "cuda":

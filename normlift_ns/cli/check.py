@@ -82,10 +82,8 @@ class NormLiftCheck(NormLift):
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
         if self.check:
-            warning = _try(rows, "cameras", lambda: self.compare_cameras(opened, device) or "")
-            if warning is not None:
-                found = warning or "three images match renders from their cameras"
-                rows.append(Diagnostic("cameras", "warning" if warning else "ok", found))
+            compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(self.compare_cameras(opened, device)))
+            rows += [] if compared is None else [compared]
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
         plan = _try(rows, "plan", lambda: self.make_plan(opened, source, device))

@@ -280,8 +280,8 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
     except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:
-        number = signal.SIGINT if isinstance(stop, KeyboardInterrupt) else signal.SIGTERM
-        word = "Interrupted" if number == signal.SIGINT else "Terminated"
+        interrupted = isinstance(stop, KeyboardInterrupt)
+        word, number = ("Interrupted", signal.SIGINT) if interrupted else ("Terminated", signal.SIGTERM)
         print_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
     except Exception as error:  # a traceback would not help the user
@@ -311,18 +311,14 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
         InputError: The command does not know the words.
         SystemExit: The help was printed; the exit code is 0.
     """
-    name = name or _module_name()
+    program = Path(sys.argv[0])
+    if name is None and program.parent == Path(__file__).parent:  # started as a module
+        name = f"python -m {__package__}.{program.stem}"
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
     arguments = fill_boolean_values(arguments, boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
     with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
-
-
-def _module_name() -> str | None:
-    """Return how to start a command that runs as a module; None for installed commands."""
-    program = Path(sys.argv[0])
-    return f"python -m {__package__}.{program.stem}" if program.parent == Path(__file__).parent else None
 
 
 def boolean_flags(options: Any) -> set[str]:

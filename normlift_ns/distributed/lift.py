@@ -17,7 +17,6 @@ from torch import Tensor
 
 from normlift_ns import pipeline
 from normlift_ns.core.consensus import (
-    CHANCE_AGREEMENT,
     Consensus,
     check_consensus_inputs,
     sample_gaussians,
@@ -48,51 +47,37 @@ from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import RefineConfig
-from normlift_ns.progress import ProgressCallback, StageTimer
+from normlift_ns.progress import StageTimer
 
 
 def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest) -> LiftedRun | None:
-    """Run `run_lift` in several processes, all with the same request. Only rank 0 writes and returns the run."""
-    prepared, stages = pipeline.prepare_lift(request), StageTimer(request.report)
+    """Run `run_lift` in several processes, all with the same request and the whole scene.
+
+    Only rank 0 writes and returns the run.
+    """
+    prepared, before = pipeline.prepare_lift(request), StageTimer(request.report)
     run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
     prepared = replace(prepared, run_dir=run_dir)
     if team.rank == 0:
         pipeline.check_target(prepared)
     pipeline.announce(prepared)
     if team.rank == 0:
-        pipeline.check_alignment(prepared, stages)
+        pipeline.check_alignment(prepared, before)
     cache, device = cache_folder(run_dir), prepared.device
     collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
     )
-    with team.shared_folder(cache):
-        result = lift_scene_distributed(team, collection, device, prepared.encoder, request.report)
-    return None if result is None else pipeline.write_lifted_run(prepared, result, stages)
-
-
-def lift_scene_distributed(
-    team: TorchCommunicator,
-    collection: EvidenceCollection,
-    device: str,
-    encoder: Mapping[str, Any],
-    report: ProgressCallback,
-) -> pipeline.LiftResult | None:
-    """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
-
-    Args:
-        device, encoder, report: as in `lift_scene`.
-    """
-    stages, facts = StageTimer(team.aggregate_progress(report)), {}
+    stages, facts = StageTimer(team.aggregate_progress(request.report)), {}
     options, means = collection.options, collection.gaussians.means
     wait_for_kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
     portion = Partition.from_means(team, means)
-    views = _collect(team, collection, portion, stages, wait_for_kernels)
+    with team.shared_folder(cache):
+        views = _collect(team, collection, portion, stages, wait_for_kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
-            agreed = consensus_distributed(
-                views, portion, sample=options.consensus_sample, **pipeline.consensus_options(options)
-            )
+            kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
+            agreed = consensus_distributed(views, portion, **kwargs)
             step()
         table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
     with stages("lift") as step:
@@ -105,13 +90,16 @@ def lift_scene_distributed(
         facts |= vote_facts
     with stages("store") as step:
         statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
-        provenance = pipeline.lift_provenance(collection, encoder, statistics)
+        provenance = pipeline.lift_provenance(collection, prepared.encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
             tolerance=options.tolerance, storage=options.storage, provenance=provenance,
         )  # fmt: skip
         step()
-    return None if field is None else pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
+    if field is None:
+        return None
+    result = pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
+    return pipeline.write_lifted_run(prepared, result, before)
 
 
 def _collect(
@@ -149,15 +137,13 @@ def _gather_tables(tables: Mapping[int, tuple[Tensor, Tensor]], team: Communicat
     return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])
 
 
-def consensus_distributed(
-    views: ViewObservations,
-    portion: Partition,
-    *,
-    power: float = 1.0,
-    sample: int = 50,
-    least: float = CHANCE_AGREEMENT,
-) -> Consensus:
-    """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes."""
+def consensus_distributed(views: ViewObservations, portion: Partition, *, sample: int, **options: float) -> Consensus:
+    """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes.
+
+    Args:
+        sample: as in `consensus`.
+        options: `power` and `least` of `consensus`.
+    """
     team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
@@ -169,7 +155,7 @@ def consensus_distributed(
         out = features.to(evidence.rows.weight.device, copy=True)
         return Consensus(team.broadcast(out), team.broadcast_object(None), len(order))
     sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
-    result = sampled_consensus(sampled, probability, features, level=level, power=power, least=least)
+    result = sampled_consensus(sampled, probability, features, level=level, **options)
     return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
 
 
