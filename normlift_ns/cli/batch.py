@@ -174,11 +174,10 @@ def _parse(words: Sequence[str]) -> NormLift:
 
 
 def _run_dir(command: NormLift, timestamp: str) -> Path | None:
-    try:
+    with suppress(InputError, OSError):  # the process of this capture reports the error
         name, outputs = command.new_run_location()
         return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
-    except (InputError, OSError):  # the process of this capture reports the error
-        return None
+    return None
 
 
 # Shards of a capture list: the part of a numbered worker.
@@ -460,10 +459,9 @@ def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
     outcome = outcomes.get(capture.key)
     if outcome is None or outcome.state == "failed":
         return False
-    try:
+    with suppress(InputError):  # reported when the capture is processed
         return capture.run_dir is None or is_lifted(capture.run_dir)
-    except InputError:  # reported when the capture is processed
-        return False
+    return False
 
 
 def _lift_capture(

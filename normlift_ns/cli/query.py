@@ -123,7 +123,10 @@ class NormLiftQuery:
         sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
         show_objects = self._list_objects(result.question) if self.objects else None
         if self.json is not None:
-            _write_json(self.json, rows, result.question, self.overwrite)
+            question = result.question
+            rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": question.negatives}
+            text = json.dumps({"queries": rows, **rules}, indent=2) + "\n"
+            write_text_file(self.json, text, overwrite=self.overwrite)
         if self.output_path is not None:
             _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
         if save_renders is not None:
@@ -375,11 +378,6 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.flush()
     if failed > 0:
         raise InputError(f"{failed} of {total} lines could not be answered; see their `error` for the reasons")
-
-
-def _write_json(path: Path, rows: list[dict[str, Any]], question: Query, overwrite: bool) -> None:
-    rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
-    write_text_file(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:

@@ -95,8 +95,15 @@ class Heartbeat:
                         self._check(r, beats, places)
             except Exception:  # a store whose process is lost raises various errors
                 self.failure = self.failure or PeerFailure(0, False, places[0])
-        if self.failure is not None and not self._stop.is_set():
-            self._exit()
+        if self.failure is None or self._stop.is_set():
+            return
+        self._loss_detected.set()
+        if self._waiting:
+            return
+        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
+        if not self._stop.wait(_GRACE):
+            self.on_failure(self.failure)
+            os._exit(1)
 
     def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
         if self.store.check([f"place/{r}"]):
@@ -111,13 +118,3 @@ class Heartbeat:
             beats[r] = beat, now
         elif now - beats[r][1] > HEARTBEAT_TIMEOUT:
             self.failure = PeerFailure(r, False, places[r])
-
-    def _exit(self) -> None:
-        self._loss_detected.set()
-        if self._waiting:
-            return
-        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
-        if not self._stop.wait(_GRACE):
-            assert self.failure is not None
-            self.on_failure(self.failure)
-            os._exit(1)
