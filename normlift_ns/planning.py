@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns import pipeline
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
@@ -41,14 +42,6 @@ from normlift_ns.evidence_collection import (
     sample_evenly,
 )
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
-from normlift_ns.pipeline import (
-    choose_raster_config,
-    consensus_options,
-    lift_features,
-    plan_collection,
-    start_kernel_warm_up,
-    vote_directions,
-)
 from normlift_ns.progress import StageTimer, peak_gib
 from normlift_ns.rasterization.evidence_cache import views_in_cache
 
@@ -315,14 +308,13 @@ def _costs(
     table, copied = features, None
     if options.consensus:
         with stages("consensus"):
-            table = consensus(
-                evidence, features, sample=options.consensus_sample, **consensus_options(options)
-            ).features
+            kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
+            table = consensus(evidence, features, **kwargs).features
     with stages("lift"):
-        lifted, own = lift_features(views, table, options)
+        lifted, own = pipeline.lift_features(views, table, options)
     if options.refine:
         vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-        copied, _ = vote_directions(means, lifted, own, vote, stages)
+        copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
     with stages("store"):
         field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
     stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
@@ -523,7 +515,8 @@ class _Observed(NamedTuple):
 def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
     """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
     gaussians = scene.gaussians.to(device)
-    ready = start_kernel_warm_up(scene, gaussians, options, choose_raster_config(scene, gaussians, options))
+    config = pipeline.choose_raster_config(scene, gaussians, options)
+    ready = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
     return min(_MAX_LOAD_S, _seconds(ready, clock=perf_counter, device=device)[0])
 
 
@@ -547,11 +540,11 @@ def measure_capture(
     Raises:
         ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
     """
-    collection = plan_collection(scene, source, options, cache, device=device, export=None)
+    collection = pipeline.plan_collection(scene, source, options, cache, device=device, export=None)
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
     cuda = torch.device(device).type == "cuda"
     timed = partial(_seconds, clock=clock, device=device)
-    start_kernel_warm_up(scene, gaussians, options, drawing)()
+    pipeline.start_kernel_warm_up(scene, gaussians, options, drawing)()
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
