@@ -269,15 +269,35 @@ def measure_core(
     table = features.to(evidence.rows.weight).repeat(times, 1)
     factor = views / (times * evidence.num_views)
     most = min(len(gaussians), _LARGE_SAMPLE.get(gaussians.means.device.type, _LARGE_SAMPLE["cpu"]))
-    costs = []
-    for count in 2 * (most // _SAMPLE_RATIO, most):  # the first two only load or compile kernels for these sizes
+
+    def costs(count: int) -> tuple[dict[str, float], dict[str, float], int]:
+        """Run all stages after the evidence on some Gaussians; return seconds and items of each, and stored bytes."""
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
-        rows = rows.to(gaussians.means.device)
-        sample = replace(evidence.select_gaussians(rows), num_excluded=0)
-        costs.append(_costs(gaussians.means[rows], sample, times, table, options, clock))
+        means = gaussians.means[rows.to(gaussians.means.device)]
+        sample = replace(evidence.select_gaussians(rows.to(means.device)), num_excluded=0)
+        stages = StageTimer(lambda stage, done, total: None, clock)
+        observed = ViewObservations(
+            Evidence.merge(*[sample] * times), table, torch.zeros(len(table), dtype=torch.int64)
+        )
+        agreed, copied = table, None
+        if options.consensus:
+            with stages("consensus"):
+                kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
+                agreed = consensus(observed.evidence, table, **kwargs).features
+        with stages("lift"):
+            lifted, own = pipeline.lift_features(observed, agreed, options)
+        if options.refine:
+            vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
+            copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
+        with stages("store"):
+            field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
+        stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
+        return stages.seconds, _items(sample, times, len(means), options), stored_bytes
+
+    # The first two only load or compile kernels for these sizes.
+    _, _, (small, few, few_bytes), (large, many, many_bytes) = map(costs, 2 * (most // _SAMPLE_RATIO, most))
     counts = _items(evidence, times, len(gaussians), options)
     counts |= {"consensus": counts["consensus"] * factor**2, "lift": counts["lift"] * factor}
-    (small, few, few_bytes), (large, many, many_bytes) = costs[2:]
     rates = {name: _rate((few[name], small[name]), (many[name], large[name]), counts[name]) for name in small}
     return rates, _rate((few["store"], few_bytes), (many["store"], many_bytes), counts["store"])
 
@@ -288,37 +308,6 @@ def _rate(small: tuple[float, float], large: tuple[float, float], count: float) 
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
     return Rate(most - each * more, each, count)
-
-
-def _costs(
-    means: Float[Tensor, "m 3"],
-    sample: Evidence,
-    times: int,
-    features: Float[Tensor, "s d"],
-    options: LiftOptions,
-    clock: Clock,
-) -> tuple[dict[str, float], dict[str, float], int]:
-    """Run all stages of a lift that follow the evidence, on some Gaussians.
-
-    Returns:
-        Seconds of every stage, number of its items, and stored bytes.
-    """
-    stages, evidence = StageTimer(lambda stage, done, total: None, clock), Evidence.merge(*[sample] * times)
-    views = ViewObservations(evidence, features, torch.zeros(len(features), dtype=torch.int64))
-    table, copied = features, None
-    if options.consensus:
-        with stages("consensus"):
-            kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
-            table = consensus(evidence, features, **kwargs).features
-    with stages("lift"):
-        lifted, own = pipeline.lift_features(views, table, options)
-    if options.refine:
-        vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-        copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
-    with stages("store"):
-        field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
-    stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
-    return stages.seconds, _items(sample, times, len(means), options), stored_bytes
 
 
 def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:

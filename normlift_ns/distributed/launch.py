@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -273,8 +273,7 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
 
 def _is_listening(host: str, port: int) -> bool:
     """Return whether a server accepts connections at this address."""
-    try:
+    with suppress(OSError):
         socket.create_connection((host, port), timeout=5).close()
-    except OSError:
-        return False
-    return True
+        return True
+    return False
