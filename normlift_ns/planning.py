@@ -273,12 +273,11 @@ def measure_core(
     def costs(count: int) -> tuple[dict[str, float], dict[str, float], int]:
         """Run all stages after the evidence on some Gaussians; return seconds and items of each, and stored bytes."""
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
-        means = gaussians.means[rows.to(gaussians.means.device)]
-        sample = replace(evidence.select_gaussians(rows.to(means.device)), num_excluded=0)
+        rows = rows.to(gaussians.means.device)
+        means, sample = gaussians.means[rows], replace(evidence.select_gaussians(rows), num_excluded=0)
+        level = torch.zeros(len(table), dtype=torch.int64)
+        observed = ViewObservations(Evidence.merge(*[sample] * times), table, level)
         stages = StageTimer(lambda stage, done, total: None, clock)
-        observed = ViewObservations(
-            Evidence.merge(*[sample] * times), table, torch.zeros(len(table), dtype=torch.int64)
-        )
         agreed, copied = table, None
         if options.consensus:
             with stages("consensus"):
