@@ -121,16 +121,14 @@ def _capture_key(command: NormLift) -> str:
     features, label maps and weights, it includes their paths only.
     """
     options = {name: value for name, value in asdict(command).items() if name not in _NOT_IN_KEY}
-    sizes = [(file.name, file.stat().st_size) for file in _scene_files(command) if file.is_file()]
+    files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
+    if command.load_config is not None:
+        step = "*" if command.load_step is None else f"{command.load_step:09d}"
+        folder = command.load_config.absolute().parent / "nerfstudio_models"
+        files = sorted(folder.glob(f"step-{step}.ckpt"))[-1:]
+    sizes = [(file.name, file.stat().st_size) for file in files if file.is_file()]
     text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
     return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
-
-
-def _scene_files(command: NormLift) -> list[Path]:
-    if command.load_config is None:
-        return [path for path in (command.load_ply, command.load_gsplat) if path is not None]
-    step = "*" if command.load_step is None else f"{command.load_step:09d}"
-    return sorted((command.load_config.absolute().parent / "nerfstudio_models").glob(f"step-{step}.ckpt"))[-1:]
 
 
 def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:

@@ -254,8 +254,14 @@ class NormLift:
             preflight.check_readable_file(self.add_images, "--add-images")
         preflight.check_unused_options(self.lift)
         preflight.check_source_options(self.source, self.queries)
-        self._check_new_run()
-        preflight.check_writable_folder(self.export_langsplat, "--export-langsplat")
+        for flag, folder in (("--output-dir", self.output_dir), ("--export-langsplat", self.export_langsplat)):
+            preflight.check_writable_folder(folder, flag)
+        name, outputs = self.new_run_location()
+        run_dir = run_directory(outputs or Path(), name or "run", self.timestamp)
+        if name is not None and outputs is not None:
+            if self.timestamp is not None:
+                refuse_existing_run(run_dir, self.overwrite)
+            preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def _check_splat(self) -> None:
         """Raise InputError unless one trained splat is given, with options that apply to it."""
@@ -286,17 +292,6 @@ class NormLift:
         cameras = (self.splat.colmap or self.splat.transforms or Path()).absolute()
         name = (cameras.parent if cameras.suffix == ".json" else cameras).name
         return name or "splat", self.output_dir or Path("outputs")
-
-    def _check_new_run(self) -> None:
-        """Raise if the directory of the new run cannot be written, or if another run exists there."""
-        preflight.check_writable_folder(self.output_dir, "--output-dir")
-        name, outputs = self.new_run_location()
-        run_dir = run_directory(outputs or Path(), name or "run", self.timestamp)
-        if name is None or outputs is None:
-            return
-        if self.timestamp is not None:
-            refuse_existing_run(run_dir, self.overwrite)
-        preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def open_scene(self) -> Scene:
         """Open the trained scene, with the images of --add-images."""
