@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -19,13 +19,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns import pipeline
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.core.lift import lift
-from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.refine import clamp_k, refine
+from normlift_ns.core.refine import clamp_k
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
@@ -35,16 +34,16 @@ from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, r
 from normlift_ns.encoders.open_clip import has_local_clip_weights
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.evidence_collection import (
-    RasterConfig,
+    EvidenceCollection,
     ViewBatch,
+    ViewObservations,
     batch_evidence,
     evidence_keys,
     observe_views,
     sample_evenly,
 )
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
-from normlift_ns.pipeline import choose_raster_config, start_kernel_warm_up
-from normlift_ns.progress import peak_gib
+from normlift_ns.progress import StageTimer, peak_gib
 from normlift_ns.rasterization.evidence_cache import views_in_cache
 
 # Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
@@ -238,8 +237,8 @@ def _cached(cached: int, views: int) -> str:
 # Cost of consensus, lift, neighbors, vote and storage, extrapolated from two samples of the Gaussians.
 
 
-Timed = Callable[[Callable[[], Any]], tuple[float, Any]]
-"""Does some work; returns its seconds and its result."""
+Clock = Callable[[], float]
+"""Returns seconds."""
 _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
 """Gaussians in the larger sample."""
 _SAMPLE_RATIO = 4
@@ -248,22 +247,13 @@ _MAX_SAMPLE_VIEWS = 64
 """Maximum number of views in the samples. The cost of more views is extrapolated in proportion."""
 
 
-@dataclass(frozen=True)
-class _Costs:
-    """Cost of one sample: seconds and number of items of every stage, and stored bytes."""
-
-    seconds: dict[str, float]
-    items: dict[str, float]
-    stored: int
-
-
 def measure_core(
     gaussians: GaussianScene,
     evidence: Evidence,
     features: Float[Tensor, "s d"],
     options: LiftOptions,
     views: int,
-    time: Timed,
+    clock: Clock,
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each stage of the core of a lift, and the bytes that it stores.
 
@@ -280,24 +270,36 @@ def measure_core(
     table = features.to(evidence.rows.weight).repeat(times, 1)
     factor = views / (times * evidence.num_views)
     most = min(len(gaussians), _LARGE_SAMPLE.get(gaussians.means.device.type, _LARGE_SAMPLE["cpu"]))
-    costs = []
-    for count in 2 * (most // _SAMPLE_RATIO, most):  # the first two only load or compile kernels for these sizes
+
+    def costs(count: int) -> tuple[dict[str, float], dict[str, float], int]:
+        """Run all stages after the evidence on some Gaussians; return seconds and items of each, and stored bytes."""
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
         rows = rows.to(gaussians.means.device)
-        parts = {"rows": evidence.rows.select_rows(rows), "unlabeled": evidence.unlabeled.select_rows(rows)}
-        sample = replace(evidence, **parts, num_excluded=0)
-        costs.append(_costs(gaussians.means[rows], sample, times, table, options, time))
-    items = _items(evidence, times, len(gaussians), options)
-    counts = {name: value * (factor if name != "neighbors" else 1.0) for name, value in items.items()}
-    counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
-    counts["consensus"] *= factor
-    small, large = costs[2:]
-    rates = {
-        name: _rate((small.items[name], seconds), (large.items[name], large.seconds[name]), counts[name])
-        for name, seconds in small.seconds.items()
-    }
-    stored = _rate((small.items["store"], small.stored), (large.items["store"], large.stored), counts["store"])
-    return rates, stored
+        means, sample = gaussians.means[rows], replace(evidence.select_gaussians(rows), num_excluded=0)
+        level = torch.zeros(len(table), dtype=torch.int64)
+        observed = ViewObservations(Evidence.merge(*[sample] * times), table, level)
+        stages = StageTimer(lambda stage, done, total: None, clock)
+        agreed, copied = table, None
+        if options.consensus:
+            with stages("consensus"):
+                kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
+                agreed = consensus(observed.evidence, table, **kwargs).features
+        with stages("lift"):
+            lifted, own = pipeline.lift_features(observed, agreed, options)
+        if options.refine:
+            vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
+            copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
+        with stages("store"):
+            field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
+        stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
+        return stages.seconds, _items(sample, times, len(means), options), stored_bytes
+
+    # The first two only load or compile kernels for these sizes.
+    _, _, (small, few, few_bytes), (large, many, many_bytes) = map(costs, 2 * (most // _SAMPLE_RATIO, most))
+    counts = _items(evidence, times, len(gaussians), options)
+    counts |= {"consensus": counts["consensus"] * factor**2, "lift": counts["lift"] * factor}
+    rates = {name: _rate((few[name], small[name]), (many[name], large[name]), counts[name]) for name in small}
+    return rates, _rate((few["store"], few_bytes), (many["store"], many_bytes), counts["store"])
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
@@ -306,41 +308,6 @@ def _rate(small: tuple[float, float], large: tuple[float, float], count: float) 
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
     return Rate(most - each * more, each, count)
-
-
-def _costs(
-    means: Float[Tensor, "m 3"],
-    sample: Evidence,
-    times: int,
-    features: Float[Tensor, "s d"],
-    options: LiftOptions,
-    timed: Timed,
-) -> _Costs:
-    """Run all stages of a lift that follow the evidence, on some Gaussians."""
-    evidence = Evidence.merge(*[sample] * times)
-    lift_kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
-    seconds: dict[str, float] = {}
-    table, copied = features, None
-    if options.consensus:
-        kwargs = {
-            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
-        }  # fmt: skip
-        seconds["consensus"], result = timed(lambda: consensus(evidence, features, **kwargs))
-        table = result.features
-    seconds["lift"], lifted = timed(lambda: lift(evidence, table, **lift_kwargs))
-    if options.consensus:
-        seconds["lift"] += timed(lambda: lift(evidence, features, **lift_kwargs))[0]
-    if options.refine:
-        vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-        seconds["neighbors"], neighbors = timed(lambda: nearest_neighbors(means, vote.k))
-        own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-        seconds["vote"], copied = timed(
-            lambda: refine(means, lifted.directions, reliability, vote, own=own, neighbors=neighbors)
-        )
-    store_kwargs = {"tolerance": options.tolerance, "storage": options.storage}
-    seconds["store"], field = timed(lambda: SemanticField.build(lifted, means, copied, **store_kwargs))
-    stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
-    return _Costs(seconds, _items(sample, times, len(means), options), stored_bytes)
 
 
 def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:
@@ -391,11 +358,19 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
         return Diagnostic("in view", "error", message, "give the cameras of this splat, or --world-transform")
-    if share < _FEW_IN_VIEW:
-        return Diagnostic(
-            "in view", "warning", message, "the others get no semantics; are these the cameras of the splat?"
-        )
-    return Diagnostic("in view", "ok", message)
+    advice = "the others get no semantics; are these the cameras of the splat?"
+    return (
+        Diagnostic("in view", "warning", message, advice)
+        if share < _FEW_IN_VIEW
+        else Diagnostic("in view", "ok", message)
+    )
+
+
+def diagnose_cameras(warning: str | None) -> Diagnostic:
+    """Return the result of comparing images with renders, from the warning if they differ."""
+    if warning is None:
+        return Diagnostic("cameras", "ok", "three images match renders from their cameras")
+    return Diagnostic("cameras", "warning", warning)
 
 
 def diagnose_device(device: str) -> Diagnostic:
@@ -415,21 +390,18 @@ def diagnose_versions() -> Diagnostic:
     missing = [name for name in _required_packages() if _version(name) is None]
     message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
-        return Diagnostic(
-            "versions", "warning", f"{message}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
-        )
+        message = f"{message}; ns-* commands need nerfstudio"
+        return Diagnostic("versions", "warning", message, "pip install nerfstudio==1.1.5")
     if len(missing) > 0:
-        return Diagnostic(
-            "versions", "error", f"{message}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
-        )
+        message = f"{message}; not installed: {', '.join(missing)}"
+        return Diagnostic("versions", "error", message, f"pip install {missing[0]}")
     return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
 def _required_packages() -> list[str]:
     """Return the names of the packages that normlift_ns requires; none in a source tree."""
     required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()
-    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
-    return ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
+    return [re.split(r"[^\w.-]", requirement)[0] for requirement in required if "extra ==" not in requirement]
 
 
 def _version(name: str) -> str | None:
@@ -495,15 +467,11 @@ def _check_capacity(name: str, needed: int, free: int, advice: str) -> Diagnosti
 def _free_memory() -> int | None:
     """Return the bytes that this process may still allocate; None if the system does not report them."""
     limits = []
-    try:
+    with suppress(OSError, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
         limits += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
-    except (OSError, ValueError, IndexError):
-        pass
-    if len(limits) == 0 and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     return min(limits) if len(limits) > 0 else None
 
 
@@ -512,7 +480,6 @@ def _free_memory() -> int | None:
 # The results are discarded, and nothing is downloaded. Cached views are read, not computed again.
 
 
-Clock = Callable[[], float]
 _Result = TypeVar("_Result")
 _MAX_VIEWS = 4
 """Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
@@ -534,23 +501,12 @@ class _Observed(NamedTuple):
     seconds: float
 
 
-class _Rasterized(NamedTuple):
-    """Evidence of some views, and what it cost."""
-
-    evidence: Evidence
-    seconds: float
-    cached_seconds: float
-    """Seconds to read it from the cache."""
-    write_bytes_s: float
-
-
-def time_kernel_loading(
-    scene: Scene, options: LiftOptions, *, device: str = "cpu", clock: Clock = perf_counter
-) -> float:
+def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
     """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
     gaussians = scene.gaussians.to(device)
-    ready = start_kernel_warm_up(scene, gaussians, options, choose_raster_config(scene, gaussians, options))
-    return min(_MAX_LOAD_S, _seconds(ready, clock=clock, device=device)[0])
+    config = pipeline.choose_raster_config(scene, gaussians, options)
+    ready = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
+    return min(_MAX_LOAD_S, _seconds(ready, clock=perf_counter, device=device)[0])
 
 
 def measure_capture(
@@ -573,14 +529,11 @@ def measure_capture(
     Raises:
         ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
     """
-    gaussians, views = scene.gaussians.to(device), scene.train
-    drawing = choose_raster_config(scene, gaussians, options)
+    collection = pipeline.plan_collection(scene, source, options, cache, device=device, export=None)
+    gaussians, used, drawing = collection.gaussians, collection.views, collection.config
     cuda = torch.device(device).type == "cuda"
     timed = partial(_seconds, clock=clock, device=device)
-    start_kernel_warm_up(scene, gaussians, options, drawing)()
-    names = set(source.available(views.names))
-    usable = [index for index, name in enumerate(views.names) if name in names]
-    used = [usable[i] for i in sample_evenly(len(usable), options.max_views)]
+    pipeline.start_kernel_warm_up(scene, gaussians, options, drawing)()
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
@@ -601,13 +554,14 @@ def measure_capture(
     def rasterize(folder: Path) -> Evidence:
         return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
-    rasterized = _measure_evidence(rasterize, timed, cuda=cuda)
-    evidence, count = rasterized.evidence, len(block.cameras)
+    count = len(block.cameras)
+    evidence, evidence_s, cached_evidence_s, write_bytes_s = _measure_evidence(rasterize, timed, warm_up=cuda)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
-    rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
+    rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), clock)
+    groups = ((_joined(list(known.values())), len(known)), (observed.block, len(new)))
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
     return Measurements(
-        device=_device_name(device),
+        device=torch.cuda.get_device_name(device) if cuda else f"{device}, {torch.get_num_threads()} threads",
         views=len(used),
         gaussians=len(gaussians),
         dimension=block.features[0].shape[1],
@@ -619,14 +573,15 @@ def measure_capture(
         features_s=_per_view(observed),
         cached_features_s=cached_s,
         cached_features_share=len(known) / len(chosen),
-        evidence_s=rasterized.seconds / count,
-        cached_evidence_s=rasterized.cached_seconds / count,
-        cached_evidence_share=_evidence_cached(gaussians, observed, known, len(chosen), options, drawing, cache),
+        evidence_s=evidence_s / count,
+        cached_evidence_s=cached_evidence_s / count,
+        cached_evidence_share=_evidence_cached(collection, groups),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
-        write_bytes_s=rasterized.write_bytes_s,
-        view_bytes=_map_bytes(block) / count,
+        write_bytes_s=write_bytes_s,
+        view_bytes=sum(4 * rows.numel() + 2 * labels.numel() for labels, rows in zip(block.labels, block.features))
+        / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
         measured_views=max(count, len(observed.block.cameras)),
@@ -639,11 +594,6 @@ def _per_view(observed: _Observed) -> float | None:
     return observed.seconds / count if count > 0 else None
 
 
-def _map_bytes(block: ViewBatch) -> int:
-    """Return the size of labels and features in the cache."""
-    return sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
-
-
 def _cached_views(indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed]) -> dict[int, ViewBatch]:
     """Return the views that can be observed from the cache, by index."""
     cached: dict[int, ViewBatch] = {}
@@ -653,16 +603,22 @@ def _cached_views(indices: Sequence[int], observe: Callable[[Sequence[int]], _Ob
     return cached
 
 
-def _measure_evidence(rasterize: Callable[[Path], Evidence], timed: Timed, *, cuda: bool) -> _Rasterized:
-    """Rasterize some views into a temporary folder, read them from there, and write their evidence once more."""
+def _measure_evidence(
+    rasterize: Callable[[Path], Evidence], timed: Callable[[Callable[[], Any]], tuple[float, Any]], *, warm_up: bool
+) -> tuple[Evidence, float, float, float]:
+    """Rasterize some views into a temporary folder, read them from there, and write their evidence once more.
+
+    Returns:
+        The evidence, the seconds to rasterize it and to read it, and bytes written per second.
+    """
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:
         folder, file = Path(name), Path(name) / "again.safetensors"
-        if cuda:  # kernels for labels like these are compiled once for all lifts
+        if warm_up:  # kernels for labels like these are compiled once for all lifts
             rasterize(folder / "first")
         seconds, evidence = timed(lambda: rasterize(folder))
         cached_seconds, _ = timed(lambda: rasterize(folder))
-        saved_s, _ = timed(lambda: evidence.save(file))
-        return _Rasterized(evidence, seconds, cached_seconds, file.stat().st_size / max(saved_s, 1e-6))
+        write_s, _ = timed(lambda: evidence.save(file))
+        return evidence, seconds, cached_seconds, file.stat().st_size / max(write_s, 1e-6)
 
 
 def _observe_loaded(
@@ -686,29 +642,20 @@ def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
     return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
-def _evidence_cached(
-    gaussians: GaussianScene,
-    observed: _Observed,
-    cached: Mapping[int, ViewBatch],
-    chosen: int,
-    options: LiftOptions,
-    drawing: RasterConfig,
-    cache: Path,
-) -> float:
-    """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
-    if not options.reuse_evidence:
+def _evidence_cached(collection: EvidenceCollection, groups: Sequence[tuple[ViewBatch, int]]) -> float:
+    """Return the share of views whose evidence is cached.
+
+    Args:
+        groups: examples of views, and how many views they represent.
+    """
+    if not collection.options.reuse_evidence:
         return 0.0
     share = 0.0
-    for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
-        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, drawing))
-        share += sum(hits) / max(1, len(hits)) * views / chosen
+    for block, views in groups:
+        keys = evidence_keys(collection.gaussians, block, collection.config)
+        hits = views_in_cache(collection.cache / "evidence", keys)
+        share += sum(hits) / max(1, len(hits)) * views / sum(count for _, count in groups)
     return share
-
-
-def _device_name(device: str) -> str:
-    if torch.device(device).type != "cuda":
-        return f"{device}, {torch.get_num_threads()} threads"
-    return torch.cuda.get_device_name(device)
 
 
 def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple[float, _Result]:

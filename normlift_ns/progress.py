@@ -18,9 +18,11 @@ ProgressCallback = Callable[[str, int, int], None]
 class StageTimer:
     """Timers of the stages of a lift, which also report progress."""
 
-    def __init__(self, report: ProgressCallback) -> None:
+    def __init__(self, report: ProgressCallback, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds: dict[str, float] = {}
-        self._report = report
+        self.report = report
+        """Reports the progress of a stage that counts its own steps."""
+        self._clock = clock
         self._done: dict[str, int] = {}
 
     @contextmanager
@@ -33,10 +35,10 @@ class StageTimer:
 
         def step() -> None:
             self._done[stage] = self._done.get(stage, 0) + 1
-            self._report(stage, self._done[stage], total)
+            self.report(stage, self._done[stage], total)
 
-        start = time.perf_counter()
-        self._report(stage, self._done.get(stage, 0), total)
+        start = self._clock()
+        self.report(stage, self._done.get(stage, 0), total)
         try:
             yield step
         except torch.cuda.OutOfMemoryError as error:
@@ -45,11 +47,7 @@ class StageTimer:
             ) from error
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-    def report(self, stage: str, done: int, total: int) -> None:
-        """Report the progress of a stage that counts its own steps."""
-        self._report(stage, done, total)
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + self._clock() - start
 
 
 def lift_cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:

@@ -49,14 +49,14 @@ torch.save(torch.nn.functional.normalize(rows, dim=1), sys.argv[2] + "/rows.pt")
 """
 LIFT = """
 import json, os
-from normlift_ns.cli import lift
-shown = lift.summary
+from normlift_ns.cli import lift, start
+shown = lift.lift_summary
 def summary(run, before, total):
     with open(os.environ["SECONDS_FILE"], "w") as file:
         json.dump({**before, **run.seconds, "total": total}, file)
     return shown(run, before, total)
-lift.summary = summary
-lift.main()
+lift.lift_summary = summary
+start.lift()
 """
 
 

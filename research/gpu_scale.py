@@ -326,7 +326,7 @@ def main(only: Sequence[str], output: Path, device: str, quick: bool, trained: P
     words = [sys.executable, "-m", "research.gpu_scale", "--device", device, "--output", str(output)]
     words += ["--quick"] * quick + ["--only", *(part for part in only if part != "command")]
     with tempfile.TemporaryDirectory() as name:
-        code = launch_processes([*words, "--folder", name], 2, print) if set(only) - {"command"} else 0
+        code = launch_processes([[*words, "--folder", name]] * 2, print) if set(only) - {"command"} else 0
         if code == 0 and "command" in only:
             report = Report("scale")
             commands(report, trained.absolute(), Path(name), device, quick)

@@ -57,7 +57,7 @@ def run(
         environment: what is added to that of this process.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), *_paths()]), **environment}
-    program = program or f"from normlift_ns.cli.{command} import main; main()"
+    program = program or f"from normlift_ns.cli.start import {command}; {command}()"
     words = [sys.executable, "-P", "-c", program] if sys.version_info >= (3, 11) else [sys.executable, "-c", program]
     with tempfile.TemporaryFile() as log:
         start = time.perf_counter()

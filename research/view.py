@@ -34,7 +34,7 @@ from tests.captures import SHARED
 PATIENCE = 180
 """Seconds."""
 COLOURS = ("orange", "crimson", "teal", "purple", "dark green", "sky blue", "yellow", "brown", "grey")
-_PROGRAM = "from normlift_ns.cli.view import main; main()"
+_PROGRAM = "from normlift_ns.cli.start import view; view()"
 _FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 _CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "fov": 1.0, "aspect": 1.0,

@@ -1,6 +1,6 @@
 """The plain room, of coloured solids: the scene "demo" of the benchmarks and the room of many tests.
 
-Figures rest on it to the last bit, so it stays as it is. `normlift_ns.demo.demo_room` is the room that people see.
+Figures rest on it to the last bit, so it stays as it is. `normlift_ns.demo.room.demo_room` is the room that people see.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from prompt_toolkit.output import DummyOutput
 
 from normlift_ns import InputError, SemanticField, open_run
 from normlift_ns.cli import query
-from normlift_ns.cli.repl import answer_lines, run_repl
+from normlift_ns.cli.query import answer_lines, run_repl
 from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.io.field import read_field
 from normlift_ns.options import RelevancyRule

@@ -11,12 +11,12 @@ import os
 import re
 import secrets
 import shlex
-import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -25,24 +25,13 @@ from typing import Annotated, Literal
 import tyro
 from rich.table import Table
 
-from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command, run_command_process
+from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command
 from normlift_ns.cli.lift import NormLift
-from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
-from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, exit_with_parent
+from normlift_ns.cli.preflight import check_readable_file, check_writable_folder
+from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
 from normlift_ns.errors import InputError, escape_unprintable
+from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
-from normlift_ns.io.file_lock import (
-    ABANDONED,
-    BEATS_PER_TIMEOUT,
-    JSONL_SUFFIX,
-    Claim,
-    append_jsonl,
-    finish_claim,
-    iter_claims,
-    read_claim_states,
-    read_jsonl,
-    write_pulse,
-)
 from normlift_ns.io.manifest import read_manifest
 from normlift_ns.io.run_dir import FIELD_FOLDER, run_directory
 from normlift_ns.options import check_options, short_repr
@@ -50,6 +39,7 @@ from normlift_ns.options import check_options, short_repr
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
 """Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
+_SOURCE_NAMES = ("load_config", *_SOURCES.values())
 _NOT_IN_KEY = ("device", "timestamp", "output_dir")
 """Options that do not change what is lifted, only where it is computed or stored."""
 _KEY_LENGTH = 16
@@ -84,7 +74,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         common = _parse(options)
     except InputError as error:
         raise InputError(f"After --: {error}") from None
-    if (name := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
+    if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
             f"--{name.replace('_', '-')} comes after --, where it applies to every capture. Write it into {path}, one "
             "line per capture."
@@ -131,20 +121,14 @@ def _capture_key(command: NormLift) -> str:
     features, label maps and weights, it includes their paths only.
     """
     options = {name: value for name, value in asdict(command).items() if name not in _NOT_IN_KEY}
-    sizes = [(file.name, file.stat().st_size) for file in _scene_files(command) if file.is_file()]
+    files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
+    if command.load_config is not None:
+        step = "*" if command.load_step is None else f"{command.load_step:09d}"
+        folder = command.load_config.absolute().parent / "nerfstudio_models"
+        files = sorted(folder.glob(f"step-{step}.ckpt"))[-1:]
+    sizes = [(file.name, file.stat().st_size) for file in files if file.is_file()]
     text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
     return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
-
-
-def _source_names() -> tuple[str, ...]:
-    return "load_config", *_SOURCES.values()
-
-
-def _scene_files(command: NormLift) -> list[Path]:
-    if command.load_config is None:
-        return [path for path in (command.load_ply, command.load_gsplat) if path is not None]
-    step = "*" if command.load_step is None else f"{command.load_step:09d}"
-    return sorted((command.load_config.absolute().parent / "nerfstudio_models").glob(f"step-{step}.ckpt"))[-1:]
 
 
 def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:
@@ -188,11 +172,10 @@ def _parse(words: Sequence[str]) -> NormLift:
 
 
 def _run_dir(command: NormLift, timestamp: str) -> Path | None:
-    try:
-        name, outputs = new_run_location(command.load_config, command.splat, command.output_dir)
+    with suppress(InputError, OSError):  # the process of this capture reports the error
+        name, outputs = command.new_run_location()
         return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
-    except (InputError, OSError):  # the process of this capture reports the error
-        return None
+    return None
 
 
 # Shards of a capture list: the part of a numbered worker.
@@ -293,6 +276,8 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
 
 
 OutcomeState = Literal["done", "failed", "skipped"]
+_STATE_NAMES: dict[OutcomeState, str] = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
+"""Outcomes as words of messages."""
 
 
 @dataclass(frozen=True)
@@ -360,8 +345,7 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
 def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> str:
     """Return the number of lifted, skipped and failed captures as one line."""
     states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
-    words = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
-    return ", ".join(f"{count} {words[state]}" for state in words if (count := states.count(state)) > 0)
+    return ", ".join(f"{count} {word}" for state, word in _STATE_NAMES.items() if (count := states.count(state)) > 0)
 
 
 # Child processes that lift one capture each.
@@ -371,8 +355,6 @@ LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
 """Seconds between terminating a process and killing it."""
-_TAIL = 2**14
-"""Number of bytes at the end of a log file that may contain its last line."""
 
 
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
@@ -403,37 +385,21 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
     ):
         try:
             while True:
-                try:
+                with suppress(subprocess.TimeoutExpired):
                     return process.wait(interval)
-                except subprocess.TimeoutExpired:
-                    if not on_tick():
-                        _terminate(process)
-                        return None
-        except BaseException:  # Ctrl-C or SIGTERM
-            _terminate(process)
-            raise
+                if not on_tick():
+                    return None
+        finally:  # also after Ctrl-C or SIGTERM
+            end_processes([process], _GRACE)
 
 
 def failure_reason(code: int, log: Path) -> str:
     """Return why a process failed: the signal that killed it, or the last line that it printed."""
     if code < 0:
-        name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-        hint = ", perhaps because the system ran out of memory" if -code == signal.SIGKILL else ""
-        return f"its process was killed by {name}{hint}; see its output in {log}"
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - _TAIL))
-        lines = file.read().decode("utf8", "replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip() != ""), "")
-    return last or f"its process ended with exit code {code} and without output"
-
-
-def _terminate(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(_GRACE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        return f"its process was killed by {describe_signal(-code)}; see its output in {log}"
+    lines = map(str.strip, log.read_bytes().decode("utf8", "replace").split("\n"))
+    *_, last = (f"its process ended with exit code {code} and without output", *filter(None, lines))
+    return last
 
 
 # Worker that lifts captures of a list, possibly alongside other workers.
@@ -465,24 +431,25 @@ def lift_captures(
     worker = f"{safe_file_name(socket.gethostname())}_{os.getpid()}_{secrets.token_hex(4)}"
     for name in (_CLAIMS, _LOGS):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    at_start, previous = read_claim_states(folder / _CLAIMS), latest_outcomes(read_jsonl(folder, Outcome))
+    at_start = file_lock.read_claim_states(folder / _CLAIMS)
+    previous = latest_outcomes(file_lock.read_jsonl(folder, Outcome))
     missing = {capture.key: capture for capture in captures if not _is_complete(capture, previous)}
-    for claim in iter_claims(folder / _CLAIMS, list(missing), at_start, timeout):
+    for claim in file_lock.iter_claims(folder / _CLAIMS, list(missing), at_start, timeout):
         capture = missing[claim.key]
         try:
             on_message(f"{capture.name} …")
             outcome = _lift_capture(capture, claim, folder, timeout, worker, command)
         except BaseException:
-            finish_claim(claim, ABANDONED)
+            file_lock.finish_claim(claim, file_lock.ABANDONED)
             raise
         if outcome is None:
             on_message(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
             continue
-        append_jsonl(folder / f"{worker}{JSONL_SUFFIX}", outcome)
-        finish_claim(claim, outcome.state)
-        results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
-        on_message(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
-    return latest_outcomes(read_jsonl(folder, Outcome))
+        file_lock.append_jsonl(folder / f"{worker}{file_lock.JSONL_SUFFIX}", outcome)
+        file_lock.finish_claim(claim, outcome.state)
+        reason = f": {outcome.message}" if outcome.state == "failed" else ""
+        on_message(f"{capture.name}: {_STATE_NAMES[outcome.state]}{reason} ({outcome.seconds:.1f} s)")
+    return latest_outcomes(file_lock.read_jsonl(folder, Outcome))
 
 
 def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
@@ -490,14 +457,13 @@ def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
     outcome = outcomes.get(capture.key)
     if outcome is None or outcome.state == "failed":
         return False
-    try:
+    with suppress(InputError):  # reported when the capture is processed
         return capture.run_dir is None or is_lifted(capture.run_dir)
-    except InputError:  # reported when the capture is processed
-        return False
+    return False
 
 
 def _lift_capture(
-    capture: Capture, claim: Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
+    capture: Capture, claim: file_lock.Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
 ) -> Outcome | None:
     """Lift a capture unless it is already lifted; return None if another worker has taken over."""
     start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
@@ -511,9 +477,9 @@ def _lift_capture(
         if capture.run_dir is not None and is_lifted(capture.run_dir):
             return outcome("skipped")
         beats = count(1)
-        code = run_logged(
-            [*program, *capture.arguments], log, lambda: write_pulse(claim, next(beats)), patience / BEATS_PER_TIMEOUT
-        )
+        interval = patience / file_lock.BEATS_PER_TIMEOUT
+        command = [*program, *capture.arguments]
+        code = run_logged(command, log, lambda: file_lock.write_pulse(claim, next(beats)), interval)
         if code is None:
             return None
         if code == 0:
@@ -578,8 +544,3 @@ class NormLiftBatch:
 def entrypoint() -> None:
     """Run ns-normlift-batch in a process that continues afterwards."""
     run_command(NormLiftBatch)
-
-
-def main() -> None:
-    """Run ns-normlift-batch as a process."""
-    run_command_process(NormLiftBatch)

@@ -7,18 +7,18 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 from rich.table import Table
 from rich.text import Text
 
 import normlift_ns
-from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command, run_command_process
-from normlift_ns.cli.lift import NormLift
-from normlift_ns.cli.preflight import check_writable_file
+from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
+from normlift_ns.cli.lift import NormLift, print_plan
+from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
-from normlift_ns.io.atomic import refuse_existing, write_text_file
+from normlift_ns.io.atomic import write_text_file
 
 if TYPE_CHECKING:
     from normlift_ns.planning import Diagnostic, Plan
@@ -43,13 +43,13 @@ class NormLiftCheck(NormLift):
             SystemExit: There is an error; the exit code is 1.
         """
         start_time = time.perf_counter()
-        if self.json is not None:
-            check_writable_file(self.json, "--json")
-            refuse_existing(self.json, overwrite=self.overwrite, flags="--json")
+        check_new_files(self.json, overwrite=self.overwrite, flags="--json")
         rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:
-            write_text_file(self.json, _to_json(rows, plan), overwrite=self.overwrite)
+            findings = {"version": normlift_ns.__version__, "findings": [asdict(row) for row in rows]}
+            text = json.dumps({**findings, "plan": None if plan is None else plan.to_json()}, indent=1) + "\n"
+            write_text_file(self.json, text, overwrite=self.overwrite)
         if any(row.state == "error" for row in rows):
             raise SystemExit(1)
 
@@ -59,7 +59,6 @@ class NormLiftCheck(NormLift):
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None
         from normlift_ns import planning  # noqa: PLC0415
-        from normlift_ns.cli.dry_run import compare_cameras, open_capture, plan_lift  # noqa: PLC0415
         from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.encoders.build import make_source  # noqa: PLC0415
         from normlift_ns.planning import Diagnostic  # noqa: PLC0415
@@ -74,7 +73,7 @@ class NormLiftCheck(NormLift):
         source = _try(rows, "2D features", lambda: make_source(options, device))
         missing = [] if source is None else planning.missing_weights(options, device)
         rows += [] if source is None else [planning.diagnose_weights(missing)]
-        opened = _try(rows, "capture", lambda: open_capture(self, start_time))
+        opened = _try(rows, "capture", lambda: self.open_capture(start_time))
         if opened is None:
             return rows, None
         scene = opened.scene
@@ -83,14 +82,11 @@ class NormLiftCheck(NormLift):
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
         if self.check:
-            warning = _try(rows, "cameras", lambda: (compare_cameras(self, opened, device),))
-            if warning == (None,):
-                rows.append(Diagnostic("cameras", "ok", "three images match renders from their cameras"))
-            elif warning is not None:
-                rows.append(Diagnostic("cameras", "warning", str(warning[0])))
+            compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(self.compare_cameras(opened, device)))
+            rows += [] if compared is None else [compared]
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
-        plan = _try(rows, "plan", lambda: plan_lift(self, opened, source, device))
+        plan = _try(rows, "plan", lambda: self.make_plan(opened, source, device))
         if plan is not None:
             rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]
         return rows, plan
@@ -110,9 +106,7 @@ def _try(rows: list[Diagnostic], name: str, function: Callable[[], _Result]) -> 
 
     try:
         return function()
-    except Exception as error:
-        if not isinstance(error, (ValueError, OSError, MemoryError)):
-            raise
+    except (ValueError, OSError, MemoryError) as error:
         message, code = describe_error(error)
         if code == EXIT_INTERNAL_ERROR:
             raise
@@ -124,36 +118,15 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
     table = Table("", "", "result", "what to do")
     colors = {"ok": "green", "warning": "yellow", "error": "red"}
     for row in rows:
-        table.add_row(
-            plain_text(row.what),
-            Text(row.state, style=colors[row.state]),
-            plain_text(row.found),
-            plain_text(row.advice),
-        )
+        what, found, advice = map(plain_text, (row.what, row.found, row.advice))
+        table.add_row(what, Text(row.state, style=colors[row.state]), found, advice)
     CONSOLE.print(table)
     if plan is None:
         info("Correct the errors above to see how long the lift will take.")
-        return
-    from normlift_ns.cli.dry_run import describe_needs, plan_table  # noqa: PLC0415
-
-    CONSOLE.print(plan_table(plan))
-    info(describe_needs(plan))
-
-
-def _to_json(rows: list[Diagnostic], plan: Plan | None) -> str:
-    content: dict[str, Any] = {
-        "version": normlift_ns.__version__,
-        "findings": [asdict(row) for row in rows],
-        "plan": None if plan is None else plan.to_json(),
-    }
-    return json.dumps(content, indent=1) + "\n"
+    else:
+        print_plan(plan)
 
 
 def entrypoint() -> None:
     """Run ns-normlift-check in a process that continues afterwards."""
     run_command(NormLiftCheck)
-
-
-def main() -> None:
-    """Run ns-normlift-check as a process."""
-    run_command_process(NormLiftCheck)

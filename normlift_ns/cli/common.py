@@ -12,8 +12,9 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
+from argparse import ArgumentError, ArgumentParser
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from functools import cache
@@ -122,26 +123,17 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
     >>> split_output_flags(["--k", "8", "--quiet", "--log-file", "a.log"])
     (['--k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
     """
-    rest, quiet, log_file = [], False, None
-    indices = iter(range(len(words)))
-    for i in indices:
-        following = words[i + 1] if i + 1 < len(words) else "--"
-        if words[i] == "--":  # the rest is for another command
-            return [*rest, *words[i:]], OutputSettings(quiet, log_file)
-        if words[i] == "--quiet":
-            quiet = following != "False"
-            if not following.startswith("-"):
-                if following not in ("True", "False"):
-                    raise InputError(f"--quiet must be True or False, got {following!r}")
-                next(indices)
-        elif words[i] in ("--log-file", "--log_file"):
-            if following.startswith("--"):
-                raise InputError("--log-file needs a file name")
-            log_file = Path(following)
-            next(indices)
-        else:
-            rest.append(words[i])
-    return rest, OutputSettings(quiet, log_file)
+    end = words.index("--") if "--" in words else len(words)  # the rest is for another command
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--quiet", nargs="?", const="True", default="False")
+    parser.add_argument("--log-file", "--log_file", type=Path)
+    try:
+        flags, rest = parser.parse_known_args(words[:end])
+    except ArgumentError:
+        raise InputError("--log-file needs a file name") from None
+    if flags.quiet not in ("True", "False"):
+        raise InputError(f"--quiet must be True or False, got {flags.quiet!r}")
+    return [*rest, *words[end:]], OutputSettings(flags.quiet == "True", flags.log_file)
 
 
 @contextmanager
@@ -151,27 +143,18 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
     Raises:
         InputError: The log file cannot be written.
     """
-    streams = sys.stdout, sys.stderr
-    output_settings.append(terminal)
-    log = None
-    try:
-        if terminal.log_file is not None:
-            log = _open_log(terminal.log_file)
-            log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} {command}\n")
-            sys.stdout, sys.stderr = (_logged(stream, log) for stream in streams)
-        yield
-    finally:
-        sys.stdout, sys.stderr = streams
-        output_settings.pop()
+    stdout, stderr = sys.stdout, sys.stderr
+    with nullcontext() if terminal.log_file is None else _open_log(terminal.log_file) as log:
         if log is not None:
-            log.close()
-
-
-def write_log_line(text: str) -> None:
-    """Write a line to the log file only, if there is one."""
-    log = getattr(sys.stderr, "log", None)
-    if log is not None:
-        log.write(text)
+            log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} {command}\n")
+        sys.stdout = None if stdout is None else cast(Any, _OutputStream(stdout, log, _output_errors))
+        sys.stderr = None if stderr is None else cast(Any, _OutputStream(stderr, log, nullcontext))
+        output_settings.append(terminal)
+        try:
+            yield
+        finally:
+            output_settings.pop()
+            sys.stdout, sys.stderr = stdout, stderr
 
 
 def _open_log(path: Path) -> IO[str]:
@@ -183,22 +166,37 @@ def _open_log(path: Path) -> IO[str]:
         raise InputError(f"{path}, given with --log-file, cannot be written: {error.strerror}") from error
 
 
-class _LoggedStream:
-    """A stream whose output also goes to a log file, without escape sequences."""
+class _OutputStream:
+    """A stream whose output also goes to the log file, if there is one, without escape sequences."""
 
-    def __init__(self, stream: IO[str], log: IO[str]) -> None:
-        self._stream, self.log = stream, log
+    def __init__(
+        self, stream: IO[str], log: IO[str] | None, errors: Callable[[], AbstractContextManager[None]]
+    ) -> None:
+        self._stream, self.log, self._errors = stream, log, errors
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        self.log.write(_ESCAPES.sub("", text))
-        return self._stream.write(text)
+        if self.log is not None:
+            self.log.write(_ESCAPES.sub("", text))
+        with self._errors():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with self._errors():
+            self._stream.flush()
 
 
-def _logged(stream: Any, log: IO[str]) -> Any:
-    return None if stream is None else cast(Any, _LoggedStream(stream, log))
+@contextmanager
+def _output_errors() -> Iterator[None]:
+    """Raise OutputError if standard output cannot be written."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(_OUTPUT_ERROR.format(error.strerror)) from error
 
 
 # Shared parts of the commands: flags and help, printing, warnings, exit codes.
@@ -273,13 +271,17 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
 def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
     """Run the command and return the exit code."""
     try:
-        with _sigterm_raises(), _plain_warnings(), _checked_output(), named_as_flags():
-            _parse_and_run(command, words)
+        with _sigterm_raises(), _plain_warnings(), named_as_flags():
+            if "--version" in words:
+                info(f"normlift_ns {normlift_ns.__version__}")
+            else:
+                tyro.extras.set_accent_color("bright_yellow")
+                parse_flags(command, words).main()
     except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:
-        number = signal.SIGINT if isinstance(stop, KeyboardInterrupt) else signal.SIGTERM
-        word = "Interrupted" if number == signal.SIGINT else "Terminated"
+        interrupted = isinstance(stop, KeyboardInterrupt)
+        word, number = ("Interrupted", signal.SIGINT) if interrupted else ("Terminated", signal.SIGTERM)
         print_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
     except Exception as error:  # a traceback would not help the user
@@ -298,14 +300,6 @@ def _report_error(error: Exception) -> int:
     return code
 
 
-def _parse_and_run(command: type[CommandProtocol], words: list[str]) -> None:
-    if "--version" in words:
-        info(f"normlift_ns {normlift_ns.__version__}")
-        return
-    tyro.extras.set_accent_color("bright_yellow")
-    parse_flags(command, words).main()
-
-
 def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | None = None) -> _Command:
     """Parse the words after the name of a command.
 
@@ -317,18 +311,14 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
         InputError: The command does not know the words.
         SystemExit: The help was printed; the exit code is 0.
     """
-    name = name or _module_name()
+    program = Path(sys.argv[0])
+    if name is None and program.parent == Path(__file__).parent:  # started as a module
+        name = f"python -m {__package__}.{program.stem}"
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
     arguments = fill_boolean_values(arguments, boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
     with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
-
-
-def _module_name() -> str | None:
-    """Return how to start a command that runs as a module; None for installed commands."""
-    program = Path(sys.argv[0])
-    return f"python -m {__package__}.{program.stem}" if program.parent == Path(__file__).parent else None
 
 
 def boolean_flags(options: Any) -> set[str]:
@@ -358,6 +348,17 @@ def fill_boolean_values(words: Sequence[str], flags: Collection[str]) -> list[st
 def plain_text(value: object) -> Text:
     """Return a prompt, path or name as rich text without markup."""
     return Text(escape_unprintable(str(value)))
+
+
+def format_number(value: float | Sequence[float] | None) -> str:
+    """Return a number or a vector as a cell of a table; a dash stands for None and for an empty vector.
+
+    >>> format_number(0.12345), format_number([1, 2.5]), format_number(None)
+    ('0.123', '1.00 2.50', '-')
+    """
+    if isinstance(value, Sequence):
+        return " ".join(f"{x:.2f}" for x in value) or "-"
+    return "-" if value is None else f"{value:.3f}"
 
 
 def info(text: str) -> None:
@@ -404,45 +405,6 @@ def _flush(stream: TextIO | None, report: bool) -> int:
         return EXIT_USER_ERROR
 
 
-class _CheckedStream:
-    """Standard output that raises OutputError if it cannot be written."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        with _output_errors():
-            return self._stream.write(text)
-
-    def flush(self) -> None:
-        with _output_errors():
-            self._stream.flush()
-
-
-@contextmanager
-def _output_errors() -> Iterator[None]:
-    try:
-        yield
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OutputError(_OUTPUT_ERROR.format(error.strerror)) from error
-
-
-@contextmanager
-def _checked_output() -> Iterator[None]:
-    stream = sys.stdout
-    if stream is not None:
-        sys.stdout = cast(TextIO, _CheckedStream(stream))
-    try:
-        yield
-    finally:
-        sys.stdout = stream
-
-
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
     """Let SIGTERM end this context with an exception, as Ctrl-C does."""
@@ -474,7 +436,8 @@ def _plain_warnings() -> Iterator[None]:
             if filename.startswith(_PACKAGE):
                 print_error(f"Warning: {message}")
             elif issubclass(category, DeprecationWarning | PendingDeprecationWarning | FutureWarning):
-                write_log_line(warnings.formatwarning(message, category, filename, rest[0]))
+                if (log := getattr(sys.stderr, "log", None)) is not None:
+                    log.write(warnings.formatwarning(message, category, filename, rest[0]))
             else:
                 default(message, category, filename, *rest, **more)
 

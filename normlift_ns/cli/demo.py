@@ -10,7 +10,6 @@ import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 from rich.table import Table
@@ -21,11 +20,6 @@ from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
 from normlift_ns.io.atomic import atomic_file, write_text_file
 from normlift_ns.options import AskOptions, SourceOptions, check_options
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from torch import Tensor
-
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
@@ -58,6 +52,10 @@ class Demo:
             warnings.simplefilter("ignore", category)
         # Meanwhile, another core compiles the kernels that are not cached.
         compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
+        import numpy as np  # noqa: PLC0415 (as all below, after the compilation has started)
+        from PIL import Image  # noqa: PLC0415
+
+        from normlift_ns.core.metrics import class_scores, confusion  # noqa: PLC0415
         from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.demo.room import demo_room  # noqa: PLC0415
         from normlift_ns.evidence_collection import sample_evenly  # noqa: PLC0415
@@ -83,16 +81,17 @@ class Demo:
         _show("ns-normlift-query", "--load-config", run.config, "--text", *_PROMPTS, *flags)
         NormLiftQuery(run.config, _PROMPTS, ask=_ASK_OPTIONS, render_dir=renders, json=answers, overwrite=True).main()
         middle = f"{sample_evenly(self.views, 3)[1]:04d}"
-        _join_images(
-            [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])], renders
-        )
+        pictures = [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])]
+        with atomic_file(renders / "overview.png", overwrite=True) as draft:
+            joined = np.hstack([np.asarray(Image.open(path).convert("RGB")) for path in pictures])
+            Image.fromarray(joined).save(draft, compress_level=1)
 
         CONSOLE.rule("Comparing with the ground truth")
         scores = {}
         for name, refined in (("before refinement", False), ("after refinement", True)):
             answer = run.ask(*room.names, refined=refined)
             classes = answer.relevancy.argmax(dim=1).where(answer.valid, -1)
-            scores[name] = iou_per_class(classes, room.labels, len(room.names))
+            scores[name] = class_scores(confusion(room.labels, classes, len(room.names))).iou.float()
         table = Table("class", *scores, title="IoU over the Gaussians of each class")
         for i, name in enumerate(room.names):
             table.add_row(name, *(f"{values[i]:.3f}" for values in scores.values()))
@@ -104,30 +103,6 @@ class Demo:
         info(f"Renders are in {renders}. To explore the room in the browser, type:")
         info(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
         return means
-
-
-def _join_images(paths: list[Path], folder: Path) -> None:
-    """Join images of the same height into overview.png."""
-    from PIL import Image  # noqa: PLC0415
-
-    images = [Image.open(path).convert("RGB") for path in paths]
-    joined = Image.new("RGB", (sum(image.width for image in images), images[0].height))
-    left = 0
-    for image in images:
-        joined.paste(image, (left, 0))
-        left += image.width
-    with atomic_file(folder / "overview.png", overwrite=True) as draft:
-        joined.save(draft, compress_level=1)
-
-
-def iou_per_class(predicted: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:
-    """Return the IoU of each class over the Gaussians whose class is known (truth >= 0)."""
-    import torch  # noqa: PLC0415
-
-    known = truth >= 0
-    predicted, truth = predicted[known], truth[known]
-    ious = [((predicted == c) & (truth == c)).sum() / ((predicted == c) | (truth == c)).sum() for c in range(classes)]
-    return torch.stack(ious)
 
 
 def _show(*words: object) -> None:

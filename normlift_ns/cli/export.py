@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,16 +10,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
-from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
-from normlift_ns.cli.preflight import (
-    check_lifted_run,
-    check_readable_file,
-    check_writable_file,
-    check_writable_folder,
-    has_stored_queries,
+from normlift_ns.cli import preflight
+from normlift_ns.cli.common import (
+    CONSOLE,
+    format_number,
+    info,
+    info_opening,
+    plain_text,
+    run_command,
+    run_command_process,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_existing
+from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.options import (
     FLOATER_THRESHOLD,
     LABEL_ARRAY_FILES,
@@ -97,9 +101,7 @@ class NormLiftExport:
         """Write the files and return the path of the PLY file."""
         check_device(self.device)
         check_prompt_list("text", self.text)
-        check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
-        if self.part in ("selection", "rest") and len(self.text) == 0 and not has_stored_queries(self.load_config):
-            raise InputError(f"--part {self.part} needs prompts, and the run stores no queries; give --text")
+        preflight.check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
         outputs = self._outputs()
         self._check_outputs(outputs)
         info_opening(self.load_config)
@@ -184,41 +186,34 @@ class NormLiftExport:
         target = outputs["ply"]
         suffixes = ("rows.npy", "names.json", "objects.json")
         files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
-        refuse_existing(*files, overwrite=self.overwrite, flags="--output-dir or --output-filename")
-        for file in files:
-            check_writable_file(file, "--output-dir")
+        cloud = outputs.get("cloud")
         self._check_answer()
-        if self.masks_dir is not None:
-            check_writable_folder(self.masks_dir, "--masks-dir")
-            if self.part == "clean":
-                raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        preflight.check_readable_file(self.transfer, "--transfer")
+        if self.masks_dir is not None and self.part == "clean":
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        if cloud in files:
+            raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
+        preflight.check_writable_folder(self.masks_dir, "--masks-dir")
+        named = (*files, *(outputs[kind] for kind in self.exporters))
+        preflight.check_new_files(*named, overwrite=self.overwrite, flags="--output-dir or --output-filename")
+        preflight.check_new_files(cloud, overwrite=self.overwrite, flags="--output-dir")
         if self.arrays_dir is not None:
-            check_writable_folder(self.arrays_dir, "--arrays-dir")
-            paths = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
-            refuse_existing(*paths, overwrite=self.overwrite, flags="--arrays-dir")
-        if self.transfer is not None:
-            check_readable_file(self.transfer, "--transfer")
-            path = outputs["cloud"]
-            if path in files:
-                raise InputError(
-                    f"{path} would be both the splat and the labeled cloud; give another --output-filename"
-                )
-            check_writable_file(path, "--output-dir")
-            refuse_existing(path, overwrite=self.overwrite, flags="--output-dir")
-        for kind in self.exporters:
-            refuse_existing(outputs[kind], overwrite=self.overwrite, flags="--output-dir or --output-filename")
+            arrays = (self.arrays_dir / name for name in LABEL_ARRAY_FILES)
+            preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
         """Raise if an output needs prompts, and there are none."""
-        if len(self.text) > 0 or has_stored_queries(self.load_config):
+        stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"
+        if len(self.text) > 0 or stored.exists():
             return
-        flags = [
-            f"--{name.replace('_', '-')}" for name in ("masks_dir", "arrays_dir", "transfer") if getattr(self, name)
-        ]
+        names = ("masks_dir", "arrays_dir", "transfer")
+        flags = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
         for kind in self.exporters:
             from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
             flags += [f"--exporters {kind}"] if EXPORTERS.load(kind).needs_answer else []
+        if self.part in ("selection", "rest"):
+            flags.insert(0, f"--part {self.part}")
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 
@@ -230,18 +225,12 @@ def _objects_table(queries: list[dict[str, Any]]) -> Table:
     for entry in queries:
         for i, item in enumerate(entry["objects"]):
             box = item["box"]
-            sizes = (high - low for low, high in zip(box["min"], box["max"]))
-            vectors = (" ".join(f"{x:.2f}" for x in vector) for vector in (item["centroid"], sizes))
-            numbers = (f"{item['size']:,}", *vectors, f"{item['mean_reliability']:.3f}")
-            table.add_row(plain_text(entry["text"] if i == 0 else ""), str(item["instance_id"]), *numbers)
-        table.add_row(
-            plain_text("" if entry["objects"] else entry["text"]),
-            "smaller",
-            f"{entry['in_smaller_parts']:,}",
-            "",
-            "",
-            "",
-        )
+            sizes = [high - low for low, high in zip(box["min"], box["max"])]
+            numbers = map(format_number, (item["centroid"], sizes, item["mean_reliability"]))
+            text = plain_text(entry["text"] if i == 0 else "")
+            table.add_row(text, str(item["instance_id"]), f"{item['size']:,}", *numbers)
+        text = plain_text("" if entry["objects"] else entry["text"])
+        table.add_row(text, "smaller", f"{entry['in_smaller_parts']:,}")
     return table
 
 
@@ -250,10 +239,5 @@ def entrypoint() -> None:
     run_command(NormLiftExport)
 
 
-def main() -> None:
-    """Run ns-normlift-export as a process."""
-    run_command_process(NormLiftExport)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftExport)

@@ -8,17 +8,17 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from rich.console import Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from normlift_ns.cli import common
+from normlift_ns.cli import common, preflight
 from normlift_ns.cli.common import (
     CONSOLE,
     TerminatedError,
@@ -28,31 +28,20 @@ from normlift_ns.cli.common import (
     print_error,
     run_command,
     run_command_process,
+    split_output_flags,
 )
-from normlift_ns.cli.preflight import (
-    check_new_run,
-    check_readable_file,
-    check_run_config,
-    check_source_options,
-    check_splat_paths,
-    check_unused_options,
-    check_writable_folder,
-)
-from normlift_ns.distributed.launch import (
-    LAUNCHED_VARIABLE,
-    PeerFailureError,
-    describe_failure,
-    distributed_context,
-    launch_processes,
-    rank_and_world_size,
-)
+from normlift_ns.data.nerfstudio.config_file import read_config_paths
+from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
+from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
     from normlift_ns.distributed.communicator import TorchCommunicator
+    from normlift_ns.encoders.base import FeatureSource
     from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.planning import Plan
     from normlift_ns.progress import ProgressCallback
 
 
@@ -70,17 +59,18 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
                 CONSOLE.quiet = True
                 warnings.simplefilter("ignore")
             yield team
-    except PeerFailureError as error:
-        if not error.failure.reported:
-            print_error(describe_failure(error.failure))
-        sys.exit(1)
     except (KeyboardInterrupt, TerminatedError):
         if started_by_us:
             sys.exit(1)
         raise
 
 
-# ns-normlift: lift 2D features onto a trained splat to make it searchable with text.
+class OpenedCapture(NamedTuple):
+    """An opened capture and the seconds that each stage has taken so far."""
+
+    scene: Scene
+    run_dir: Path
+    stage_seconds: dict[str, float]
 
 
 @dataclass
@@ -138,9 +128,9 @@ class NormLift:
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
-            code = launch_processes(
-                [sys.executable, "-m", "normlift_ns.cli.lift", *sys.argv[1:]], self.num_devices, print_error
-            )
+            words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
+            other = [*program, *split_output_flags(words)[0]]  # only the first process writes the log file
+            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], print_error)
             if code > 0:
                 sys.exit(code)
             return None
@@ -148,18 +138,69 @@ class NormLift:
             return self._lift(team)
 
     def _plan(self) -> None:
+        """Print what the lift needs, without lifting anything."""
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.cli.dry_run import describe_needs, dry_run, plan_table  # noqa: PLC0415 (loads torch)
+        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (loads torch)
+        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
+        from normlift_ns.planning import missing_weights  # noqa: PLC0415
 
-        plan = dry_run(self, start_time)
-        CONSOLE.print(plan_table(plan))
-        info(describe_needs(plan))
+        device = choose_device(self.device)
+        init_cuda(device)
+        options = self.source.looking_for(self.queries)
+        source = make_source(options, device)
+        missing = missing_weights(options, device)
+        if len(missing) > 0:
+            raise FileNotFoundError(
+                f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
+                "Download them first, or give local files with --encoder-pretrained and --sam-model."
+            )
+        opened = self.open_capture(start_time)
+        warning = self.compare_cameras(opened, device) if self.check else None
+        if warning is not None:
+            info(f"Warning: {warning}")
+        print_plan(self.make_plan(opened, source, device))
+
+    def open_capture(self, start_time: float) -> OpenedCapture:
+        """Open the capture to plan a lift of it.
+
+        Args:
+            start_time: Start of the command by `time.perf_counter`.
+        """
+        import_time = time.perf_counter()
+        scene = self.open_scene()
+        run_dir = run_directory(self.output_dir or scene.runs_dir, scene.name, self.timestamp)
+        seconds = {"start": import_time - start_time, "open": time.perf_counter() - import_time}
+        return OpenedCapture(scene, run_dir, seconds)
+
+    def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
+        """Return a warning if images and renders of three views differ; add the time to that of the stages."""
+        from normlift_ns.data.alignment import alignment_warning, measure_alignment  # noqa: PLC0415 (as above)
+        from normlift_ns.data.open_splat import SplatScene  # noqa: PLC0415
+        from normlift_ns.pipeline import resolve_gsplat_version  # noqa: PLC0415
+        from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
+        from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
+
+        scene = opened.scene
+        opened.stage_seconds["kernels"] = time_kernel_loading(scene, self.lift, device=device)
+        start = time.perf_counter()
+        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, self.lift))
+        match = measure_alignment(scene, settings, device=device)
+        opened.stage_seconds["check"] = time.perf_counter() - start
+        return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+
+    def make_plan(self, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
+        """Estimate the lift from a short measurement of the opened capture."""
+        from normlift_ns.planning import make_plan, measure_capture  # noqa: PLC0415 (as above)
+
+        scene, run_dir, seconds = opened
+        facts = measure_capture(scene, source, self.lift, cache_folder(run_dir), device=device, before=seconds)
+        return make_plan(facts, num_devices=self.num_devices)
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import LiftRequest, run_lift, scene_opener  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.api import LiftRequest, run_lift  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
@@ -170,12 +211,8 @@ class NormLift:
             info_progress(text)
 
         with progress_bars() as report:
-            trained = self.open_trained()
-            is_config = isinstance(trained, Path)
             request = LiftRequest(
-                open_scene=scene_opener(
-                    trained, self.data if is_config else None, self.load_step if is_config else None
-                ),
+                open_scene=self.open_scene,
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
@@ -212,15 +249,21 @@ class NormLift:
             )
         self._check_splat()
         if self.load_config is None:
-            check_splat_paths(self.load_ply, self.load_gsplat, self.splat)
+            preflight.check_splat_paths(self.load_ply, self.load_gsplat, self.splat)
         else:
-            check_run_config(self.load_config, self.data, self.load_step)
+            preflight.check_run_config(self.load_config, self.data, self.load_step)
         if self.add_images is not None and not self.add_images.is_dir():
-            check_readable_file(self.add_images, "--add-images")
-        check_unused_options(self.lift)
-        check_source_options(self.source, self.queries)
-        check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
-        check_writable_folder(self.export_langsplat, "--export-langsplat")
+            preflight.check_readable_file(self.add_images, "--add-images")
+        preflight.check_unused_options(self.lift)
+        preflight.check_source_options(self.source, self.queries)
+        for flag, folder in (("--output-dir", self.output_dir), ("--export-langsplat", self.export_langsplat)):
+            preflight.check_writable_folder(folder, flag)
+        name, outputs = self.new_run_location()
+        run_dir = run_directory(outputs or Path(), name or "run", self.timestamp)
+        if name is not None and outputs is not None:
+            if self.timestamp is not None:
+                refuse_existing_run(run_dir, self.overwrite)
+            preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def _check_splat(self) -> None:
         """Raise InputError unless one trained splat is given, with options that apply to it."""
@@ -239,15 +282,26 @@ class NormLift:
             if getattr(options, name) != getattr(default, name, None):
                 raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
 
-    def open_trained(self) -> Path | Scene:
-        """Return the config of the run; for a splat, or with --add-images, the opened scene."""
-        splat = self.load_ply or self.load_gsplat
-        if splat is None and self.add_images is None:
-            return cast(Path, self.load_config)
+    def new_run_location(self) -> tuple[str | None, Path | None]:
+        """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
+
+        Raises:
+            InputError, OSError: The config is invalid or cannot be read.
+        """
+        if self.load_config is not None:
+            paths = read_config_paths(self.load_config)
+            return paths.experiment, self.output_dir or paths.output_dir
+        cameras = (self.splat.colmap or self.splat.transforms or Path()).absolute()
+        name = (cameras.parent if cameras.suffix == ".json" else cameras).name
+        return name or "splat", self.output_dir or Path("outputs")
+
+    def open_scene(self) -> Scene:
+        """Open the trained scene, with the images of --add-images."""
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
         from normlift_ns.lifted_run import open_scene  # noqa: PLC0415 (as above)
 
+        splat = self.load_ply or self.load_gsplat
         if splat is not None:
             scene: Any = open_splat(splat, self.splat, say=info_progress)
         else:
@@ -270,25 +324,38 @@ def progress_bars() -> Iterator[ProgressCallback]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    started: set[str] = set()
+    live = CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
+    progress, tasks = Progress(*columns, console=CONSOLE), dict[str, TaskID]()
 
-    def print_stage(stage: str, done: int, total: int) -> None:
-        if stage not in started:
-            started.add(stage)
-            info_progress(f"{names.get(stage, stage)} …")
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
+            if not live:
+                info_progress(f"{names.get(stage, stage)} …")
+        progress.update(tasks[stage], completed=done, total=total)
 
-    if not CONSOLE.is_terminal or common.output_settings[-1] != common.OutputSettings():
-        yield print_stage
-        return
-    with Progress(*columns, console=CONSOLE) as progress:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
-            progress.update(tasks[stage], completed=done, total=total)
-
+    with progress if live else nullcontext():
         yield report
+
+
+def print_plan(plan: Plan) -> None:
+    """Print the stages of a plan with their seconds and what is cached, and a sentence about memory and disk."""
+    table = Table("stage", title=f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}")
+    table.add_column("seconds", justify="right")
+    table.add_column("cached")
+    for stage in plan.stages:
+        table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
+    table.add_section()
+    table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
+    CONSOLE.print(table)
+    gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
+    subject = f"{plan.num_devices} processes share the work. Each" if plan.num_devices > 1 else "The lift"
+    space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
+    info(f"{subject} needs about {gpu}{space}.")
+
+
+def _views(count: int) -> str:
+    return f"{count} view{'s' * (count != 1)}"
 
 
 def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:
@@ -393,10 +460,5 @@ def entrypoint() -> None:
     run_command(NormLift)
 
 
-def main() -> None:
-    """Run ns-normlift as a process."""
-    run_command_process(NormLift)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLift)

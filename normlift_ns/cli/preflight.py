@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
-from normlift_ns.io.atomic import complete_interrupted_writes
-from normlift_ns.io.run_dir import (
-    FIELD_FOLDER,
-    cache_folder,
-    field_folder,
-    refuse_existing_run,
-    run_directory,
-    text_cache_folder,
-)
+from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
+from normlift_ns.io.manifest import read_manifest
+from normlift_ns.io.run_dir import field_folder, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
 _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
@@ -27,30 +19,41 @@ _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "defa
 
 def check_readable_file(path: Path | None, flag: str) -> None:
     """Raise FileNotFoundError if the path is missing, or InputError if it is not a regular file."""
-    if path is None:
-        return
-    mode = _mode(path, flag)
-    if not stat.S_ISREG(mode):
-        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
-        raise InputError(f"{path}, given with {flag}, is {kind}; give a file")
-    _check_access(path, flag)
+    _check_readable(path, flag, "a file", "a file")
 
 
 def check_readable_folder(path: Path | None, flag: str) -> None:
     """Raise FileNotFoundError if the path is missing, or InputError if it is not a folder."""
+    _check_readable(path, flag, "a folder", "the folder that contains the files")
+
+
+def _check_readable(path: Path | None, flag: str, expected: str, advice: str) -> None:
     if path is None:
         return
-    if not stat.S_ISDIR(_mode(path, flag)):
-        raise InputError(f"{path}, given with {flag}, is not a folder; give the folder that contains the files")
+    mode = _existing_mode(path, flag)
+    kind = {stat.S_IFREG: "a file", stat.S_IFDIR: "a folder"}.get(stat.S_IFMT(mode), "a pipe or a device")
+    if kind != expected:
+        raise InputError(f"{path}, given with {flag}, is {kind}; give {advice}")
     _check_access(path, flag)
 
 
-def _mode(path: Path, flag: str) -> int:
+def _existing_mode(path: Path, flag: str) -> int:
+    mode = _mode(path, flag)
+    if mode is None:
+        raise FileNotFoundError(f"{path}, given with {flag}, does not exist; check the path")
+    return mode
+
+
+def _mode(path: Path, flag: str) -> int | None:
+    """Return the mode of a file or a folder; None if there is none."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
-        link = " (a broken link)" if path.is_symlink() else ""
-        raise FileNotFoundError(f"{path}{link}, given with {flag}, does not exist; check the path") from None
+        if path.is_symlink():
+            raise FileNotFoundError(
+                f"{path} (a broken link), given with {flag}, does not exist; check the path"
+            ) from None
+        return None
     except OSError as error:  # a link to itself, a name that is too long, a folder without search permission
         raise OSError(f"{short_repr(str(path))}, given with {flag}, cannot be opened: {error.strerror}") from None
 
@@ -58,6 +61,14 @@ def _mode(path: Path, flag: str) -> int:
 def _check_access(path: Path, flag: str) -> None:
     if not os.access(path, os.R_OK):
         raise PermissionError(f"{path}, given with {flag}, is not readable; change its permissions")
+
+
+def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
+    """Raise if a file cannot be written, or exists and must not be replaced."""
+    files = [path for path in paths if path is not None]
+    refuse_existing(*files, overwrite=overwrite, flags=flags)
+    for path in files:
+        check_writable_file(path, flags)
 
 
 def check_writable_file(path: Path | None, flag: str) -> None:
@@ -73,35 +84,15 @@ def check_writable_file(path: Path | None, flag: str) -> None:
 
 def check_writable_folder(path: Path | None, flag: str) -> None:
     """Raise InputError or OSError if a folder cannot be written; it need not exist."""
-    if path is None:
-        return
-    for parent in (path, *path.absolute().parents):
-        try:
-            mode = parent.stat().st_mode
-        except FileNotFoundError:
-            if not parent.is_symlink():
-                continue
-            raise InputError(f"{parent}, named with {flag}, is a broken link; give another folder") from None
-        except NotADirectoryError:
-            continue  # one of the parents is a file
-        except OSError as error:
-            raise OSError(f"{short_repr(str(path))}, named with {flag}, cannot be opened: {error.strerror}") from None
+    for parent in () if path is None else (path, *path.absolute().parents):
+        mode = _mode(parent, flag)
+        if mode is None:
+            continue
         if not stat.S_ISDIR(mode):
             raise InputError(f"{parent}, named with {flag}, is not a folder; give another path")
         if not os.access(parent, os.W_OK | os.X_OK):
             raise PermissionError(f"{parent}, named with {flag}, is not writable; give another folder")
         return
-
-
-def check_distinct_paths(**paths: Path | None) -> None:
-    """Raise InputError if two flags name the same file."""
-    names: dict[str, str] = {}
-    for name, path in paths.items():
-        target = None if path is None else os.path.realpath(path)
-        if target is not None and target in names:
-            raise InputError(f"--{names[target]} and --{name.replace('_', '-')} name the same file, {path}")
-        if target is not None:
-            names[target] = name.replace("_", "-")
 
 
 def check_run_config(config: Path, data: Path | None, step: int | None = None, *, written_by: str = "ns-train") -> None:
@@ -149,68 +140,18 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
     if ask is None:
         return
     check_readable_file(ask.text_vectors, "--text-vectors")
-    stored = _encoder_of(folder)
-    if ask.text_vectors is None and stored.get("text_vectors") is None:
-        names = text_cache_folder(folder.parent)
-        if not (names.is_dir() and any(names.iterdir())):  # the cache may contain the prompts
-            _check_stored_encoder(stored)
-
-
-def _check_stored_encoder(stored: dict[str, Any]) -> None:
-    """Check the encoder options of a manifest if the encoder is installed."""
-    from normlift_ns.encoders.registry import find_encoder_kind  # noqa: PLC0415 (not needed for --help)
-
-    kind = find_encoder_kind(stored.get("encoder"))
     try:
-        options = SourceOptions(**stored)
-    except (TypeError, ValueError):  # reported when the run is opened
+        stored = SourceOptions(**read_manifest(folder)[0]["encoder"])
+    except (KeyError, TypeError, ValueError, OSError):  # reported when the run is opened
         return
-    if kind is not None:
-        kind.check(options)
+    names = text_cache_folder(folder.parent)
+    cached = names.is_dir() and any(names.iterdir())  # the cache may contain the prompts
+    if ask.text_vectors is None and stored.text_vectors is None and not cached:
+        from normlift_ns.encoders.registry import find_encoder_kind  # noqa: PLC0415 (not needed for --help)
 
-
-def _encoder_of(folder: Path) -> dict[str, Any]:
-    """Return the encoder options of a manifest; empty if it is damaged, which is reported when the run is opened."""
-    try:
-        encoder = json.loads((folder / "manifest.json").read_text("utf8")).get("encoder")
-    except (OSError, ValueError, RecursionError, AttributeError):
-        return {}
-    return encoder if isinstance(encoder, dict) else {}
-
-
-def has_stored_queries(config: Path) -> bool:
-    """Return whether a lifted run stores queries."""
-    return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
-
-
-def check_new_run(
-    config: Path | None, splat: SplatOptions, output_dir: Path | None, timestamp: str | None, overwrite: bool
-) -> None:
-    """Raise if the directory of a new run cannot be written, or if another run exists there."""
-    check_writable_folder(output_dir, "--output-dir")
-    name, outputs = new_run_location(config, splat, output_dir)
-    run_dir = run_directory(outputs or Path(), name or "run", timestamp)
-    if name is None or outputs is None:
-        return
-    if timestamp is not None:
-        refuse_existing_run(run_dir, overwrite)
-    check_writable_folder(cache_folder(run_dir), "--output-dir")
-
-
-def new_run_location(
-    config: Path | None, splat: SplatOptions, output_dir: Path | None
-) -> tuple[str | None, Path | None]:
-    """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
-
-    Raises:
-        InputError, OSError: The config is invalid or cannot be read.
-    """
-    if config is not None:
-        paths = read_config_paths(config)
-        return paths.experiment, output_dir or paths.output_dir
-    cameras = (splat.colmap or splat.transforms or Path()).absolute()
-    name = (cameras.parent if cameras.suffix == ".json" else cameras).name
-    return name or "splat", output_dir or Path("outputs")
+        kind = find_encoder_kind(stored.encoder)
+        if kind is not None:
+            kind.check(stored)
 
 
 def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:
@@ -223,11 +164,10 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
             f"A splat needs one file of cameras, got {count}: give a COLMAP project folder with --colmap, or a "
             "transforms.json with --transforms."
         )
-    check_readable_folder(splat.colmap, "--colmap")
+    for name in ("colmap", "images", "masks"):
+        check_readable_folder(getattr(splat, name), f"--{name}")
     if splat.transforms is not None and not splat.transforms.is_dir():
         check_readable_file(splat.transforms, "--transforms")
-    check_readable_folder(splat.images, "--images")
-    check_readable_folder(splat.masks, "--masks")
     check_readable_file(splat.world_transform, "--world-transform")
 
 
@@ -256,7 +196,7 @@ def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     if name != "auto":
         check_mask_options(source.looking_for(texts), name)
     if source.sam_model is not None and is_local_path(source.sam_model, 2):
-        _mode(Path(source.sam_model), "--sam-model")
+        _existing_mode(Path(source.sam_model), "--sam-model")
     if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
         raise InputError(
             f"--text-template {short_repr(source.text_template)} has no {{}} for the prompt; give a template such as "

@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import glob
 import json
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from normlift_ns.cli.common import info, info_opening, run_command, run_command_process
-from normlift_ns.cli.preflight import check_distinct_paths, check_lifted_run, check_writable_file, check_writable_folder
-from normlift_ns.errors import InputError
-from normlift_ns.io.atomic import atomic_file, refuse_existing, safe_file_name, write_text_file
-from normlift_ns.io.run_dir import FIELD_FOLDER
+from rich.table import Table
+
+from normlift_ns.cli.common import (
+    CONSOLE,
+    format_number,
+    info,
+    info_opening,
+    plain_text,
+    print_error,
+    run_command,
+    run_command_process,
+)
+from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder
+from normlift_ns.errors import InputError, user_state_folder
+from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
+from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
 from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
 
 if TYPE_CHECKING:
+    from normlift_ns.analysis.explain import ViewVote, Why
+    from normlift_ns.analysis.objects import Catalogue
+    from normlift_ns.analysis.vote_records import RecordedVotes
+    from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.query.arrays import QuickRun
     from normlift_ns.query.engine import Answer
     from normlift_ns.query.question import Query
@@ -86,8 +103,6 @@ class NormLiftQuery:
         """Run the query, write files, print the table and return its rows."""
         self._check()
         info_opening(self.load_config)
-        from normlift_ns.cli.repl import answer_lines, run_repl  # noqa: PLC0415 (--help should not wait for NumPy)
-
         run = self._open()
         if self.stdin:
             answer_lines(run, self.ask.rules())
@@ -99,7 +114,6 @@ class NormLiftQuery:
 
     def _answer(self, run: QuickRun) -> list[dict[str, Any]]:
         """Answer --text, write files, print the table and return its rows."""
-        from normlift_ns.cli.repl import print_answer  # noqa: PLC0415
         from normlift_ns.query.question import save_query  # noqa: PLC0415 (--help should not wait for NumPy)
 
         result = run.ask(self.text, **self.ask.rules())
@@ -109,7 +123,10 @@ class NormLiftQuery:
         sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
         show_objects = self._list_objects(result.question) if self.objects else None
         if self.json is not None:
-            _write_json(self.json, rows, result.question, self.overwrite)
+            question = result.question
+            rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": question.negatives}
+            text = json.dumps({"queries": rows, **rules}, indent=2) + "\n"
+            write_text_file(self.json, text, overwrite=self.overwrite)
         if self.output_path is not None:
             _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
         if save_renders is not None:
@@ -133,60 +150,103 @@ class NormLiftQuery:
             from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
 
             choose_device(self.device)
+        vectors, template = self.ask.text_vectors, self.ask.text_template
         open_with = partial(
-            open_quick, self.load_config, device=self.device, text_vectors=self.ask.text_vectors,
-            text_template=self.ask.text_template,
-        )  # fmt: skip
-        run = open_with()
-        if run is not None:
-            return run
+            open_quick, self.load_config, device=self.device, text_vectors=vectors, text_template=template
+        )
+        return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
+
+    @cached_property
+    def _run(self) -> LiftedRun:
+        """The run with its scene, which most answers do not need."""
         from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (as above)
 
-        means = open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()
-        return cast("QuickRun", open_with(means=means))
+        return open_run(self.load_config, data=self.data)
+
+    def _answer_with_scene(self, question: Query) -> Answer:
+        from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
+
+        return run_query(self._run.field, self._run.scene.gaussians.means, question)
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
         """Load everything that renders need, and return a function that renders and saves them."""
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
-        from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415
 
-        run, folder = open_run(self.load_config, data=self.data), cast(Path, self.render_dir)
-        cameras = training_cameras(run.scene, self.render_views)
-        result = run_query(run.field, run.scene.gaussians.means, question)
-        settings = RasterSettings.recorded(run.field.manifest)
-        return lambda: save_overlays(run.scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
+        scene, folder = self._run.scene, cast(Path, self.render_dir)
+        cameras = training_cameras(scene, self.render_views)
+        result, settings = self._answer_with_scene(question), RasterSettings.recorded(self._run.field.manifest)
+        return lambda: save_overlays(scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add an explanation to every row, write the images, and return a function that prints the explanations."""
-        from normlift_ns.cli.answers import explain_answer, explanation_to_json, print_explanations, save_vote_images  # noqa: PLC0415
+        """Add an explanation to every row, write the images, and return a function that prints the explanations.
 
-        run, reasons = explain_answer(self.load_config, self.data, result)
-        for row, reason in zip(rows, reasons):
-            row["why"] = explanation_to_json(run, reason)
+        A prompt that selects nothing has no explanation.
+        """
+        import torch  # noqa: PLC0415
+
+        votes, refined = self._run.votes, result.question.refined
+        masks = torch.as_tensor(result.selected).T
+        reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
+        for row, why in zip(rows, reasons):
+            row["why"] = None if why is None else explanation_to_json(votes.names, why)
         if self.why_dir is not None:
-            save_vote_images(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
-        return lambda: print_explanations(run, self.text, reasons)
+            save_vote_images(votes, self.text, reasons, self.why_dir, overwrite=self.overwrite)
+        return lambda: print_explanations(votes.names, self.text, reasons)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
-        """Add SAM 3's answer to every row, and return its arrays and a function that prints it."""
-        from normlift_ns.cli.answers import print_sam3_table, sam3_arrays, segment_with_sam3  # noqa: PLC0415
+        """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
 
-        kwargs = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
-        segmented, summaries = segment_with_sam3(self.load_config, self.data, result, **kwargs)
+        Returns:
+            The arrays of the lifted masks, and a function that prints the summaries.
+        """
+        import torch  # noqa: PLC0415
+
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415
+        from normlift_ns.encoders.cache import CachedTextMasks  # noqa: PLC0415
+        from normlift_ns.query.sam3_query import query_sam3  # noqa: PLC0415
+        from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
+        from normlift_ns.segmentation.checkpoint import TEXT_PROMPT_FAMILIES, check_sam_checkpoint  # noqa: PLC0415
+
+        model, device = self.segment_model or DEFAULT_SAM3, choose_device(self.device)
+        check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
+        run, question = self._run, result.question
+        count = len(run.scene.train)
+        info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
+        cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
+        segmented = query_sam3(
+            run.scene, cached.find, question.texts,
+            views=self.segment_views, min_reliability=question.min_reliability,
+            settings=RasterSettings.recorded(run.field.manifest), device=device,
+        )  # fmt: skip
+        summaries = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(result.selected))
         for row, summary in zip(rows, summaries):
-            row["segment"] = summary
-        return sam3_arrays(segmented), lambda: print_sam3_table(self.text, summaries)
+            row["segment"] = {"model": model, **summary}
+        columns = {
+            "segment_relevancy": [answer.relevancy for answer in segmented.answers],
+            "segment_reliability": [answer.scalars.reliability for answer in segmented.answers],
+            "segment_agreement": [answer.scalars.c_inter for answer in segmented.answers],
+        }
+        arrays = {name: torch.stack(tensors, dim=1).cpu().numpy() for name, tensors in columns.items()}
+        return arrays, lambda: print_sam3_table(self.text, summaries)
 
     def _list_objects(self, question: Query) -> Callable[[], None]:
-        """Find objects, write their files, and return a function that prints them."""
-        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
-        from normlift_ns.cli.answers import find_catalog, print_catalog, query_metadata  # noqa: PLC0415
+        """Find objects, write their files, and return a function that prints them.
 
-        catalog = find_catalog(self.load_config, self.data, question, self.metres_per_unit)
+        This opens the whole run, because best views need the cameras of the scene.
+        """
+        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
+
+        answer = self._answer_with_scene(question)
+        catalog = self._run.catalogue(answer, metres_per_unit=self.metres_per_unit)
         if self.objects_dir is not None:
-            write_catalogue(catalog, self.objects_dir, question=query_metadata(question), overwrite=self.overwrite)
+            metadata = {
+                "texts": list(question.texts),
+                "relevancy": question.rule,
+                "threshold": question.threshold,
+                "min_reliability": question.min_reliability,
+            }
+            write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 
     def _check(self) -> None:
@@ -194,17 +254,15 @@ class NormLiftQuery:
         check_device(self.device)
         self._check_texts()
         check_lifted_run(self.load_config, self.data, self.ask)
-        check_distinct_paths(json=self.json, output_path=self.output_path)
+        if self.json and self.output_path and os.path.realpath(self.json) == os.path.realpath(self.output_path):
+            raise InputError(f"--json and --output-path name the same file, {self.output_path}")
         for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
-            if path is not None:
-                refuse_existing(path, overwrite=self.overwrite, flags=flag)
-                check_writable_file(path, flag)
+            check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.why_dir, "--why-dir")
         if self.objects_dir is not None:
-            check_writable_folder(self.objects_dir, "--objects-dir")
-            files = [self.objects_dir / name for name in CATALOG_FILES]
-            refuse_existing(*files, overwrite=self.overwrite, flags="--objects-dir")
+            files = (self.objects_dir / name for name in CATALOG_FILES)
+            check_new_files(*files, overwrite=self.overwrite, flags="--objects-dir")
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
@@ -227,17 +285,16 @@ class NormLiftQuery:
         check_prompt_list("text", self.text)
 
     def _check_dependent_options(self) -> None:
-        if len(self.render_views) > 0 and self.render_dir is None:
-            raise InputError("--render-views has no effect without --render-dir; give the folder for the renders")
-        if self.why_dir is not None and not self.why:
-            raise InputError("--why-dir has no effect without --why True; add that flag")
-        for name in ("segment_model", "segment_views"):
-            if self.segment is None and getattr(self, name) != getattr(type(self), name):
-                raise InputError(f"--{name.replace('_', '-')} has no effect without --segment sam3; add that flag")
-        for name in ("objects_dir", "metres_per_unit"):
-            if getattr(self, name) is not None and not self.objects:
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{flag} has no effect without --objects True; add that flag")
+        for name, needed, flag in (
+            ("render_views", self.render_dir, "--render-dir FOLDER"),
+            ("why_dir", self.why, "--why True"),
+            ("segment_model", self.segment, "--segment sam3"),
+            ("segment_views", self.segment, "--segment sam3"),
+            ("objects_dir", self.objects, "--objects True"),
+            ("metres_per_unit", self.objects, "--objects True"),
+        ):
+            if not needed and getattr(self, name) != getattr(type(self), name):
+                raise InputError(f"--{name.replace('_', '-')} has no effect without {flag}; add that flag")
 
     def _existing_renders(self) -> list[Path]:
         """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""
@@ -247,9 +304,80 @@ class NormLiftQuery:
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 
 
-def _write_json(path: Path, rows: list[dict[str, Any]], question: Query, overwrite: bool) -> None:
-    rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
-    write_text_file(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
+def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> None:
+    """Answer prompts that a user types, one per line, until Ctrl-D; invalid prompts print an error message.
+
+    Args:
+        run: The lifted run.
+        rules: Keyword arguments of `QuickRun.ask`.
+        keep_history: Store prompts in the history file.
+    """
+    from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
+    from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
+
+    file = _history_file() if keep_history else None
+    session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
+    info(f"{len(run.field.arrays['source']):,} Gaussians. Type one prompt per line; Ctrl-D quits.")
+    while True:
+        try:
+            text = session.prompt("> ").strip()
+        except KeyboardInterrupt:
+            continue
+        except EOFError:
+            return
+        if text == "":
+            continue
+        try:
+            answer = run.ask([text], **rules)
+        except (InputError, OSError, MemoryError) as error:
+            print_error(str(error))
+        else:
+            print_answer(answer.to_json(), answer.question)
+
+
+def _history_file() -> Path | None:
+    """Return the history file, which only the user can read; None if it cannot be created."""
+    with suppress(OSError):
+        folder = user_state_folder()
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            os.close(os.open(folder / "history", os.O_RDWR | os.O_CREAT, 0o600))
+            (folder / "history").chmod(0o600)
+            return folder / "history"
+    return None
+
+
+def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes] | None = None) -> None:
+    """Answer one prompt per line, and print each answer immediately as one line of JSON; skip empty lines.
+
+    Args:
+        run: The lifted run.
+        rules: Keyword arguments of `QuickRun.ask`.
+        lines: The prompts; None: lines of standard input.
+    Raises:
+        ValueError: Some lines failed; the JSON line of each has an `error`.
+    """
+    stdin: Any = sys.stdin  # None if it is closed
+    source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
+    if sys.stdout is None:
+        raise InputError("standard output is closed; --stdin prints its answers there")
+    failed = total = 0
+    for line in source:
+        text = line.decode("utf8", "replace").lstrip("\ufeff").strip()  # byte order mark of files from Windows
+        if text == "":
+            continue
+        total += 1
+        try:
+            answer = run.ask([text], **rules)
+            (row,) = answer.to_json()
+            output = {**row, "rule": answer.question.rule, "threshold": answer.question.threshold}
+        except InputError as error:
+            failed += 1
+            output = {"text": text, "error": str(error)}
+        sys.stdout.write(json.dumps(output) + "\n")
+        sys.stdout.flush()
+    if failed > 0:
+        raise InputError(f"{failed} of {total} lines could not be answered; see their `error` for the reasons")
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
@@ -265,15 +393,190 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
         np.savez(file, names=np.array(result.question.texts), **arrays)
 
 
+# Tables of answers, and images of the votes for them.
+
+
+def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
+    """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
+    rule = f"{question.rule} > {question.threshold:.4g}"
+    CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=CONSOLE.width < 100))
+    for row in rows:
+        if row["stands_out"] is False:
+            top, limit = row["histogram"]["top"], row["histogram"]["limit"]
+            position = "" if row["nearest"] is None else f" at {format_number(row['nearest'])}"
+            info(
+                f"{row['text']}: probably not in this scene. The nearest match{position} has relevancy {top:.3f}; "
+                f"objects in a scene usually reach at least {limit:.3g}."
+            )
+
+
+def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
+    """Return a table with one row per prompt.
+
+    Args:
+        rows: Rows of `Answer.to_json`.
+        rule: Selection rule for the title, such as lerf > 0.5.
+        threshold: Threshold that each histogram marks with a bar |.
+        narrow: Leave out the histograms.
+    """
+    from normlift_ns.query.histogram import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
+
+    result = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
+    wrapped = ("text", "centroid", "extent")
+    for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
+        justify = "left" if name == "text" else "right"
+        result.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
+    if not narrow:
+        result.add_column("histogram", no_wrap=True)
+    result.add_column("suggested", justify="right", no_wrap=True)
+    for row in rows:
+        names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
+        *cells, suggested = (format_number(row[name]) for name in names)
+        bins = row["histogram"]
+        bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
+        histogram = () if narrow else (plain_text(bars),)
+        result.add_row(plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
+    return result
+
+
+# ns-normlift-query --objects: the objects in a selection.
+
+
+_MAX_ROWS = 40
+"""Largest number of objects in the table."""
+
+
+def print_catalog(catalog: Catalogue) -> None:
+    """Print a table of the largest objects, in capture coordinates."""
+    table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
+    table.add_column("id")
+    table.add_column("text", overflow="fold")
+    narrow = CONSOLE.width < 70
+    vectors = ("centroid", "box", *(() if narrow else ("extent",)))
+    for name in ("Gaussians", *vectors, "R", "views"):
+        width = 8 if name in vectors else None  # keeps each number on one line
+        table.add_column(name, justify="right", no_wrap=name not in vectors, overflow="fold", min_width=width)
+    if not narrow:
+        table.add_column("best views")
+    largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[:_MAX_ROWS]
+    for item in sorted(largest, key=lambda item: item.id):
+        geometry = item.capture
+        rows = (geometry.centroid, geometry.box.size, geometry.extent)[: len(vectors)]
+        numbers = (" ".join(f"{x:.3g}" for x in row) for row in rows)
+        cells = (f"{item.gaussians:,}", *numbers, f"{item.reliability:.3f}", str(item.views))
+        best = () if narrow else (plain_text(" ".join(Path(name).stem for name in item.best_views)),)
+        table.add_row(str(item.id), plain_text(item.text), *cells, *best)
+    CONSOLE.print(table)
+    if len(catalog.objects) > _MAX_ROWS:
+        info(f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
+    if catalog.num_in_small_components > 0:
+        info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
+
+
+# ns-normlift-query --why: the images that voted for a selection.
+
+
+IMAGES_PER_GROUP = 3
+"""Number of images per prompt in each group: those with the largest weight, and those that disagree most."""
+_LARGEST_WEIGHT = "weighs most"
+
+
+def explanation_to_json(names: Sequence[str], why: Why) -> dict[str, Any]:
+    """Return an explanation as plain types, with the names of the images."""
+    row = why.to_json()
+    return {**row, "views": [{"photograph": names[view["view"]], **view} for view in row["views"]]}
+
+
+def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
+    """Return the images to show: those with the largest weight, and those that disagree most."""
+    return {_LARGEST_WEIGHT: why.views[:IMAGES_PER_GROUP], "disagrees most": why.most_different[:IMAGES_PER_GROUP]}
+
+
+def save_vote_images(
+    recorded: RecordedVotes, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
+) -> None:
+    """Write the images of the largest weights and disagreements, all or none.
+
+    The files are <number>_<text>_1_<image>.png … and <number>_<text>_disagrees_1_<image>.png ….
+
+    Raises:
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
+        FileNotFoundError, ValueError: Same as in `Votes.pictures`.
+    """
+    from PIL import Image  # noqa: PLC0415 (the tables do not need it)
+
+    from normlift_ns.rendering.figures import unique_file_names  # noqa: PLC0415
+
+    names = unique_file_names(recorded.names)
+    votes: dict[Path, ViewVote] = {}
+    for index, (text, why) in enumerate(zip(texts, reasons)):
+        for kind, group in ({} if why is None else _votes_to_show(why)).items():
+            for rank, vote in enumerate(group, 1):
+                prefix = "" if kind == _LARGEST_WEIGHT else "disagrees_"
+                votes[folder / f"{index}_{safe_file_name(text)}_{prefix}{rank}_{names[vote.view]}.png"] = vote
+    with atomic_files(*votes, overwrite=overwrite) if len(votes) > 0 else nullcontext(()) as drafts:
+        for draft, picture in zip(drafts, recorded.pictures(votes.values())):
+            Image.fromarray(picture.image.numpy()).save(draft, format="PNG")
+
+
+def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
+    """Print a table of images, and a sentence per prompt about their agreement."""
+    result = explanation_table(names, texts, reasons, narrow=CONSOLE.width < 120)
+    if result.row_count > 0:
+        CONSOLE.print(result)
+    for text, why in zip(texts, reasons):
+        info(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
+
+
+def explanation_table(
+    names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False
+) -> Table:
+    """Return a table of the images of every prompt; a narrow table leaves out weights and region counts."""
+    result = Table(title="Why", padding=(0, 0 if narrow else 1))
+    for name in ("text", "", "image"):
+        result.add_column(name, overflow="fold")
+    for name in (*(() if narrow else ("weight in pixels",)), "share", "agreement", "disagreement"):
+        result.add_column(name, justify="right", no_wrap=True)
+    if not narrow:
+        result.add_column("regions", justify="right", no_wrap=True)
+    for text, why in zip(texts, reasons):
+        label = text
+        for kind, votes in ({} if why is None else _votes_to_show(why)).items():
+            for vote in votes:
+                shares = (f"{vote.share:.1%}", f"{vote.agreement:.3f}", f"{vote.disagreement:.0%}")
+                numbers = shares if narrow else (f"{vote.weight:,.0f}", *shares, str(len(vote.regions)))
+                result.add_row(plain_text(label), kind, plain_text(names[vote.view]), *numbers)
+                label = ""
+    return result
+
+
+# ns-normlift-query --segment: SAM 3's masks for the same prompts.
+
+
+def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Print the table of SAM 3's answer."""
+    from normlift_ns.query.sam3_query import MIN_MASK_FRACTION  # noqa: PLC0415 (loads torch)
+
+    limit = max(row["min_reliability"] for row in rows)
+    reliable = f" and reliability at least {limit:g}" if limit > 0 else ""
+    table = Table(
+        title=f"SAM 3: Gaussians with more than {MIN_MASK_FRACTION:.0%} of their weight in its masks{reliable}"
+    )
+    for name in ("text", "Gaussians", "centroid", "extent", "peak", "agreement", "reliability", "found in", "IoU"):
+        table.add_column(name, justify="left" if name == "text" else "right")
+    for text, row in zip(texts, rows):
+        names = ("centroid", "extent", "peak", "agreement", "mean_reliability")
+        numbers = (format_number(row[name]) for name in names)
+        views = f"{len(row['found_in'])} of {len(row['views'])} views, {len(row['agree'])} agree"
+        table.add_row(plain_text(text), f"{row['fraction']:.2%}", *numbers, views, format_number(row["iou"]))
+    CONSOLE.print(table)
+
+
 def entrypoint() -> None:
     """Run ns-normlift-query in a process that continues afterwards."""
     run_command(NormLiftQuery)
 
 
-def main() -> None:
-    """Run ns-normlift-query as a process."""
-    run_command_process(NormLiftQuery)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftQuery)

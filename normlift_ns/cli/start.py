@@ -4,48 +4,24 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import partial
 from importlib import import_module
 
 
-def _start(command: str) -> None:
+def _start(module: str, command: str) -> None:
     try:
-        import_module(f"normlift_ns.cli.{command}").main()
+        found = getattr(import_module(f"normlift_ns.cli.{module}"), command)
+        import_module("normlift_ns.cli.common").run_command_process(found)
     except KeyboardInterrupt:  # the command itself handles later ones
         sys.stderr.write("Interrupted.\n")
         sys.stderr.flush()
         os._exit(130)
 
 
-def lift() -> None:
-    """Run ns-normlift."""
-    _start("lift")
-
-
-def query() -> None:
-    """Run ns-normlift-query."""
-    _start("query")
-
-
-def export() -> None:
-    """Run ns-normlift-export."""
-    _start("export")
-
-
-def evaluate() -> None:
-    """Run ns-normlift-eval."""
-    _start("evaluate")
-
-
-def view() -> None:
-    """Run ns-normlift-view."""
-    _start("view")
-
-
-def batch() -> None:
-    """Run ns-normlift-batch."""
-    _start("batch")
-
-
-def check() -> None:
-    """Run ns-normlift-check."""
-    _start("check")
+lift = partial(_start, "lift", "NormLift")
+query = partial(_start, "query", "NormLiftQuery")
+export = partial(_start, "export", "NormLiftExport")
+evaluate = partial(_start, "evaluate", "NormLiftEval")
+view = partial(_start, "view", "NormLiftView")
+batch = partial(_start, "batch", "NormLiftBatch")
+check = partial(_start, "check", "NormLiftCheck")

@@ -116,10 +116,5 @@ def entrypoint() -> None:
     run_command(NormLiftView)
 
 
-def main() -> None:
-    """Run ns-normlift-view as a process."""
-    run_command_process(NormLiftView)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftView)

@@ -106,11 +106,6 @@ class _Gaussians(NamedTuple):
     """[n], integers: indices of parts"""
 
 
-def class_names(parts: Sequence[Part]) -> tuple[str, ...]:
-    """Return the names of the classes, in the order of their first parts."""
-    return tuple(dict.fromkeys(part.name for part in parts))
-
-
 def build_room(
     parts: Sequence[Part], painter: SurfaceColors, area: float, num_gaussians: int, seed: int = 0
 ) -> DemoRoom:
@@ -136,7 +131,7 @@ def build_room(
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)  # z axis to normal
     quats /= row_lengths(quats)[:, None]
     scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
-    names = class_names(parts)
+    names = tuple(dict.fromkeys(part.name for part in parts))  # in the order of their first parts
     classes = np.array([*(names.index(part.name) for part in parts), -1])[labels.astype(int)]
     return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)
 

@@ -68,17 +68,6 @@ def torus(radius: float, tube: float) -> Distance:
     return lambda p: np.hypot(np.hypot(p[:, 0], p[:, 2]) - radius, p[:, 1]) - tube
 
 
-def capsule(start: tuple[float, float, float], end: tuple[float, float, float], radius: float) -> Distance:
-    """Return all points within `radius` of a line segment."""
-    a, b = np.array(start), np.array(end)
-
-    def distance(p: Array) -> Array:
-        along = ((p - a) @ (b - a) / ((b - a) @ (b - a))).clip(0, 1)
-        return row_lengths(p - a - along[:, None] * (b - a)) - radius
-
-    return distance
-
-
 def cavity(shape: Distance) -> Distance:
     """Return all space outside the shape."""
     return lambda p: -shape(p)
@@ -251,6 +240,11 @@ def tapered(start: Point, end: Point, first: float, last: float) -> Distance:
         return row_lengths(p - a - along[:, None] * (b - a)) - first - (last - first) * along
 
     return distance
+
+
+def capsule(start: Point, end: Point, radius: float) -> Distance:
+    """Return all points within `radius` of a line segment."""
+    return tapered(start, end, radius, radius)
 
 
 BANANA_BEND, BANANA_ARC = 0.24, np.radians(55)

@@ -65,18 +65,8 @@ class TorchCommunicator(Communicator):
 
     def gather(self, rows: Tensor) -> list[Tensor] | None:
         """See the base class."""
-        counts, data = self._counts(len(rows)), self._bytes(rows)
-        if self.rank > 0:
-            if data.numel() > 0:
-                dist.send(data, 0)
-            return None
-        parts = [rows]
-        for r in range(1, self.world_size):
-            part = data.new_empty(counts[r], *data.shape[1:])
-            if part.numel() > 0:
-                dist.recv(part, r)
-            parts.append(_like(part, rows))
-        return parts
+        parts = self.all_to_all([rows if r == 0 else rows[:0] for r in range(self.world_size)])
+        return parts if self.rank == 0 else None
 
     def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """See the base class."""
@@ -153,10 +143,9 @@ class TorchCommunicator(Communicator):
         creators = sum(self.all_gather_object(try_claim(self._folder, "start", after=0) is not None))
         if creators != 1:
             raise InputError(
-                f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. Either "
-                "they do "
-                "not share that folder, or its file system does not support exclusive creation. Give all of them the "
-                "same --output-dir, on a disk that they share"
+                f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. Either they "
+                "do not share that folder, or its file system does not support exclusive creation. Give all of them "
+                "the same --output-dir, on a disk that they share"
             )
         try:
             yield
@@ -303,11 +292,8 @@ def _exchange_rows(
     empty = CooEntries(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, dtype)))
     arrays = []
     for name in CooEntries._fields:
-        sent = [
-            [getattr(empty, name), *(getattr(chunk[rank], name) for chunk in entries)]
-            for rank in range(team.world_size)
-        ]
-        arrays.append(team.all_to_all([torch.cat(parts) for parts in sent]))
+        sent = ([empty, *(chunk[rank] for chunk in entries)] for rank in range(team.world_size))
+        arrays.append(team.all_to_all([torch.cat([getattr(part, name) for part in parts]) for parts in sent]))
     received: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
     for rank, chunks in enumerate(chunks_by_rank):
         parts = [array[rank].split(list(counts[rank])) for array in arrays]
@@ -344,15 +330,9 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
     requested = team.all_to_all([row[gaussians] for gaussians in halo])
     evidence, norm = lifted.evidence, lifted.scalars.norm
     sent = [evidence.rows.select_rows(rows.long()) for rows in requested]
-    lengths, column, weight, halo_norm = (
-        torch.cat(team.all_to_all(parts))
-        for parts in (
-            [x.offsets.diff() for x in sent],
-            [x.column for x in sent],
-            [x.weight for x in sent],
-            [norm[rows.long()] for rows in requested],
-        )
-    )
+    norms = (norm[rows.long()] for rows in requested)
+    parts = zip(*((x.offsets.diff(), x.column, x.weight, length) for x, length in zip(sent, norms)))
+    lengths, column, weight, halo_norm = (torch.cat(team.all_to_all(part)) for part in parts)
     offsets = _offsets(torch.cat([evidence.rows.offsets.diff(), lengths]))
     rows = SparseRows(offsets, torch.cat([evidence.rows.column, column]), torch.cat([evidence.rows.weight, weight]))
     blank = SparseRows(torch.zeros_like(offsets), evidence.unlabeled.column[:0], evidence.unlabeled.weight[:0])

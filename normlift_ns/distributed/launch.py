@@ -1,8 +1,4 @@
-"""Launch of processes on this machine or by torchrun, and heartbeats that reveal a lost one.
-
-A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
-counter stops is lost, and the others report that and exit. A process that fails reports its own error first.
-"""
+"""Start of distributed lifts: launch processes on this machine, or join those of torchrun on any number of machines."""
 
 from __future__ import annotations
 
@@ -15,126 +11,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
-from threading import Event, Thread
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+from normlift_ns.distributed.heartbeat import Heartbeat, PeerFailure
 from normlift_ns.errors import InputError
 
 if TYPE_CHECKING:
     from normlift_ns.distributed.communicator import TorchCommunicator
-
-
-HEARTBEAT_INTERVAL = 2.0
-"""Seconds between heartbeats."""
-HEARTBEAT_TIMEOUT = 30.0
-"""Seconds without a heartbeat after which a process counts as lost."""
-_GRACE = 10.0
-"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost one."""
-
-
-class PeerFailure(NamedTuple):
-    """Loss or failure of another process, after which this one has to exit."""
-
-    rank: int
-    """Rank of the lost or failed process."""
-    reported: bool
-    """True if the process failed and reported the error itself; False if its heartbeat stopped."""
-    host: str
-    """Host name and process id."""
-
-
-@dataclass
-class Heartbeat:
-    """Heartbeat of this process, and monitor of the others."""
-
-    store: Any
-    """Client of the shared store, for this object only."""
-    rank: int
-    size: int
-    on_failure: Callable[[PeerFailure], None]
-    """Callback invoked before a forced exit; it must return quickly."""
-    failure: PeerFailure | None = None
-    _waiting: bool = False
-    _stop: Event = field(default_factory=Event)
-    _loss_detected: Event = field(default_factory=Event)
-
-    def start(self) -> None:
-        """Start the thread that sends the heartbeat and monitors the others."""
-        self.store.set(f"place/{self.rank}", f"{socket.gethostname()}, process {os.getpid()}")
-        Thread(target=self._run, name="heartbeat", daemon=True).start()
-
-    def stop(self, well: bool) -> bool:
-        """Stop the heartbeat, and announce to the others that this process exits.
-
-        If the store is unreachable, process 0, which hosts it, has exited: it has reported its own error, unless this
-        process has detected the loss.
-
-        Args:
-            well: True if the process succeeded. Otherwise, the others have to exit too.
-        Returns:
-            Whether this process is the first to fail, and should report its error.
-        """
-        self._stop.set()
-        with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
-            first = not well and self.store.add("failures", 1) == 1
-            self.store.set(f"end/{self.rank}", "well" if well else "failed")
-            if well and self.rank == 0:  # the store may live in this process
-                self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
-            return first
-        return self.rank == 0 or self.failure is not None
-
-    def wait_for_failure(self) -> PeerFailure | None:
-        """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
-        self._waiting = True
-        self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
-        return self.failure
-
-    def _run(self) -> None:
-        beats: dict[int, tuple[bytes, float]] = {}
-        places = {r: "host unknown" for r in range(self.size)}
-        count = 0
-        while self.failure is None and not self._stop.wait(HEARTBEAT_INTERVAL):
-            count += 1
-            try:
-                self.store.set(f"beat/{self.rank}", str(count))
-                for r in range(self.size):
-                    if r != self.rank:
-                        self._check(r, beats, places)
-            except Exception:  # a store whose process is lost raises various errors
-                self.failure = self.failure or PeerFailure(0, False, places[0])
-        if self.failure is not None and not self._stop.is_set():
-            self._exit()
-
-    def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
-        if self.store.check([f"place/{r}"]):
-            places[r] = self.store.get(f"place/{r}").decode()
-        if self.store.check([f"end/{r}"]):
-            if self.store.get(f"end/{r}") == b"failed":
-                self.failure = PeerFailure(r, True, places[r])
-            return
-        beat = self.store.get(f"beat/{r}") if self.store.check([f"beat/{r}"]) else b""
-        now = time.monotonic()
-        if r not in beats or beats[r][0] != beat:
-            beats[r] = beat, now
-        elif now - beats[r][1] > HEARTBEAT_TIMEOUT:
-            self.failure = PeerFailure(r, False, places[r])
-
-    def _exit(self) -> None:
-        self._loss_detected.set()
-        if self._waiting:
-            return
-        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
-        if not self._stop.wait(_GRACE):
-            assert self.failure is not None
-            self.on_failure(self.failure)
-            os._exit(1)
-
-
-# Start of distributed lifts: launch processes on this machine, or join those of torchrun on any number of machines.
-
 
 TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for distributed processes."""
@@ -150,14 +35,6 @@ _QUIET_WAIT = 15.0
 _PR_SET_PDEATHSIG = 1
 """Option of Linux's prctl."""
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
-
-
-class PeerFailureError(RuntimeError):
-    """Loss or failure of another process."""
-
-    def __init__(self, lost: PeerFailure) -> None:
-        super().__init__(f"process {lost.rank} ({lost.host}) {'failed' if lost.reported else 'was lost'}")
-        self.failure = lost
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
@@ -183,19 +60,18 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
     return (rank, size) if size > 1 else None
 
 
-def launch_processes(command: Sequence[str], count: int, log: Callable[[str], None]) -> int:
-    """Run a command in several processes on this machine, and return the exit code.
+def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
+    """Run several processes on this machine that lift one scene together, and return the exit code.
 
     If one process fails, the others are terminated.
 
     Args:
-        command: command line.
-        count: number of processes.
+        commands: command line of each process.
         log: callback for a message that names a process killed by a signal. Other failures are reported by the
             process itself.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
+    count = len(commands)
+    with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     env = os.environ | {
         "MASTER_ADDR": "127.0.0.1",
@@ -206,59 +82,46 @@ def launch_processes(command: Sequence[str], count: int, log: Callable[[str], No
     env.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
     env.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast is not faster here, and can fail
     if sys.platform in _LOOPBACK:  # do not listen on the network
-        env |= {name: _LOOPBACK[sys.platform] for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")}
+        env |= dict.fromkeys(("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"), _LOOPBACK[sys.platform])
     processes = [
         subprocess.Popen(
-            command if r == 0 else _without_log_file(command),
+            command,
             env=env | {"RANK": str(r), "LOCAL_RANK": str(r)},
             stdin=subprocess.DEVNULL,
             preexec_fn=exit_with_parent(),  # noqa: PLW1509 (the launcher has no threads)
         )
-        for r in range(count)
+        for r, command in enumerate(commands)
     ]
     try:
         return _watch(processes, log)
-    except BaseException:  # Ctrl-C or SIGTERM
-        _end(processes)
-        raise
-
-
-def _without_log_file(command: Sequence[str]) -> list[str]:
-    """Remove --log-file from a command line, because only the first process writes that file.
-
-    >>> _without_log_file(["ns-normlift", "--log-file", "a.txt", "--quiet"])
-    ['ns-normlift', '--quiet']
-    >>> _without_log_file(["ns-normlift", "--log_file=a.txt"])
-    ['ns-normlift']
-    """
-    result, skip = [], False
-    for word in command:
-        flag, equals, _ = word.replace("_", "-").partition("=")
-        is_log_file = not skip and flag == "--log-file"
-        if not skip and not is_log_file:
-            result.append(word)
-        skip = is_log_file and not equals
-    return result
+    finally:  # also after Ctrl-C or SIGTERM
+        end_processes(processes, 8.0)
 
 
 def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
+    """Return 0 when all processes have succeeded, or the exit code of the first one that fails."""
     while True:
         codes = [process.poll() for process in processes]
-        failed = [(r, code) for r, code in enumerate(codes) if code]
-        if len(failed) > 0:
-            rank, code = failed[0]
-            if code < 0:
-                name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-                hint = ", possibly because the machine ran out of memory" if name == "SIGKILL" else ""
-                log(f"Process {rank} of 0..{len(processes) - 1} was killed by {name}{hint}. {_RESUME_HINT}")
-            _end(processes)
-            return code if code > 0 else 1
-        if all(code == 0 for code in codes):
-            return 0
+        rank, code = next(((r, code) for r, code in enumerate(codes) if code), (0, 0))
+        if code < 0:
+            log(f"Process {rank} of 0..{len(processes) - 1} was killed by {describe_signal(-code)}. {_RESUME_HINT}")
+        if code != 0 or all(code == 0 for code in codes):
+            return max(code, int(code != 0))
         time.sleep(0.1)
 
 
-def _end(processes: Sequence[subprocess.Popen[bytes]], grace: float = 8.0) -> None:
+def describe_signal(number: int) -> str:
+    """Return the name of a signal that killed a process, and a possible reason.
+
+    >>> describe_signal(15)
+    'SIGTERM'
+    """
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    return name + (", possibly because the machine ran out of memory" if name == "SIGKILL" else "")
+
+
+def end_processes(processes: Sequence[subprocess.Popen[bytes]], grace: float) -> None:
+    """Terminate processes, and kill those that are still running after `grace` seconds."""
     for process in processes:
         process.terminate()
     deadline = time.monotonic() + grace
@@ -311,7 +174,7 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
         log: callback for a message that names a lost process, if no other process reports it.
     Raises:
         InputError: if the processes cannot connect, or there are too few GPUs.
-        LostError: if another process fails or is lost.
+        SystemExit: if another process fails or is lost; the exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)
     if ranks is None:
@@ -339,7 +202,9 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
             lost = PeerFailure(rank, True, "this one") if lost is None else lost._replace(reported=True)
         if lost is None:
             raise
-        raise PeerFailureError(lost) from error
+        if not lost.reported:
+            log(describe_failure(lost))
+        raise SystemExit(1) from error
     heart.stop(well=True)
     dist.destroy_process_group()
 
@@ -408,8 +273,7 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
 
 def _is_listening(host: str, port: int) -> bool:
     """Return whether a server accepts connections at this address."""
-    try:
+    with suppress(OSError):
         socket.create_connection((host, port), timeout=5).close()
-    except OSError:
-        return False
-    return True
+        return True
+    return False

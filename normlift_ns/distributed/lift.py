@@ -15,9 +15,8 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from normlift_ns.api import LiftRequest, announce, check_alignment, check_target, prepare_lift, write_lifted_run
+from normlift_ns import api, pipeline
 from normlift_ns.core.consensus import (
-    CHANCE_AGREEMENT,
     Consensus,
     check_consensus_inputs,
     sample_gaussians,
@@ -48,85 +47,59 @@ from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import RefineConfig
-from normlift_ns.pipeline import (
-    LiftResult,
-    check_directions,
-    consensus_facts,
-    consensus_options,
-    count_directions,
-    count_votes,
-    lift_features,
-    lift_provenance,
-    lift_statistics,
-    plan_collection,
-    start_kernel_warm_up,
-    vote_shares,
-    with_cost,
-)
-from normlift_ns.progress import ProgressCallback, StageTimer
+from normlift_ns.progress import StageTimer
 
 
-def run_lift_distributed(team: TorchCommunicator, request: LiftRequest) -> LiftedRun | None:
-    """Run `run_lift` in several processes, all with the same request. Only rank 0 writes and returns the run."""
-    prepared, stages = prepare_lift(request), StageTimer(request.report)
+def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> LiftedRun | None:
+    """Run `run_lift` in several processes, all with the same request and the whole scene.
+
+    Only rank 0 writes and returns the run.
+    """
+    prepared, before = api.prepare_lift(request), StageTimer(request.report)
     run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
     prepared = replace(prepared, run_dir=run_dir)
     if team.rank == 0:
-        check_target(prepared)
-    announce(prepared)
+        api.check_target(prepared)
+    api.announce(prepared)
     if team.rank == 0:
-        check_alignment(prepared, stages)
+        api.check_alignment(prepared, before)
     cache, device = cache_folder(run_dir), prepared.device
-    collection = plan_collection(
+    collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
     )
-    with team.shared_folder(cache):
-        result = lift_scene_distributed(team, collection, device, prepared.encoder, request.report)
-    return None if result is None else write_lifted_run(prepared, result, stages)
-
-
-def lift_scene_distributed(
-    team: TorchCommunicator,
-    collection: EvidenceCollection,
-    device: str,
-    encoder: Mapping[str, Any],
-    report: ProgressCallback,
-) -> LiftResult | None:
-    """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
-
-    Args:
-        device, encoder, report: as in `lift_scene`.
-    """
-    stages, facts = StageTimer(team.aggregate_progress(report)), {}
+    stages, facts = StageTimer(team.aggregate_progress(request.report)), {}
     options, means = collection.options, collection.gaussians.means
-    wait_for_kernels = start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
+    wait_for_kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
     portion = Partition.from_means(team, means)
-    views = _collect(team, collection, portion, stages, wait_for_kernels)
+    with team.shared_folder(cache):
+        views = _collect(team, collection, portion, stages, wait_for_kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
-            agreed = consensus_distributed(
-                views, portion, sample=options.consensus_sample, **consensus_options(options)
-            )
+            kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
+            agreed = consensus_distributed(views, portion, **kwargs)
             step()
-        table, facts = agreed.features, consensus_facts(options, agreed)
+        table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
     with stages("lift") as step:
-        lifted, own = lift_features(views, table, options)
-        check_directions(team.all_reduce(count_directions(lifted)), len(means), collection.source)
+        lifted, own = pipeline.lift_features(views, table, options)
+        pipeline.check_directions(team.all_reduce(pipeline.count_directions(lifted)), len(means), collection.source)
         step()
     copied = None
     if options.refine:
         copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
         facts |= vote_facts
     with stages("store") as step:
-        statistics = lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
-        provenance = lift_provenance(collection, encoder, statistics)
+        statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
+        provenance = pipeline.lift_provenance(collection, prepared.encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
             tolerance=options.tolerance, storage=options.storage, provenance=provenance,
         )  # fmt: skip
         step()
-    return None if field is None else LiftResult(with_cost(field, stages, device), stages.seconds)
+    if field is None:
+        return None
+    result = pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
+    return api.write_lifted_run(prepared, result, before)
 
 
 def _collect(
@@ -164,15 +137,13 @@ def _gather_tables(tables: Mapping[int, tuple[Tensor, Tensor]], team: Communicat
     return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])
 
 
-def consensus_distributed(
-    views: ViewObservations,
-    portion: Partition,
-    *,
-    power: float = 1.0,
-    sample: int = 50,
-    least: float = CHANCE_AGREEMENT,
-) -> Consensus:
-    """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes."""
+def consensus_distributed(views: ViewObservations, portion: Partition, *, sample: int, **options: float) -> Consensus:
+    """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes.
+
+    Args:
+        sample: as in `consensus`.
+        options: `power` and `least` of `consensus`.
+    """
     team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
@@ -184,7 +155,7 @@ def consensus_distributed(
         out = features.to(evidence.rows.weight.device, copy=True)
         return Consensus(team.broadcast(out), team.broadcast_object(None), len(order))
     sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
-    result = sampled_consensus(sampled, probability, features, level=level, power=power, least=least)
+    result = sampled_consensus(sampled, probability, features, level=level, **options)
     return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
 
 
@@ -217,8 +188,8 @@ def vote_distributed(
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        counts = team.all_reduce(count_votes(copied, gaussians, neighbors, reliability))
-    return copied, vote_shares(counts, len(means))
+        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
+    return copied, pipeline.vote_shares(counts, len(means))
 
 
 def build_field_distributed(

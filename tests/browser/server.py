@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tests.viewer.scenes import free_port
 
-OWN = "from normlift_ns.cli.view import main; main()"
+OWN = "from normlift_ns.cli.start import view; view()"
 STOCK = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
 PATIENCE = 600.0
 """Seconds after which a state that is waited for does not come any more, on a machine with much else to do."""

@@ -18,7 +18,7 @@ from PIL import Image
 
 from normlift_ns import evidence_collection, open_run, open_scene
 from normlift_ns.cli import evaluate, export, lift, query
-from normlift_ns.cli.demo import iou_per_class
+from normlift_ns.core.metrics import class_scores, confusion
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.query.question import load_query
@@ -41,7 +41,7 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
     run = open_run(lifted)
     field, vectors = run.field, run.texts.text(room.names)
     found = [field.query(vectors, refined=refined).argmax(1) for refined in (False, True)]
-    before, after = (float(iou_per_class(classes, room.labels, len(room.names)).mean()) for classes in found)
+    before, after = (class_scores(confusion(room.labels, classes, len(room.names))).miou for classes in found)
     assert after > 0.7 and after > before
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12

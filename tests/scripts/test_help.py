@@ -75,7 +75,7 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
         begun: list[Any] = []
         with monkeypatch.context() as patch:
             command = import_module(f"normlift_ns.cli.{function}")
-            patch.setattr(command, "run_command_process", begun.append)
+            patch.setattr(common, "run_command_process", begun.append)
             getattr(start, function)()
             assert begun == [COMMANDS[name]], name
             patch.setattr(command, "run_command", begun.append)

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from normlift_ns import Scene, open_run, render
 from normlift_ns.cli import lift, query
-from normlift_ns.cli.demo import iou_per_class
+from normlift_ns.core.metrics import class_scores, confusion
 from normlift_ns.encoders.text_files import TextEmbeddingFile
 from normlift_ns.rendering.figures import pixel_relevancy
 from tests.captures import SHARED, clip_vectors, needs_shared
@@ -115,7 +115,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
         scores = []
         for refined in (False, True):
             found = torch.where(field.valid(refined=refined), field.query(texts, refined=refined).argmax(1), -1)
-            scores.append(float(iou_per_class(found, room.labels, len(room.names)).mean()))
+            scores.append(class_scores(confusion(room.labels, found, len(room.names))).miou)
         return config, scores
 
     scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}

@@ -18,7 +18,7 @@ from plyfile import PlyData
 from normlift_ns import Camera, InputError, open_run
 from normlift_ns.analysis.objects import csv_columns, view_shares
 from normlift_ns.cli import export, query
-from normlift_ns.cli.answers import print_catalog
+from normlift_ns.cli.query import print_catalog
 from normlift_ns.exports import answer_instances
 from normlift_ns.rasterization.rasterize import render
 from normlift_ns.rasterization.settings import RasterSettings

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from normlift_ns.analysis.explain import ViewVote, Why
-from normlift_ns.cli import answers, common, evaluate, export, lift, query, repl
+from normlift_ns.cli import common, evaluate, export, lift, query
 from normlift_ns.errors import escape_unprintable
 from tests.scripts.conftest import run_entry
 
@@ -38,7 +38,7 @@ def summary(text: str) -> Any:
 
 
 TABLES: dict[str, Callable[[str], Any]] = {
-    "query": lambda text: repl.answer_table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
+    "query": lambda text: query.answer_table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
     "export": lambda text: export._objects_table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
     "export nothing": lambda text: export._objects_table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
     "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),
@@ -109,8 +109,8 @@ def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():
     why, names = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
     for width in (60, 80, 120):
         for table, numbers in (
-            (repl.answer_table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),
-            (answers.explanation_table(names, ["tomato red"], [why], narrow=width < 120), "8.8% 0.994 -0.006 21%"),
+            (query.answer_table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),
+            (query.explanation_table(names, ["tomato red"], [why], narrow=width < 120), "8.8% 0.994 -0.006 21%"),
         ):
             Console(file=(file := io.StringIO()), width=width).print(table)
             shown = file.getvalue()

@@ -11,13 +11,8 @@ from typing import Any
 
 import pytest
 
-from normlift_ns.distributed import launch as module
-from normlift_ns.distributed.launch import (
-    HEARTBEAT_TIMEOUT,
-    Heartbeat,
-    PeerFailure,
-    rank_and_world_size,
-)
+from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat, PeerFailure
+from normlift_ns.distributed.launch import rank_and_world_size
 from normlift_ns.errors import InputError
 
 ENVIRONMENT = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
@@ -93,10 +88,10 @@ class World:
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     """All hearts are stopped in the end: one that is not ends the process."""
-    assert (module.HEARTBEAT_INTERVAL, HEARTBEAT_TIMEOUT, module._GRACE) == (2, 30, 10)
+    assert (heartbeat.HEARTBEAT_INTERVAL, HEARTBEAT_TIMEOUT, heartbeat._GRACE) == (2, 30, 10)
     found = World()
-    monkeypatch.setattr(module, "HEARTBEAT_INTERVAL", 0.002)
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: found.now))
+    monkeypatch.setattr(heartbeat, "HEARTBEAT_INTERVAL", 0.002)
+    monkeypatch.setattr(heartbeat, "time", SimpleNamespace(monotonic=lambda: found.now))
     monkeypatch.setattr(os, "kill", lambda pid, number: found.signals.append(number))
     monkeypatch.setattr(os, "_exit", found.exits.append)
     yield found
@@ -149,7 +144,7 @@ def test_one_that_fails_says_so_and_only_the_first_one_speaks(world: World) -> N
 def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_GRACE", 0.01)
+    monkeypatch.setattr(heartbeat, "_GRACE", 0.01)
     world.team(2)
     world.kill(1)
     world.store.values["end/1"] = b"failed"
@@ -188,11 +183,11 @@ def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pyt
     def connect(rank: int, size: int, backend: str, log: Any) -> Any:
         raise ConnectionError(f"{rank} of {size} by {backend}")
 
-    monkeypatch.setattr(module, "_connect", connect)
+    monkeypatch.setattr(launch, "_connect", connect)
     for name, value in (ENVIRONMENT | {"LOCAL_RANK": "1", "TORCH_CPP_LOG_LEVEL": "ERROR"}).items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(ConnectionError, match="1 of 2 by gloo"), module.distributed_context("cpu", print):
+    with pytest.raises(ConnectionError, match="1 of 2 by gloo"), launch.distributed_context("cpu", print):
         pass
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    with pytest.raises(InputError, match="GPU"), module.distributed_context("auto", print):
+    with pytest.raises(InputError, match="GPU"), launch.distributed_context("auto", print):
         pass

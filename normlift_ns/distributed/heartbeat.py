@@ -1,0 +1,120 @@
+"""Heartbeats of the processes of one lift, which reveal a lost process.
+
+A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
+counter stops is lost, and the others report that and exit. A process that fails reports its own error first.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
+from threading import Event, Thread
+from typing import Any, NamedTuple
+
+HEARTBEAT_INTERVAL = 2.0
+"""Seconds between heartbeats."""
+HEARTBEAT_TIMEOUT = 30.0
+"""Seconds without a heartbeat after which a process counts as lost."""
+_GRACE = 10.0
+"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost one."""
+
+
+class PeerFailure(NamedTuple):
+    """Loss or failure of another process, after which this one has to exit."""
+
+    rank: int
+    """Rank of the lost or failed process."""
+    reported: bool
+    """True if the process failed and reported the error itself; False if its heartbeat stopped."""
+    host: str
+    """Host name and process id."""
+
+
+@dataclass
+class Heartbeat:
+    """Heartbeat of this process, and monitor of the others."""
+
+    store: Any
+    """Client of the shared store, for this object only."""
+    rank: int
+    size: int
+    on_failure: Callable[[PeerFailure], None]
+    """Callback invoked before a forced exit; it must return quickly."""
+    failure: PeerFailure | None = None
+    _waiting: bool = False
+    _stop: Event = field(default_factory=Event)
+    _loss_detected: Event = field(default_factory=Event)
+
+    def start(self) -> None:
+        """Start the thread that sends the heartbeat and monitors the others."""
+        self.store.set(f"place/{self.rank}", f"{socket.gethostname()}, process {os.getpid()}")
+        Thread(target=self._run, name="heartbeat", daemon=True).start()
+
+    def stop(self, well: bool) -> bool:
+        """Stop the heartbeat, and announce to the others that this process exits.
+
+        If the store is unreachable, process 0, which hosts it, has exited: it has reported its own error, unless this
+        process has detected the loss.
+
+        Args:
+            well: True if the process succeeded. Otherwise, the others have to exit too.
+        Returns:
+            Whether this process is the first to fail, and should report its error.
+        """
+        self._stop.set()
+        with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
+            first = not well and self.store.add("failures", 1) == 1
+            self.store.set(f"end/{self.rank}", "well" if well else "failed")
+            if well and self.rank == 0:  # the store may live in this process
+                self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
+            return first
+        return self.rank == 0 or self.failure is not None
+
+    def wait_for_failure(self) -> PeerFailure | None:
+        """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
+        self._waiting = True
+        self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
+        return self.failure
+
+    def _run(self) -> None:
+        beats: dict[int, tuple[bytes, float]] = {}
+        places = {r: "host unknown" for r in range(self.size)}
+        count = 0
+        while self.failure is None and not self._stop.wait(HEARTBEAT_INTERVAL):
+            count += 1
+            try:
+                self.store.set(f"beat/{self.rank}", str(count))
+                for r in range(self.size):
+                    if r != self.rank:
+                        self._check(r, beats, places)
+            except Exception:  # a store whose process is lost raises various errors
+                self.failure = self.failure or PeerFailure(0, False, places[0])
+        if self.failure is None or self._stop.is_set():
+            return
+        self._loss_detected.set()
+        if self._waiting:
+            return
+        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
+        if not self._stop.wait(_GRACE):
+            self.on_failure(self.failure)
+            os._exit(1)
+
+    def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
+        if self.store.check([f"place/{r}"]):
+            places[r] = self.store.get(f"place/{r}").decode()
+        if self.store.check([f"end/{r}"]):
+            if self.store.get(f"end/{r}") == b"failed":
+                self.failure = PeerFailure(r, True, places[r])
+            return
+        beat = self.store.get(f"beat/{r}") if self.store.check([f"beat/{r}"]) else b""
+        now = time.monotonic()
+        if r not in beats or beats[r][0] != beat:
+            beats[r] = beat, now
+        elif now - beats[r][1] > HEARTBEAT_TIMEOUT:
+            self.failure = PeerFailure(r, False, places[r])
