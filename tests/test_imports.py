@@ -137,7 +137,7 @@ normlift_ns.__version__
 check("version", HEAVY)
 from normlift_ns.cli import batch, check as _, demo, evaluate, export, lift, query, view
 check("scripts", HEAVY)
-from normlift_ns.encoders.weights import has_local_clip_weights
+from normlift_ns.encoders.open_clip import has_local_clip_weights
 has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
 check("weights", HEAVY | {"transformers", "skimage"})
 missing = ["--load-config", "nowhere/config.yml"]

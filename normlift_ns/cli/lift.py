@@ -30,7 +30,7 @@ from normlift_ns.cli.common import (
     run_command_process,
     split_output_flags,
 )
-from normlift_ns.data.nerfstudio.config_file import read_config_paths
+from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory

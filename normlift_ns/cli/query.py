@@ -32,9 +32,8 @@ from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
 from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
 
 if TYPE_CHECKING:
-    from normlift_ns.analysis.explain import ViewVote, Why
+    from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
     from normlift_ns.analysis.objects import Catalogue
-    from normlift_ns.analysis.vote_records import RecordedVotes
     from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.query.arrays import QuickRun
     from normlift_ns.query.engine import Answer
@@ -419,7 +418,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         threshold: Threshold that each histogram marks with a bar |.
         narrow: Leave out the histograms.
     """
-    from normlift_ns.query.histogram import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
+    from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
     result = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
     wrapped = ("text", "centroid", "extent")

@@ -44,8 +44,6 @@ _MIN_SPAN = 0.05
 """Smallest difference between the relevancies at the ends of a color scale."""
 SEGMENTATION_OPACITY = 0.8
 """Opacity of the prompt colors over the scene."""
-MANUAL_SELECTION_COLOR = prompt_colors([""])[0]
-"""RGB of Gaussians selected by clicks without a query."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ def render_outputs(
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
     _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
     opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
-    overlaid, segmented = _over_gray(rgb, MANUAL_SELECTION_COLOR.to(rgb), opacity), _gray(rgb)
+    overlaid, segmented = _over_gray(rgb, prompt_colors([""])[0].to(rgb), opacity), _gray(rgb)
     outputs = {f"relevancy_{i}": image[:, :, i : i + 1] for i in range(count)}
     if count > 0:
         segmented = segmentation(rgb, pixel[:, :, :count].argmax(dim=2), selected_by_any, display.palette)

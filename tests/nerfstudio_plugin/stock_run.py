@@ -31,8 +31,7 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.data.nerfstudio.config import with_absolute_paths
-from normlift_ns.data.nerfstudio.config import locate_run
+from normlift_ns.data.nerfstudio.config import locate_run, with_absolute_paths
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.rasterization import projection
 from normlift_ns.rasterization.projection import assign_tiles, prepare_gaussians, project

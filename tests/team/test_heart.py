@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from normlift_ns.distributed import heartbeat, launch
 from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat, PeerFailure
 from normlift_ns.distributed.launch import rank_and_world_size
 from normlift_ns.errors import InputError

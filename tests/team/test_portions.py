@@ -141,8 +141,8 @@ def test_process_0_reports_the_views_of_all() -> None:
     done: Counter[str] = Counter()
     store = SimpleNamespace(add=lambda stage, new: done.update({stage: new}) or done[stage])
     told: list[tuple[str, int, int]] = []
-    team = [TorchCommunicator(rank=r, size=2, device=torch.device("cpu"), store=store) for r in (0, 1)]
-    reports = [one.counted(lambda *progress: told.append(progress)) for one in team]
+    team = [TorchCommunicator(rank=r, world_size=2, device=torch.device("cpu"), store=store) for r in (0, 1)]
+    reports = [one.aggregate_progress(lambda *progress: told.append(progress)) for one in team]
     for count in (1, 2, 4):
         for report in reports[::-1]:
             report("evidence", count, 9)
