@@ -166,7 +166,7 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
 
 
 def encode_directions(
-    lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " b"]]
+    lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " _"]]
 ) -> tuple[Float16[Tensor, "m r"], Int64[Tensor, " m"]]:
     """Return float16 coordinates and the row of the lift for every Gaussian with evidence, block by block.
 
