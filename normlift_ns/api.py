@@ -104,7 +104,7 @@ def lift_run(
         check: compare three training images with renders of the scene first. Warn if they differ; raise if the splat
             does not show what the images show.
         device: auto, cpu or cuda.
-        export: where to also write the 2D features, in LangSplat's format.
+        export: LangSplat files to also write the 2D features to; None: none.
         report: called with (stage, steps done, total steps).
         say: called with each status line and warning, for example `print`.
     Raises:

@@ -369,7 +369,7 @@ class ExportJob:
     objects: Mapping[str, Any] | None = None
     """Table of these objects, with JSON types only."""
     rest: bool = False
-    """Whether `keep` is the rest of the scene, without the selection of the answer."""
+    """True if `keep` is the rest of the scene, without the selection of the answer."""
     transfer: CloudTransfer | None = None
     overwrite: bool = False
     """Replace existing files."""
@@ -390,7 +390,7 @@ class Exporter:
     suffix: str = ""
     """Suffix of the output, such as ".csv"; "": the output is a folder."""
     needs_answer: bool = True
-    """Whether the job must have an answer."""
+    """True if the job must have an answer."""
 
 
 def transfer_labels(

@@ -123,7 +123,7 @@ class Why:
 
     @property
     def words(self) -> str:
-        """How well the images agree, and the effective number of images, as English sentences.
+        """Agreement of the images and their effective number, as English sentences.
 
         >>> Why(5, 0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'

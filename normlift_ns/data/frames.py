@@ -30,9 +30,9 @@ class ImageHeader(NamedTuple):
     mode: str
     """Pillow's name of the pixel format."""
     rotated: bool
-    """Whether EXIF data ask viewers to rotate the image, which training ignores."""
+    """True if EXIF data ask viewers to rotate the image, which training ignores."""
     multi_frame: bool
-    """Whether the file holds several images; only the first is read."""
+    """True if the file holds several images; only the first is read."""
 
 
 def read_image_header(file: Path) -> ImageHeader:
@@ -159,7 +159,7 @@ class Intrinsics(NamedTuple):
 
     @property
     def is_distorted(self) -> bool:
-        """Whether a distortion parameter is not zero."""
+        """True if a distortion parameter is not zero."""
         return any(self[6:12])
 
     def resized(self, width: int, height: int) -> Intrinsics:
@@ -177,8 +177,7 @@ class WorldTransform(NamedTuple):
     """Rotation and translation."""
     scale: float
     float32: bool = False
-    """Whether to compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its
-    training."""
+    """Compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its training."""
 
 
 @dataclass(frozen=True)

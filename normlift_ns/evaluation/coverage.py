@@ -576,7 +576,7 @@ def suggest_poses(
 
     @cache
     def accept(view: int) -> bool:
-        """Whether a view shows a region, and all but a few pixels are not too near."""
+        """Return whether a view shows a region, with all but a few pixels far enough from the camera."""
         if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
             return False
         depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()

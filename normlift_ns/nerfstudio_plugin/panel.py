@@ -309,7 +309,7 @@ class PanelWidgets:
                     self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects."),
                 )
                 self.colormap = self._input(
-                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
+                    "colormap", self._gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
                 )
                 hint = "Prompts to compare with, separated by commas."
                 self.negatives = self._gui.add_text("Negatives", "", hint=hint)

@@ -72,7 +72,7 @@ class Display:
     drawn: Bool[Tensor, " n"] | None = None
     """Gaussians that are drawn at all; None: all."""
     by_hand: bool = False
-    """Whether the selection was made by hand, in which case the overlay has a single color."""
+    """True if the selection was made by hand; the overlay then has a single color."""
 
     @property
     def num_prompts(self) -> int:
@@ -292,7 +292,7 @@ class FigureHeader:
     summary: str
     """Size of the selection and strength of its evidence."""
     absent: bool = False
-    """Whether the prompt is probably not in the scene."""
+    """True if the prompt is probably not in the scene."""
 
     @property
     def title(self) -> str:

@@ -196,7 +196,7 @@ _REMEDIES = {
     "SAM 3": f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
     "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment",
 }
-"""What to do about a checkpoint, by the name of the networks."""
+"""Advice in messages about an unusable checkpoint, by the name of the networks."""
 _FIRST = "the first SAM, ViT-B, -L or -H"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {

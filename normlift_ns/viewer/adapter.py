@@ -121,7 +121,7 @@ def guarded() -> Iterator[None]:
     """Servers of viser that start within serve the files of its page only, with our script for browsers without WebGL
     in it, and do not compress.
 
-    By itself 0.2.7 serves every file that a path with .. leads to, and spends seconds on compressing colours.
+    By itself 0.2.7 serves every file that a path with .. leads to, and spends seconds on compressing colors.
     """
     from viser.infra import _infra as known  # noqa: PLC0415
 
@@ -217,13 +217,13 @@ _MAX_HOLDUP = 0.5
 """Seconds that a message waits for the one before it, at most."""
 _SCRIPT = """
 (() => {
-  const labelled = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
+  const labelOf = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
   const press = (text) => {
     const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
     if (found && !found.disabled) found.click();
   };
   const rowOf = (text) => {
-    let row = labelled(text);
+    let row = labelOf(text);
     while (row && !row.querySelector("input")) row = row.parentElement;
     return row;
   };

@@ -153,7 +153,7 @@ class RunLocation:
     data: Path
     """The dataset: a folder or a .json file."""
     data_moved: bool
-    """Whether `data` differs from the path in the config, read relative to `root`."""
+    """True if `data` differs from the path in the config, read relative to `root`."""
 
     @property
     def folder(self) -> Path:

@@ -190,7 +190,7 @@ class NerfstudioScene:
 
     @property
     def has_harmonics(self) -> bool:
-        """Whether colors depend on the view."""
+        """True if colors depend on the view direction."""
         return self.model_config.sh_degree > 0
 
     @property
