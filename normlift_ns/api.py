@@ -309,9 +309,6 @@ def query_to_store(
     return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
 
 
-# Directory of a lifted run: the files that stock nerfstudio loads, and the semantic field.
-
-
 def write_run(
     source: NerfstudioScene | SplatScene,
     field: SemanticField,

@@ -70,7 +70,7 @@ class TrainedSplat(NamedTuple):
     """Trained Gaussians, and how to render them."""
 
     parameters: Mapping[str, Tensor]
-    """As in `Scene.parameters`."""
+    """Parameters as in `Scene.parameters`."""
     spherical_harmonics: bool
     """False if colors do not depend on the view (sh_degree 0) and are stored as logits."""
     rasterize_mode: RasterizeMode
@@ -219,9 +219,6 @@ def write_label_arrays(
             np.save(draft, ids.cpu().numpy()[rows].astype(np.int32) - 1)
         drafts[3].write_text(json.dumps(names, indent=2) + "\n", "utf8")
     return files
-
-
-# Transfer of labels from Gaussians to the points of a point cloud or mesh.
 
 
 class CloudTransfer(NamedTuple):

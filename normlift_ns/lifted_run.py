@@ -503,9 +503,6 @@ def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
     return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
 
 
-# Opening.
-
-
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
     """Open a trained splatfacto run or a lifted run, from any working directory.
 

@@ -326,9 +326,6 @@ def with_cost(field: SemanticField, stages: StageTimer, device: str) -> Semantic
     return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
 
 
-# Warm-up of kernels in the background, while images are read and networks process them.
-
-
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
 ) -> Callable[[], None]:

@@ -236,9 +236,6 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
     return tuple(votes)
 
 
-# Outlines of regions in an image.
-
-
 _LINE_COLOR = (255, 176, 0)
 """Orange, which contrasts with the dark rim for people with any color vision."""
 _OUTSIDE_BRIGHTNESS = 0.45
@@ -344,7 +341,7 @@ class RecordedVotes:
         """Yield the image of each vote, with outlines of the regions that voted; images are read one at a time.
 
         Raises:
-            FileNotFoundError: an image does not exist any more.
+            FileNotFoundError: an image no longer exists.
             ValueError: an image has changed, or the cache no longer holds its regions. Features passed from Python
                 always raise this error, because no file has their regions.
         """

@@ -27,9 +27,6 @@ from normlift_ns.options import CATALOG_FILES, FLOATER_THRESHOLD, OBJECT_MAX_GAP
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
-# Oriented bounding boxes of Gaussian centers that are robust to outliers.
-
-
 BOX_QUANTILES = (0.01, 0.99)
 """Quantiles of the points along each axis that bound a box."""
 _FLAT = 1e-14
@@ -234,9 +231,6 @@ def connected_components(
     return labels.to(means.device)
 
 
-# Assignment of each Gaussian to at most one class and one object, for exports to other tools.
-
-
 @dataclass(frozen=True, eq=False)
 class Instances:
     """Class and object of every Gaussian: classes are prompts, objects are connected components of a class."""
@@ -322,9 +316,6 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
         objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
         tables.append({"text": text, "class_id": number, **found, "objects": objects})
     return tables
-
-
-# Catalog of objects: position, size and reliability of each, and the images that show it.
 
 
 MIN_VIEW_SHARE = 0.1
@@ -499,9 +490,6 @@ def _inside(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = None) -> Placement:
     low, high = np.quantile(points, BOX_QUANTILES, axis=0)
     return Placement(np.average(points, axis=0, weights=weight), high - low, box or oriented_box(points))
-
-
-# Export of a catalog as JSON, as a CSV table, and as box meshes for mesh viewers.
 
 
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))

@@ -120,9 +120,6 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
     return tuple(warnings)
 
 
-# Images and cameras as camera files describe them.
-
-
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a rotation from orthonormal, because files round."""
@@ -245,7 +242,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}, the first is "
+            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}; the first is "
             f"{missing[0]}. Put them back, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]

@@ -162,9 +162,6 @@ class SplatFile(NamedTuple):
     """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
 
 
-# Splats in PLY files written by Inria's trainer, gsplat, ns-export or this package.
-
-
 _MAX_HEADER_BYTES = 2**20
 _PLY_BLOCK_ROWS = 2**18
 """Number of Gaussians read at a time."""

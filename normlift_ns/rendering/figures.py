@@ -492,7 +492,7 @@ def _overlays(
 
 
 def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
-    """Return the training image of a view, or None if it cannot be read any more."""
+    """Return the training image of a view, or None if it can no longer be read."""
     names = unique_file_names(list(scene.train.names))
     try:
         return scene.train[names.index(view)].image
