@@ -22,9 +22,9 @@ IS_NO = re.compile(r"(?<![Tt]here )\b(?:is|are) no (?!longer\b|more\b|less\b|lar
 WHERE = re.compile(r"(?:^Where|[.;:] [Ww]here) [a-z]")
 BRITISH = re.compile(
     r"(?<![A-Za-z])(?i:(?:dis|un)?colour|neighbour|centre|(?:un)?labell|grey|(?:centi|milli|kilo)?metre|behaviour|favour|"
-    r"favourit|honour|licence|programmes?(?![a-z])|(?:re)?modell|travell|cancell(?!at)|catalogue|artefact|judgement|"
-    r"practise|defence|whilst|amongst|towards|analys(?:e|ed|er|ing)(?![a-z])|"
-    r"(?![a-z]*(?:wis|nois|prais|precis|promis|exercis|vis|compris|surpris|expertis|concis|disguis|premis))"
+    r"honour|licence|programmes?(?![a-z])|(?:re)?model(?:led|ling)|travell|cancel(?:led|ling)|catalogue|artefact|"
+    r"judgement|practise|defence|whilst|amongst|towards|analys(?:e|ed|er|ing)(?![a-z])|"
+    r"(?![a-z]*(?:wis|nois|prais|precis|prom|exercis|vis|compris|surpris|expertis|concis|disguis|premis))"
     r"[a-z]{4,}is(?:e[drs]?|ing|ations?)(?![a-z]))[a-z]*"
 )
 ALLOWED = {

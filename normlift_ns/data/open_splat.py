@@ -91,7 +91,7 @@ class SplatScene:
     """Warnings about the images, in whole sentences."""
 
     renderer = None
-    """No renderer of its own: `normlift_ns` renders the scene."""
+    """None, because `normlift_ns` renders the scene."""
     has_harmonics = True
 
     @property

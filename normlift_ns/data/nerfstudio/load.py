@@ -158,7 +158,7 @@ class NerfstudioScene:
     Gaussians."""
 
     renderer = None
-    """No renderer of its own: `normlift_ns` renders the scene as splatfacto does."""
+    """None, because `normlift_ns` renders the scene as splatfacto does."""
 
     @property
     def name(self) -> str:
