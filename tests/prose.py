@@ -21,8 +21,8 @@ QUESTION = re.compile(r"(What|Who|Whose|Whether|Where|How|Which|Why)\b")
 IS_NO = re.compile(r"(?<![Tt]here )\b(?:is|are) no (?!longer\b|more\b|less\b|larger\b|smaller\b|other\b)[a-z{]")
 WHERE = re.compile(r"(?:^Where|[.;:] [Ww]here) [a-z]")
 BRITISH = re.compile(
-    r"(?<![A-Za-z])(?i:(?:dis|un)?colour|neighbour|centre|(?:un)?labell|grey|(?:centi|milli|kilo)?metre|behaviour|favour|"
-    r"honour|licence|programmes?(?![a-z])|(?:re)?model(?:led|ling)|travell|cancel(?:led|ling)|catalogue|artefact|"
+    r"(?<![A-Za-z])(?i:(?:dis|un)?colour|neighbour|centre|(?:un)?labell|grey|(?:centi|milli|kilo)?metre|behaviour|"
+    r"favour|honour|licence|programmes?(?![a-z])|(?:re)?model(?:led|ling)|travell|cancel(?:led|ling)|catalogue|artefact|"
     r"judgement|practise|defence|whilst|amongst|towards|analys(?:e|ed|er|ing)(?![a-z])|"
     r"(?![a-z]*(?:wis|nois|prais|precis|prom|exercis|vis|compris|surpris|expertis|concis|disguis|premis))"
     r"[a-z]{4,}is(?:e[drs]?|ing|ations?)(?![a-z]))[a-z]*"

@@ -712,7 +712,7 @@ class SearchPanel(torch.nn.Module):
             return build_query(field, prompts, encode, negatives=split_prompts(negatives), **options)
 
     def _stored_query(self) -> Query | None:
-        """The query stored in the run; None if it stores none."""
+        """Return the query stored in the run; None if it stores none."""
         return None if self._folder is None else load_query(self._folder)
 
     def _select_floaters(self, token: RequestToken) -> None:
