@@ -24,6 +24,7 @@ style: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
+	$(BIN)/python -m tests.prose
 
 lint: style
 	$(BIN)/basedpyright

@@ -104,7 +104,7 @@ def lift_run(
         check: compare three training images with renders of the scene first. Warn if they differ; raise if the splat
             does not show what the images show.
         device: auto, cpu or cuda.
-        export: where to also write the 2D features, in LangSplat's format.
+        export: LangSplat files to also write the 2D features to; None: none.
         report: called with (stage, steps done, total steps).
         say: called with each status line and warning, for example `print`.
     Raises:
@@ -307,9 +307,6 @@ def query_to_store(
     if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
     return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
-
-
-# Directory of a lifted run: the files that stock nerfstudio loads, and the semantic field.
 
 
 def write_run(

@@ -95,7 +95,7 @@ def _user_message(error: BaseException) -> str | None:
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
     if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):
-        return "this torch was built for NumPy 1, but NumPy 2 is installed; type: pip install 'numpy<2'"
+        return "this torch was built for NumPy 1, but NumPy 2 is installed; run: pip install 'numpy<2'"
     return None
 
 

@@ -70,7 +70,7 @@ class TrainedSplat(NamedTuple):
     """Trained Gaussians, and how to render them."""
 
     parameters: Mapping[str, Tensor]
-    """As in `Scene.parameters`."""
+    """Parameters as in `Scene.parameters`."""
     spherical_harmonics: bool
     """False if colors do not depend on the view (sh_degree 0) and are stored as logits."""
     rasterize_mode: RasterizeMode
@@ -221,9 +221,6 @@ def write_label_arrays(
     return files
 
 
-# Transfer of labels from Gaussians to the points of a point cloud or mesh.
-
-
 class CloudTransfer(NamedTuple):
     """A point cloud to label, and the rule for it."""
 
@@ -369,7 +366,7 @@ class ExportJob:
     objects: Mapping[str, Any] | None = None
     """Table of these objects, with JSON types only."""
     rest: bool = False
-    """Whether `keep` is the rest of the scene, without the selection of the answer."""
+    """True if `keep` is the rest of the scene, without the selection of the answer."""
     transfer: CloudTransfer | None = None
     overwrite: bool = False
     """Replace existing files."""
@@ -390,7 +387,7 @@ class Exporter:
     suffix: str = ""
     """Suffix of the output, such as ".csv"; "": the output is a folder."""
     needs_answer: bool = True
-    """Whether the job must have an answer."""
+    """True if the job must have an answer."""
 
 
 def transfer_labels(

@@ -133,7 +133,7 @@ class LiftedRun:
             rule: how to compute relevancy from cosines, see `relevancy`. "auto" is lerf with negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
                 relevancies. None is 0.5, or 0.02 for rule margin, or "auto" for bare cosines of encoders other than
-                colour.
+                "colour".
             min_reliability: minimum R of a selected Gaussian, in 0..1.
             refined: use the refined features, after the vote.
         Raises:
@@ -294,8 +294,8 @@ class LiftedRun:
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
         >>> rows = run.export(folder / "cloud.ply")
-        >>> labelled = run.transfer(folder / "cloud.ply", folder / "red.ply", run.ask("red"), coordinates="scene")
-        >>> labelled.points == len(rows), labelled.share  # every point is a Gaussian
+        >>> labeled = run.transfer(folder / "cloud.ply", folder / "red.ply", run.ask("red"), coordinates="scene")
+        >>> labeled.points == len(rows), labeled.share  # every point is a Gaussian
         (True, 1.0)
         """
         answer, path = _answer_of(part), check_path("path", path)
@@ -501,9 +501,6 @@ def load_field(
 def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
     """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
     return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
-
-
-# Opening.
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:

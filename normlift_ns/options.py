@@ -626,14 +626,14 @@ class AskOptions:
     """
 
     negatives: tuple[str, ...] | None = None
-    """Negative prompts to compare with. Default: set by the encoder. Networks use LERF's (object, things, stuff,
-    texture), colour uses none."""
+    """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
+    texture). colour: none."""
     rule: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. cosine: the cosine itself. lerf: the softmax against each negative, at its minimum. margin:
     the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
-    relevancies. Default: set by the encoder (0.5 for colour), else 0.5 for lerf, 0.02 for margin and auto for
+    relevancies. Default: set by the encoder (colour: 0.5), else 0.5 for lerf, 0.02 for margin and auto for
     cosine."""
     min_reliability: float = 0.0
     """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""

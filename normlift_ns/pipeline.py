@@ -76,7 +76,7 @@ def lift_scene(
         cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: device for rasterizing, lifting and voting.
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
-        export: where to also write the 2D features, in LangSplat's format.
+        export: LangSplat files to also write the 2D features to; None: none.
         report: called with the progress.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option does not fit, which the message names, or no
@@ -324,9 +324,6 @@ def lift_provenance(
 def with_cost(field: SemanticField, stages: StageTimer, device: str) -> SemanticField:
     """Return a field whose manifest records the time and memory of the lift."""
     return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
-
-
-# Warm-up of kernels in the background, while images are read and networks process them.
 
 
 def start_kernel_warm_up(

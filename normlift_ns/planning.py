@@ -322,9 +322,6 @@ def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions)
     return {"consensus": sampled, "lift": float(evidence.nnz * times), **others}
 
 
-# Diagnostics of a capture and a machine: one row per check, with its state (ok, warning or error) and advice.
-
-
 DiagnosticState = Literal["ok", "warning", "error"]
 _PROJECTED_GAUSSIANS = 100_000
 """Number of Gaussians that are projected into the cameras."""

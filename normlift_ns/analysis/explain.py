@@ -123,7 +123,7 @@ class Why:
 
     @property
     def words(self) -> str:
-        """How well the images agree, and the effective number of images, as English sentences.
+        """Agreement of the images and their effective number, as English sentences.
 
         >>> Why(5, 0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
@@ -236,9 +236,6 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
     return tuple(votes)
 
 
-# Outlines of regions in an image.
-
-
 _LINE_COLOR = (255, 176, 0)
 """Orange, which contrasts with the dark rim for people with any color vision."""
 _OUTSIDE_BRIGHTNESS = 0.45
@@ -344,7 +341,7 @@ class RecordedVotes:
         """Yield the image of each vote, with outlines of the regions that voted; images are read one at a time.
 
         Raises:
-            FileNotFoundError: an image does not exist any more.
+            FileNotFoundError: an image no longer exists.
             ValueError: an image has changed, or the cache no longer holds its regions. Features passed from Python
                 always raise this error, because no file has their regions.
         """

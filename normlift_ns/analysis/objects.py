@@ -1,4 +1,4 @@
-"""Objects in a selection: boxes, connected components, instances, the catalogue of all objects, and floaters."""
+"""Objects in a selection: boxes, connected components, instances, the catalog of all objects, and floaters."""
 
 from __future__ import annotations
 
@@ -26,9 +26,6 @@ from normlift_ns.io.atomic import atomic_files
 from normlift_ns.options import CATALOG_FILES, FLOATER_THRESHOLD, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, check_number
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
-
-# Oriented bounding boxes of Gaussian centers that are robust to outliers.
-
 
 BOX_QUANTILES = (0.01, 0.99)
 """Quantiles of the points along each axis that bound a box."""
@@ -234,9 +231,6 @@ def connected_components(
     return labels.to(means.device)
 
 
-# Assignment of each Gaussian to at most one class and one object, for exports to other tools.
-
-
 @dataclass(frozen=True, eq=False)
 class Instances:
     """Class and object of every Gaussian: classes are prompts, objects are connected components of a class."""
@@ -322,9 +316,6 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
         objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
         tables.append({"text": text, "class_id": number, **found, "objects": objects})
     return tables
-
-
-# Catalogue of objects: position, size and reliability of each, and the images that show it.
 
 
 MIN_VIEW_SHARE = 0.1
@@ -424,7 +415,7 @@ def make_catalogue(
     metres_per_unit: float | None = None,
     device: str = "cpu",
 ) -> Catalogue:
-    """Summarize every object in a catalogue.
+    """Summarize every object in a catalog.
 
     Args:
         capture: transform from the coordinates of the scene to those of the capture.
@@ -501,18 +492,15 @@ def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = Non
     return Placement(np.average(points, axis=0, weights=weight), high - low, box or oriented_box(points))
 
 
-# Export of a catalogue as JSON, as a CSV table, and as box meshes for mesh viewers.
-
-
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Corner indices of each face of a box, counterclockwise as seen from outside."""
 _GOLDEN_RATIO = 0.618033988749895
 
 
 def write_catalogue(
-    catalogue: Catalogue, folder: Path, *, question: Mapping[str, Any] | None = None, overwrite: bool = False
+    catalog: Catalogue, folder: Path, *, question: Mapping[str, Any] | None = None, overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Write the files of a catalogue, all or none, and return their paths.
+    """Write the files of a catalog, all or none, and return their paths.
 
     The files are objects.json, objects.csv, objects.ply (boxes in the coordinates of the capture) and
     objects_scene.ply (boxes in the coordinates of the Gaussians). docs/objects.md explains them.
@@ -524,25 +512,25 @@ def write_catalogue(
         OSError: a file cannot be written.
     """
     files = tuple(folder / name for name in CATALOG_FILES)
-    document = {**catalogue_to_json(catalogue), **(question or {})}
+    document = {**catalogue_to_json(catalog), **(question or {})}
     with atomic_files(*files, overwrite=overwrite) as drafts:
         drafts[0].write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", "utf8")
         with drafts[1].open("w", newline="", encoding="utf8") as file:
             table = csv.writer(file)
             table.writerow(csv_columns())
-            table.writerows(csv_rows(catalogue))
-        write_box_mesh(drafts[2], catalogue.objects, [item.capture.box for item in catalogue.objects])
-        write_box_mesh(drafts[3], catalogue.objects, [item.scene.box for item in catalogue.objects])
+            table.writerows(csv_rows(catalog))
+        write_box_mesh(drafts[2], catalog.objects, [item.capture.box for item in catalog.objects])
+        write_box_mesh(drafts[3], catalog.objects, [item.scene.box for item in catalog.objects])
     return files
 
 
-def catalogue_to_json(catalogue: Catalogue) -> dict[str, Any]:
-    """Return a catalogue as plain Python types."""
+def catalogue_to_json(catalog: Catalogue) -> dict[str, Any]:
+    """Return a catalog as plain Python types."""
     return {
-        "unit": catalogue.unit,
-        "metres_per_unit": catalogue.meters_per_unit,
-        "in_smaller_parts": catalogue.num_in_small_components,
-        "objects": [asdict(item, dict_factory=_plain) for item in catalogue.objects],
+        "unit": catalog.unit,
+        "metres_per_unit": catalog.meters_per_unit,
+        "in_smaller_parts": catalog.num_in_small_components,
+        "objects": [asdict(item, dict_factory=_plain) for item in catalog.objects],
     }
 
 
@@ -572,9 +560,9 @@ _PLACE_COLUMNS = (
 )
 
 
-def csv_rows(catalogue: Catalogue) -> Iterator[list[Any]]:
+def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
     """Yield the rows of the CSV table."""
-    for item in catalogue.objects:
+    for item in catalog.objects:
         best = [*item.best_views, *[""] * (MAX_BEST_VIEWS - len(item.best_views))]
         places = [(x.centroid, x.extent, x.box.center, x.box.size, *x.box.axes) for x in (item.capture, item.scene)]
         numbers = np.array(places).ravel().tolist()

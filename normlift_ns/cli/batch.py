@@ -178,9 +178,6 @@ def _run_dir(command: NormLift, timestamp: str) -> Path | None:
     return None
 
 
-# Shards of a capture list: the part of a numbered worker.
-
-
 _MAX_SHARDS = 10**6
 _TASK_ID, _TASK_COUNT, _TASK_MIN, _TASK_STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
 
@@ -277,7 +274,7 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
 
 OutcomeState = Literal["done", "failed", "skipped"]
 _STATE_NAMES: dict[OutcomeState, str] = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
-"""Outcomes as words of messages."""
+"""Names of outcomes in messages."""
 
 
 @dataclass(frozen=True)
@@ -348,9 +345,6 @@ def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
     return ", ".join(f"{count} {word}" for state, word in _STATE_NAMES.items() if (count := states.count(state)) > 0)
 
 
-# Child processes that lift one capture each.
-
-
 LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
@@ -402,9 +396,6 @@ def failure_reason(code: int, log: Path) -> str:
     return last
 
 
-# Worker that lifts captures of a list, possibly alongside other workers.
-
-
 _CLAIMS, _LOGS = "claims", "logs"
 """Subfolders of the results folder."""
 
@@ -453,7 +444,7 @@ def lift_captures(
 
 
 def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
-    """Return whether a capture is lifted and has a result that says so."""
+    """Return whether a capture is lifted and its result is recorded."""
     outcome = outcomes.get(capture.key)
     if outcome is None or outcome.state == "failed":
         return False

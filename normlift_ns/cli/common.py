@@ -92,9 +92,6 @@ def _unboxed(stderr: str, program: str) -> str:
     return " ".join(part if part.endswith((".", ":", "--help")) else f"{part}." for part in parts if part)
 
 
-# Output flags of all commands: `--quiet` and `--log-file`.
-
-
 OUTPUT_FLAGS_HELP = (
     "Every command accepts --quiet (print results, warnings and errors, but no progress), --log-file FILE (append all "
     "output to this file, including the warnings of other packages) and --version."
@@ -197,9 +194,6 @@ def _output_errors() -> Iterator[None]:
         raise
     except OSError as error:
         raise OutputError(_OUTPUT_ERROR.format(error.strerror)) from error
-
-
-# Shared parts of the commands: flags and help, printing, warnings, exit codes.
 
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}

@@ -100,7 +100,7 @@ class Demo:
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
         write_text_file(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
-        info(f"Renders are in {renders}. To explore the room in the browser, type:")
+        info(f"Renders are in {renders}. To explore the room in the browser, run:")
         info(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
         return means
 

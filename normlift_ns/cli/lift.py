@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
-    """Join the processes that this one was started with, if any; only the first process prints. None: there are none.
+    """Join the other processes of the lift; only the first one prints. Yield None if there is only one process.
 
     Args:
         device: cpu, cuda or auto.
@@ -91,7 +91,7 @@ class NormLift:
     check: bool = True
     """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
     dry_run: bool = False
-    """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and what is cached. The
+    """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and cached views. The
     speed is measured on a few images."""
     data: Path | None = None
     """Current path of the dataset, if it was moved after training."""
@@ -339,7 +339,7 @@ def progress_bars() -> Iterator[ProgressCallback]:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print the stages of a plan with their seconds and what is cached, and a sentence about memory and disk."""
+    """Print the stages of a plan with their seconds and cached views, and a sentence about memory and disk."""
     table = Table("stage", title=f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}")
     table.add_column("seconds", justify="right")
     table.add_column("cached")

@@ -392,9 +392,6 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
         np.savez(file, names=np.array(result.question.texts), **arrays)
 
 
-# Tables of answers, and images of the votes for them.
-
-
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
     """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
     rule = f"{question.rule} > {question.threshold:.4g}"

@@ -32,7 +32,7 @@ class NormLiftView:
     port: int = 7008
     """Port to listen on, in 1..65535; if it is in use, the next free one."""
     share_readonly: bool = False
-    """Forbid visitors to store prompts in the run or to write files on this machine; their exports become browser
+    """Forbid visitors from storing prompts in the run or writing files on this machine; their exports become browser
     downloads."""
     most_drawn: int = 1_000_000
     """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values

@@ -15,7 +15,7 @@ Pixels without a region count as well. Otherwise, an object without a mask in so
 of its neighbors, because their frayed borders reach it. The part of s that lies in regions of view v is
 a_sv = sum_j p_js sum_{t in v} p_jt.
 
-The factor c_ts limits the influence of a region t that covers several objects. B tells regions of objects from the
+The factor c_ts limits the influence of a region t that covers several objects. B distinguishes regions of objects from
 cells of an arbitrary partition, whose overlaps only average neighboring cells. For example, a square of one grid and
 the best match in a randomly shifted copy of that grid share 9/16 of their area on average, which is J = 0.39.
 

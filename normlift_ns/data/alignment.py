@@ -131,7 +131,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     if match.psnr < MIN_PSNR:
         return (
             f"The splat reaches {match.psnr:.1f} dB on three training images; {MIN_PSNR:.0f} dB or more is usual. "
-            f"Expect equally inexact semantics. {causes}."
+            f"The semantics will be equally inexact. {causes}."
         )
     return None
 

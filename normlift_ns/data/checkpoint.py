@@ -1,4 +1,4 @@
-"""Checkpoints of nerfstudio and of gsplat, read without running what they contain."""
+"""Checkpoints of nerfstudio and of gsplat, read without running code from them."""
 
 from __future__ import annotations
 
@@ -290,9 +290,6 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
             f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device} that "
             "is not stored as a dense array. Expected plain tensors, as trainers save them; save the file again."
         )
-
-
-# Checkpoints of gsplat's simple_trainer.
 
 
 _RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")

@@ -30,9 +30,9 @@ class ImageHeader(NamedTuple):
     mode: str
     """Pillow's name of the pixel format."""
     rotated: bool
-    """Whether EXIF data ask viewers to rotate the image, which training ignores."""
+    """True if EXIF data ask viewers to rotate the image, which training ignores."""
     multi_frame: bool
-    """Whether the file holds several images; only the first is read."""
+    """True if the file holds several images; only the first is read."""
 
 
 def read_image_header(file: Path) -> ImageHeader:
@@ -120,9 +120,6 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
     return tuple(warnings)
 
 
-# Images and cameras as camera files describe them.
-
-
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a rotation from orthonormal, because files round."""
@@ -159,7 +156,7 @@ class Intrinsics(NamedTuple):
 
     @property
     def is_distorted(self) -> bool:
-        """Whether a distortion parameter is not zero."""
+        """True if a distortion parameter is not zero."""
         return any(self[6:12])
 
     def resized(self, width: int, height: int) -> Intrinsics:
@@ -177,8 +174,7 @@ class WorldTransform(NamedTuple):
     """Rotation and translation."""
     scale: float
     float32: bool = False
-    """Whether to compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its
-    training."""
+    """Compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its training."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +242,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}, the first is "
+            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}; the first is "
             f"{missing[0]}. Put them back, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]

@@ -97,9 +97,6 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
     return matches
 
 
-# Undistorted images, as splats are trained on them, with their pinhole cameras.
-
-
 def to_camera(
     camera_to_world: Float[Tensor, "3 4"], intrinsics: Float[Tensor, "3 3"], width: int, height: int
 ) -> Camera:
@@ -148,7 +145,7 @@ class SplitViews:
     """
 
     _LISTED_IN, _ADVICE, _TRAINED = "the dataset", "give the path of the dataset with --data", "run"
-    """For messages: what lists the images, the alternative to restoring one, and what was trained with them."""
+    """Phrases for messages: the list of images, the alternative to restoring one, and the output of the training."""
 
     def __init__(
         self,
@@ -363,7 +360,7 @@ def undistort_image(
         pixels, pinhole, (x, y) = _undistorted_fisheye(image, lens) if lens.fisheye else _undistorted(image, lens)
     except (InputError, cv2.error, ValueError) as error:
         parameters = [*lens[6:9], lens.k4, lens.p1, lens.p2]
-        raise InputError(f"its distortion {parameters} cannot be undistorted ({error})") from error
+        raise InputError(f"its distortion {parameters} cannot be removed ({error})") from error
     fx, fy = pinhole[0, 0], pinhole[1, 1]
     return pixels, np.array([[fx, 0, pinhole[0, 2] - x + 0.5], [0, fy, pinhole[1, 2] - y + 0.5], [0, 0, 1]])
 

@@ -40,9 +40,6 @@ BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white":
 _MIN_POINTS, _PARALLEL = 4, 1e-6
 
 
-# Camera files: COLMAP projects and transforms.json.
-
-
 def read_camera_file(options: SplatOptions, advice: str = "give the folder of the images with --images") -> CameraFile:
     """Read the camera file that the options name, and check that its images exist.
 
@@ -72,9 +69,6 @@ def read_camera_file(options: SplatOptions, advice: str = "give the folder of th
     return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
 
 
-# Splats with their images.
-
-
 @dataclass(frozen=True)
 class SplatScene:
     """A `Scene` made from a splat and its images, without a nerfstudio run."""
@@ -97,7 +91,7 @@ class SplatScene:
     """Warnings about the images, in whole sentences."""
 
     renderer = None
-    """No renderer of its own: `normlift_ns` renders the scene."""
+    """None, because `normlift_ns` renders the scene."""
     has_harmonics = True
 
     @property
@@ -325,7 +319,7 @@ def _adjust_poses(
     trained = [frame for frame in frames if frame.name not in held_out]
     if len(trained) != len(deltas):
         without_eighth = len(frames) - len(range(0, len(frames), 8))
-        hint = " The trainer holds out every eighth: give --test-every 8." if len(deltas) == without_eighth else ""
+        hint = " The trainer holds out every 8th image: give --test-every 8." if len(deltas) == without_eighth else ""
         raise InputError(
             f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
             f"{len(frames)} images are training views. Give the held-out images with --test-every or --holdout.{hint}"
@@ -362,9 +356,9 @@ def _assumptions(
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")
     texts.append(
-        "Weights are gsplat's, by the rules of --gsplat-rules (1.4 by default), where a Gaussian covers at most 0.999 "
-        "of a pixel. With the rules of 1.6 it is 0.99, as in Inria's trainer. Inria's trainer puts the principal point "
-        "in the middle. Images with distortion are undistorted as in ns-train."
+        "Weights are computed as in gsplat, in the version of --gsplat-rules (default: 1.4). Versions before 1.6 cap "
+        "the opacity of a Gaussian in a pixel at 0.999, version 1.6 and Inria's trainer at 0.99. Inria's trainer "
+        "assumes the principal point in the middle of the image. Distorted images are undistorted as in ns-train."
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"
@@ -377,9 +371,6 @@ def _assumptions(
         if unused > 0:
             texts.append(f"{unused} files in {folder} have no camera and are skipped.")
     return texts
-
-
-# Splat and cameras stored in a lifted run, which open it again without the original files.
 
 
 SPLAT_FILE, TRANSFORMS_FILE, CHECKPOINT_DIR = "splat.json", "transforms.json", "nerfstudio_models"

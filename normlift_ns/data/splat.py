@@ -159,10 +159,7 @@ class SplatFile(NamedTuple):
     pose_adjust: Float[Tensor, "v 9"] | None = None
     """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
     by_gsplat: bool = False
-    """Whether gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
-
-
-# Splats in PLY files written by Inria's trainer, gsplat, ns-export or this package.
+    """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
 
 
 _MAX_HEADER_BYTES = 2**20

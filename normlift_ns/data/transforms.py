@@ -179,9 +179,6 @@ def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:
     return [(name, value) for name in names if (value := getattr(entry, name)) is not None]
 
 
-# Cameras in transforms.json, the format of nerfstudio, instant-ngp and Blender's synthetic scenes.
-
-
 _MIN_DETERMINANT = 1e-6
 
 
@@ -287,7 +284,7 @@ def _masks(
     missing = [name for name, file in zip(names, files) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} masks that {path} lists are missing, the first is "
+            f"{len(missing)} of the {len(names)} masks that {path} lists are missing; the first is "
             f"{root / missing[0]}. Put them back, or next to the images if those were moved."
         )
     return [file.absolute() for file in files if file is not None]
@@ -383,9 +380,6 @@ def _entry(frame: Frame) -> dict[str, Any]:
     numbers = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2"), camera))
     mask = {} if frame.mask is None else {"mask_path": str(frame.mask)}
     return {"file_path": str(frame.file), **mask, **numbers, "transform_matrix": pose}
-
-
-# Transforms from the world of the cameras to the world of the splat.
 
 
 _TOLERANCE = 1e-3

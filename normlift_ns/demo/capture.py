@@ -124,9 +124,6 @@ def _opengl_pose(camera: Camera) -> Float[Tensor, "4 4"]:
     return camera.world_to_camera.double().inverse() * torch.tensor([1, -1, -1, 1], dtype=torch.float64)
 
 
-# The demo room as a splatfacto run, written by nerfstudio's own trainer without training.
-
-
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
     """Write output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
 

@@ -361,7 +361,7 @@ def banded(tones: Callable[[Array], Array], tint: tuple[float, float, float]) ->
 _TABLE = 0.62
 """Height of the table top in meters."""
 _EXPOSURE = 0.8
-"""Share of each part's surface that is no brighter than the color of its name."""
+"""Share of each part's surface that is not brighter than the color of its name."""
 _ROUGHNESS = 0.012
 """Standard deviation of a random factor on every color."""
 _DETAILED_AREA = 130.0

@@ -410,9 +410,6 @@ def resize_image(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Floa
     )
 
 
-# Precomputed features: label maps and vectors from memory.
-
-
 @dataclass(frozen=True)
 class PrecomputedFeatures:
     """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings, on the CPU."""

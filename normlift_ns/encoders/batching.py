@@ -49,9 +49,6 @@ def prefetch_map(function: Callable[[_Item], _Result], items: Iterable[_Item], t
             pool.shutdown(cancel_futures=True)
 
 
-# Batched computation that adapts to the available GPU memory.
-
-
 _ADVICE = (
     "close other programs that use the GPU, use a smaller model, downscale the images (--lift-downscale 2), or lift on "
     "the CPU: --device cpu"

@@ -54,7 +54,7 @@ class _Cached:
     inner: Any
     """Computes the results."""
     folder: Path
-    """Contains one safetensors file per image, and per level if an encoder computes them; created if it does not
+    """Folder with one safetensors file per image, and per level if an encoder computes them; created if it does not
     exist."""
     compute: bool = True
     """See `cached`."""
@@ -171,8 +171,8 @@ class CachedTextMasks:
     """A folder, or a name on the hub."""
     device: str
     folder: Path
-    """Contains one safetensors file per image and text; created if it does not exist. If the folder cannot be written
-    to, nothing is cached."""
+    """Folder with one safetensors file per image and text, created if it does not exist. If it is not writable, nothing
+    is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
         """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.segment`."""

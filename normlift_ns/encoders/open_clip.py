@@ -65,7 +65,7 @@ def missing_patches_reason(model: str) -> str | None:
     """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
     vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
     if "timm_model_name" in vision:
-        return "its image encoder is timm's"
+        return "its image encoder comes from timm"
     if not isinstance(vision.get("layers"), int):
         return "its image encoder is a convolutional network"
     return "it pools by attention" if vision.get("attentional_pool") else None
@@ -77,9 +77,6 @@ def _folder() -> Path:
     if spec is None or spec.origin is None:
         raise InputError("open_clip is not installed (pip install open_clip_torch); --encoder colour works without it")
     return Path(spec.origin).parent
-
-
-# Lookup of OpenCLIP weights: a local file, the local cache, or a download.
 
 
 OPEN_CLIP_REMEDY = (
@@ -206,7 +203,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
         return path, published
     origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
     problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
-    remedy = f"go online once, {OPEN_CLIP_REMEDY}"
+    remedy = f"connect to the internet once, {OPEN_CLIP_REMEDY}"
     with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
         return _download(published), published
 

@@ -92,8 +92,8 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     with third_party_errors(
         f"the tokenizer of OpenCLIP model {model} cannot be loaded",
-        f"go online once, use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that "
-        "needs none: --encoder colour",
+        "connect to the internet once, use a model with OpenCLIP's own tokenizer such as "
+        f"{DEFAULT_MODEL}, or use the encoder that needs none: --encoder colour",
         FileNotFoundError,
     ):
         tokenizer = open_clip.get_tokenizer(model)

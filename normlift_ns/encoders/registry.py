@@ -65,9 +65,6 @@ class EncoderKind:
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
 
-# The built-in encoders.
-
-
 _DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
 """Prefixes of weight identities that are digests of file contents rather than tags."""
 
@@ -115,7 +112,7 @@ def _check_unchanged(pretrained: str, expected: object) -> None:
     if path.is_file():
         identity = file_digest(path, compare_to=expected)
     elif expected.startswith(_DIGEST_PREFIXES) and os.path.lexists(path):
-        raise InputError(f"weight file {path}, which the run was lifted with, is not a file anymore; {remedy}")
+        raise InputError(f"weight file {path}, which the run was lifted with, is no longer a file; {remedy}")
     elif expected.startswith(_DIGEST_PREFIXES):
         raise FileNotFoundError(f"weight file {path}, which the run was lifted with, does not exist; {remedy}")
     if identity != expected:
@@ -134,7 +131,7 @@ def _check_weights(options: SourceOptions) -> None:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
     if open_clip.has_local_clip_weights(model, pretrained) is False:
         problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
-        with third_party_errors(problem, f"go online once, {remedy}", FileNotFoundError):
+        with third_party_errors(problem, f"connect to the internet once, {remedy}", FileNotFoundError):
             check_hub_access()
 
 
@@ -174,9 +171,6 @@ def _make_kind(family: ModelFamily) -> EncoderKind:
 SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))
 
 
-# Registration of `--encoder colour`, without torch.
-
-
 def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
 
@@ -187,9 +181,6 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
 
 COLOR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_make_color_encoder, learned=False)
 """Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""
-
-
-# Encoders by name.
 
 
 ENCODERS = Registry(

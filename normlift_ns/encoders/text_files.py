@@ -113,11 +113,8 @@ def prompt_templates(template: str) -> Sequence[Callable[[str], str]]:
     return [lambda text: template.replace("{}", text)]
 
 
-# Text embeddings in a file, for features whose text encoder is not available.
-
-
 _MAX_VECTOR_BYTES, _MAX_FILE_BYTES = 2**20, 2**30
-"""In bytes; a small archive can decompress to any number of equal bytes."""
+"""Limits in bytes, because a small archive can decompress to any number of equal bytes."""
 _COMMENT_PREFIX = b"normlift_ns "
 """Prefix of the comment of archives that this package writes; the digest follows. NumPy's archives have no comment."""
 
@@ -256,9 +253,6 @@ def _digest_comment(vectors: Mapping[str, np.ndarray]) -> bytes:
     return _COMMENT_PREFIX + array_digest(vectors, {}).encode()
 
 
-# A cache of text embeddings: prompts that were encoded before need neither the network nor torch.
-
-
 CACHE_FORMAT = "normlift_ns.encoders/3"
 """Part of every cache key; to be increased when labels or features change for the same settings."""
 _ARRAY = "text"
@@ -281,8 +275,8 @@ class CachedTextEncoder(LazyTextEncoder):
     make_encoder: Callable[[], TextEncoder]
     """Makes the encoder; called only for texts that are not cached."""
     folder: Path | None
-    """Contains one safetensors file per text; created if it does not exist. If the folder is None or cannot be written
-    to, nothing is cached."""
+    """Folder with one safetensors file per text, created if it does not exist. If it is None or not writable, nothing
+    is cached."""
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt.

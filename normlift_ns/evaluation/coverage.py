@@ -36,9 +36,6 @@ from normlift_ns.options import RasterizeMode, check_number, check_path
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
-# Images of a scene: which were lifted, and why others were not.
-
-
 LeftOutReason = Literal["max_views", "no features", "held out"]
 MAX_IMAGES = 256
 """Maximum number of lifted images, and of other images, that are examined."""
@@ -576,7 +573,7 @@ def suggest_poses(
 
     @cache
     def accept(view: int) -> bool:
-        """Whether a view shows a region, and all but a few pixels are not too near."""
+        """Return whether a view shows a region, with all but a few pixels far enough from the camera."""
         if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
             return False
         depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()
@@ -682,9 +679,6 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     for axes in (left, right):
         axes.set(xticks=[], yticks=[])
     figure.savefig(path)
-
-
-# Coverage study of a lifted run. Read this module first.
 
 
 RELIABLE = 0.5

@@ -130,9 +130,6 @@ def _reject_constant(text: str) -> float:
     raise InputError(f"{text} is not a valid JSON number")
 
 
-# Results of an evaluation, in the JSON format of ns-eval.
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """Metrics of one protocol over one or several runs."""

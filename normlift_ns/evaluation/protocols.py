@@ -149,9 +149,6 @@ def evaluate_masks(
     return Evaluation(results, rows, {"protocol": "masks", **settings})
 
 
-# Lifted runs, as all protocols evaluate them.
-
-
 _CHANNELS = 64
 """Number of feature channels that are composited together."""
 

@@ -444,9 +444,6 @@ def make_figure(size: tuple[float, float], rows: int, columns: int, **options: A
     return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
 
 
-# Further studies of lifted runs: ablation, parameter sweeps, signals of R, comparison with other methods, timing.
-
-
 Evaluate = Callable[[Iterable[EvaluatedRun]], Evaluation]
 Row = Mapping[str, Any]
 

@@ -247,7 +247,7 @@ def _check_npy(file: IO[bytes]) -> None:
         kind = "objects" if dtype.hasobject else str(dtype)[:80]
         raise InputError(f"it holds {kind}; expected integers or floats")
     if len(shape) > 8 or min(shape, default=0) < 0 or math.prod(length or 1 for length in shape) > _MAX_NUMBERS:
-        raise InputError("its header has an invalid shape: too many lengths, or lengths that are negative or too large")
+        raise InputError("its header has an invalid shape: too many dimensions, or negative or too large sizes")
     start, expected = file.tell(), math.prod(shape) * dtype.itemsize
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:

@@ -138,7 +138,7 @@ class NormLiftModel(SplatfactoModel):
         self.normlift.close()
 
     def show(self, display: Display | None) -> None:
-        """Replace what is rendered in addition to the colors. Safe to call while another thread renders."""
+        """Replace the display that is rendered in addition to the colors. Safe to call while another thread renders."""
         self._display = display
 
     @torch.no_grad()

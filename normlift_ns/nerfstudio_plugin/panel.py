@@ -1,4 +1,4 @@
-"""Search panel in the nerfstudio viewer: its widgets, what they show, and what they do to the history of states."""
+"""Search panel in the nerfstudio viewer: its widgets, their contents, and their effect on the history of states."""
 
 from __future__ import annotations
 
@@ -131,9 +131,6 @@ class ClickListener:
         self._hit(armed[0], torch.tensor(event.ray_origin) / VISER_SCALE, torch.tensor(event.ray_direction))
 
 
-# Status text of the panel as MDX, which the viewer compiles.
-
-
 _MAX_TABLE_ROWS = 8
 
 
@@ -205,7 +202,7 @@ class PanelHost(Protocol):
     """Interface of the model that the panel uses."""
 
     def show(self, display: Display | None) -> None:
-        """Replace what is rendered in addition to the colors."""
+        """Replace the display that is rendered in addition to the colors."""
         ...
 
     def ray_weights(self, origin: Tensor, direction: Tensor) -> Tensor:
@@ -267,23 +264,23 @@ class PanelWidgets:
         self._lock = lock
         self._values: dict[str, Any] = {}
         with add_first_tab(server.gui, TAB_LABEL, "SEARCH"):
-            self.prompts = self._gui.add_text("Prompts", "", hint="What to look for, separated by commas.")
-            self.ask = self._button("Ask", hint="Or press Enter in the prompts.")
-            self.cancel = self._button("Cancel", hint="Or press Escape. Stops a query or a pending click.")
+            self.prompts = self._gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
+            self.ask = self._button("Ask", hint="Or press Enter in the Prompts field.")
+            self.cancel = self._button("Cancel", hint="Stop the query or the pending click, as Escape does.")
             self.cancel.visible = False
             self.status = self._gui.add_markdown("")
-            self.remove_weak = self._button("Leave out what is poorly evidenced")
+            self.remove_weak = self._button("Leave out Gaussians with weak evidence")
             self.remove_weak.visible = False
             self._group("History", ("Undo", "Redo", "Clear"))
             self.threshold = self._slider(
                 "Threshold", MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5, "Relevancy above which Gaussians are selected."
             )
             self.reliability = self._slider(
-                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "Reliability R that selected Gaussians must have."
+                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "Minimum reliability R of selected Gaussians."
             )
-            self._button("Suggested", hint="Use the threshold that the histogram suggests, its dashed line.")
+            self._button("Suggested", hint="Use the threshold suggested by the histogram (dashed line).")
             self._group("Selection", ("Hide", "Only", "All"))
-            self._button("Select likely floaters", hint="Gaussians of no surface. Check them, then hide them.")
+            self._button("Select likely floaters", hint="Gaussians that lie on no surface. Check, then hide them.")
             self.prompt_table = self._gui.add_markdown("")
             self.histograms = self._gui.add_markdown("")
             self.rows = ObjectRows(self._gui, lambda action, row, event: act(action, row, event.client))
@@ -299,17 +296,17 @@ class PanelWidgets:
                     "Grow", -MAX_GROW_STEPS, MAX_GROW_STEPS, 1, 0, "Grow or shrink the selection, from part to whole."
                 )
             with self._gui.add_folder("Keep"):
-                self._button("Download selection", hint="The selected Gaussians as a PLY file.")
+                self._button("Download selection", hint="Download the selected Gaussians as a PLY file.")
                 self._button("Save prompts in run", hint="Add them to the stored prompts; ns-render draws them.")
                 self.replace = self._button("Replace the saved prompts")
                 self.replace.visible = False
             with self._gui.add_folder("How it is asked and drawn", expand_by_default=False):
                 self.shown = self._input(
                     "shown",
-                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects."),
+                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt to show."),
                 )
                 self.colormap = self._input(
-                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
+                    "colormap", self._gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
                 )
                 hint = "Prompts to compare with, separated by commas."
                 self.negatives = self._gui.add_text("Negatives", "", hint=hint)
@@ -401,9 +398,6 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
     return tab
 
 
-# Details of an answer in the panel: objects, histograms, and the training images behind it.
-
-
 _DELAY = 0.1
 """Seconds without a change before the details are computed."""
 
@@ -478,7 +472,7 @@ _ACTIONS = {
     "Only": actions.show_only,
     "All": actions.show_all,
     "Suggested": actions.use_suggested_threshold,
-    "Leave out what is poorly evidenced": actions.remove_weak,
+    "Leave out Gaussians with weak evidence": actions.remove_weak,
 }
 _SLIDERS = {
     "Threshold": actions.set_threshold,
@@ -655,7 +649,7 @@ class SearchPanel(torch.nn.Module):
             raise InputError("Nothing is selected; there is nothing to download.")
         splat, state = self._host[0].splat_parameters(), cast(State, self.state)
         if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
-            raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
+            raise InputError("All selected Gaussians are invisible (opacity below 1/255): nothing to download.")
         name = f"{safe_file_name(stem)}.ply"
         with tempfile.TemporaryDirectory() as folder:
             rows = write_splat_ply(Path(folder) / name, splat, state.space.field, state.answer, keep=mask)
@@ -718,7 +712,7 @@ class SearchPanel(torch.nn.Module):
             return build_query(field, prompts, encode, negatives=split_prompts(negatives), **options)
 
     def _stored_query(self) -> Query | None:
-        """The query stored in the run; None if it stores none."""
+        """Return the query stored in the run; None if it stores none."""
         return None if self._folder is None else load_query(self._folder)
 
     def _select_floaters(self, token: RequestToken) -> None:
@@ -766,7 +760,7 @@ class SearchPanel(torch.nn.Module):
             self.show_message(describe_error(error)[0])
 
     def _save(self, state: State, *, replaces: bool) -> None:
-        """Store the prompts of a state in the run, beside or instead of those stored there."""
+        """Store the prompts of a state in the run, in addition to those stored there or instead of them."""
         try:
             if state.query is None or self._folder is None:
                 raise InputError("No query yet; there is nothing to save.")

@@ -63,7 +63,7 @@ class NormLiftPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return splatfacto's callbacks and the lift, after checking what the lift needs.
+        """Return splatfacto's callbacks and the lift, after checking the requirements of the lift.
 
         Raises:
             ValueError, FileNotFoundError: the encoder or a query cannot be used.

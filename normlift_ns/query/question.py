@@ -154,12 +154,12 @@ def save_query(folder: Path, question: Query) -> Path:
 
     Raises:
         ValueError: `load_query` would raise an error for this query.
-        FileNotFoundError: the folder does not exist any more.
+        FileNotFoundError: the folder no longer exists.
         OSError: the file cannot be written.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"{folder} does not exist any more, so nothing was stored: the run was moved or deleted while it was open. "
+            f"{folder} no longer exists, so nothing was stored: the run was moved or deleted while it was open. "
             "Open it again at its new path"
         )
     if question.suggest_threshold:

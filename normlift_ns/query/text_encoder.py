@@ -96,7 +96,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         cache: folder that caches embeddings computed by a network.
     Raises:
         ValueError: the manifest names no known encoder, or the weights or text embeddings are not those of the lift.
-        FileNotFoundError: the weights or text embeddings do not exist any more.
+        FileNotFoundError: the weights or text embeddings no longer exist.
     """
     options = _options(field)
     if options.text_vectors is not None:
@@ -168,7 +168,7 @@ def _check_vectors(path: Path, expected: object) -> None:
         "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
-        raise InputError(f"the run's file of text vectors {path} is not a regular file any more; {remedy}")
+        raise InputError(f"the run's file of text vectors {path} is no longer a regular file; {remedy}")
     if not path.is_file():
         raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
     if isinstance(expected, str) and (actual := TextEmbeddingFile(path).identity["content"]) != expected:

@@ -359,9 +359,6 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
     return max(high, UNLABELED) + 1 if count is None else count
 
 
-# Contributing Gaussians of pixels, with their compositing weights.
-
-
 class Contributors(NamedTuple):
     """Gaussians that contribute to P pixels: entries offsets[p] to offsets[p + 1] belong to pixel p, nearest first.
 

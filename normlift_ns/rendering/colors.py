@@ -121,9 +121,6 @@ def _candidates() -> tuple[tuple[float, ...], ...]:
     return (*okabe_ito, *(colorsys.hsv_to_rgb((i * 0.618034) % 1, *tones[i % 4]) for i in range(160)))
 
 
-# Colors of prompts as tuples, the same in every viewer and figure.
-
-
 RGB = tuple[float, float, float]
 """RGB in 0..1."""
 

@@ -72,7 +72,7 @@ class Display:
     drawn: Bool[Tensor, " n"] | None = None
     """Gaussians that are drawn at all; None: all."""
     by_hand: bool = False
-    """Whether the selection was made by hand, in which case the overlay has a single color."""
+    """True if the selection was made by hand; the overlay then has a single color."""
 
     @property
     def num_prompts(self) -> int:
@@ -292,7 +292,7 @@ class FigureHeader:
     summary: str
     """Size of the selection and strength of its evidence."""
     absent: bool = False
-    """Whether the prompt is probably not in the scene."""
+    """True if the prompt is probably not in the scene."""
 
     @property
     def title(self) -> str:
@@ -492,7 +492,7 @@ def _overlays(
 
 
 def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
-    """Return the training image of a view, or None if it cannot be read any more."""
+    """Return the training image of a view, or None if it can no longer be read."""
     names = unique_file_names(list(scene.train.names))
     try:
         return scene.train[names.index(view)].image

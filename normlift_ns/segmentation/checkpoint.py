@@ -29,7 +29,7 @@ _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
 _MIN_TORCH = "2.6"
 _ALTERNATIVE = (
-    "the first SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
+    "the original SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
 )
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
@@ -133,7 +133,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
         )
     missing = sorted(map(str, [*report["missing_keys"], *report["mismatched_keys"]]))
     if len(missing) > 0:
-        raise InputError(f"{WEIGHTS_FILE} lacks {len(missing)} parameters, the first is {missing[0]}")
+        raise InputError(f"{WEIGHTS_FILE} lacks {len(missing)} parameters; the first is {missing[0]}")
     return model.eval().requires_grad_(False)
 
 
@@ -193,11 +193,11 @@ def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> 
 _REMEDIES = {
     "SAM": f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file "
     "such as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel",
-    "SAM 3": f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
-    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment",
+    "SAM 3": f"give --sam-model (in a lift) or --segment-model (in a query) a name such as {DEFAULT_SAM3}, or a folder "
+    "with config.json, model.safetensors and a tokenizer; or choose other --regions and omit --segment",
 }
-"""What to do about a checkpoint, by the name of the networks."""
-_FIRST = "the first SAM, ViT-B, -L or -H"
+"""Advice in messages about an unusable checkpoint, by the name of the networks."""
+_FIRST = "the original SAM, ViT-B, -L or -H"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
     "image_encoder.trunk.": "SAM 2",
@@ -320,7 +320,7 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
         return local
     title, files = _title(kinds), [WEIGHTS_FILE, *more]
     problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
-    with weights.third_party_errors(problem, f"go online once, or {_REMEDIES[title]}", FileNotFoundError):
+    with weights.third_party_errors(problem, f"connect to the internet once, or {_REMEDIES[title]}", FileNotFoundError):
         return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 

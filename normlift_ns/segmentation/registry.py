@@ -42,12 +42,9 @@ class MaskSource:
     check: Callable[[SourceOptions], None] = lambda options: None
     """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
     options: tuple[str, ...] = ()
-    """Those of `MASK_OPTIONS` that it takes."""
+    """Names from `MASK_OPTIONS` that the source accepts."""
     has_features: bool = False
     """True if `make` returns a `FeatureSource`, which needs no encoder of regions."""
-
-
-# The built-in mask sources.
 
 
 _COUNT, _PATCH_COUNT = 256, 1024
@@ -173,9 +170,6 @@ def _check_langsplat(options: SourceOptions) -> None:
 
 LANGSPLAT = MaskSource(_make_langsplat, _check_langsplat, MASK_OPTIONS, has_features=True)
 """Masks and features of LangSplat's preprocessing."""
-
-
-# Mask sources by name.
 
 
 MASK_SOURCES = Registry(

@@ -1,4 +1,4 @@
-"""Viewer-independent session: what a user asks, selects, hides and undoes in any viewer, without a browser.
+"""Viewer-independent session: prompts, selections, hidden Gaussians and undo, without a browser.
 
 Everything that is shown is an immutable `State`. Each action returns a new state, and a `History` is a list of states.
 A viewer keeps one `SelectionContext` per run, and one `History` per user::

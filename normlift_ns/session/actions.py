@@ -179,7 +179,7 @@ def set_min_reliability(state: State, value: float) -> State:
 def remove_weak(state: State) -> State:
     """Remove Gaussians with weak evidence from the selection, including those selected by clicks."""
     poor = state.selection & (state.space.field.scalars.reliability < WEAK_RELIABILITY)
-    return remove(state, poor, "Leave out what is poorly evidenced")
+    return remove(state, poor, "Leave out Gaussians with weak evidence")
 
 
 def show_prompt(state: State, shown: int | None) -> State:

@@ -1,4 +1,4 @@
-"""Objects of a selection: a row for each, with what a panel shows and what its buttons need."""
+"""Objects of a selection: a row for each, with the values and Gaussians for the buttons of a panel."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
     """
     texts, vectors = split_prompts(text), dict(known_vectors or {})
     if len(texts) == 0:
-        raise InputError("Type what to look for, then press Ask.")
+        raise InputError("Type a prompt, then press Ask.")
     if len(texts) > MAX_PROMPTS:
         raise InputError(f"{len(texts)} prompts were typed; ask at most {MAX_PROMPTS} at a time.")
     new, errors = [one for one in texts if one not in vectors], {}
@@ -138,7 +138,7 @@ def build_query(
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
     if len(clicks) == 0:
-        raise InputError(rows[0].error if len(rows) > 0 else "Type what to look for, then press Ask.")
+        raise InputError(rows[0].error if len(rows) > 0 else "Type a prompt, then press Ask.")
     if all(clicks):
         negatives, rule, threshold = (), "cosine", CLICK_THRESHOLD if threshold is None else threshold
     options = {"negatives": negatives, "rule": rule, "threshold": threshold}

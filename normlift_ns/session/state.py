@@ -113,9 +113,6 @@ class State:
         return replace(self)
 
 
-# Undo and redo: a list of immutable states.
-
-
 T = TypeVar("T")
 MAX_STATES = 100
 

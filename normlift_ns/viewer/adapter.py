@@ -78,8 +78,8 @@ SCRIPT = """
   };
 })();
 """
-"""For the head of the page. Without WebGL, three.js throws and React takes the whole page away, panel and all; so it
-gets a context that draws nothing. Panel, camera and clicks then work as ever, and pictures come from the server.
+"""Script for the head of the page. Without WebGL, three.js raises an error and React removes the whole page. The script
+therefore supplies a context that draws nothing. Panel, camera and clicks then work, and the server sends renders.
 """
 
 _PICTURE = """
@@ -99,7 +99,7 @@ _PICTURE = """
 
 
 def with_script(page: bytes) -> bytes:
-    """The page with the script before all others, and without viser's report of every visit to Google.
+    """Return the page with our script before all others, and without the script that reports visits to Google.
 
     >>> with_script(b"<html><head><title>")[:20]
     b'<html><head><script>'
@@ -113,15 +113,12 @@ def picture_script(jpeg: bytes) -> str:
     return _PICTURE.replace("CONTENT", base64.b64encode(jpeg).decode())
 
 
-# What viser's server serves: the files of its page with our script in it, and nothing else.
-
-
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Servers of viser that start within serve the files of its page only, with our script for browsers without WebGL
-    in it, and do not compress.
+    """Restrict viser servers that start in this context to the files of the page, which then contains our script for
+    browsers without WebGL, and disable compression.
 
-    By itself 0.2.7 serves every file that a path with .. leads to, and spends seconds on compressing colours.
+    Otherwise, 0.2.7 serves any file that a path with .. leads to, and spends seconds on compressing colors.
     """
     from viser.infra import _infra as known  # noqa: PLC0415
 
@@ -161,7 +158,7 @@ def guarded() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded_one() -> Iterator[None]:
-    """The same of viser 1.x, which lets nobody out of its folder and does not compress."""
+    """Do the same for viser 1.x, which already rejects paths outside its folder and does not compress."""
     from viser.infra import _infra  # noqa: PLC0415
 
     one: Any = _infra
@@ -214,16 +211,16 @@ _EDGES = (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
 _MODIFIERS = (None, "shift", "alt")
 """Modifier keys with which a click is handled."""
 _MAX_HOLDUP = 0.5
-"""Seconds that a message waits for the one before it, at most."""
+"""Maximum number of seconds that a message waits for the one before it."""
 _SCRIPT = """
 (() => {
-  const labelled = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
+  const labelOf = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
   const press = (text) => {
     const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
     if (found && !found.disabled) found.click();
   };
   const rowOf = (text) => {
-    let row = labelled(text);
+    let row = labelOf(text);
     while (row && !row.querySelector("input")) row = row.parentElement;
     return row;
   };
@@ -668,14 +665,11 @@ def _unpack_splats(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:
     }
 
 
-# The door of a viewer: it serves at once, before torch is imported and the run is read; pages wait meanwhile.
-
-
 OPENING = "Opening the run."
 
 
 class Door:
-    """A server whose pages wait until somebody takes them."""
+    """Server that accepts pages immediately, before torch is imported and the run is read; the pages wait meanwhile."""
 
     def __init__(self, host: str, port: int) -> None:
         self._lock, self._waiting = threading.Lock(), dict[int, BrowserPage]()
@@ -683,12 +677,12 @@ class Door:
         self.server = ViserServer(host, port, "normlift", self._come, self._go)
 
     def open(self, label: str, come: Callable[[BrowserPage], None], go: Callable[[int], None]) -> None:
-        """Gives away the pages that wait, and all that come.
+        """Pass on the waiting pages and all later ones.
 
         Args:
-            label: stands over the panel.
-            come: called for every page that comes.
-            go: called with the number of a page that is gone; it may not have come yet.
+            label: text above the panel.
+            come: called with every page that opens.
+            go: called with the number of every page that closes, even if `come` was not called with it.
         """
         self.server.label(label)
         with self._lock:

@@ -45,9 +45,6 @@ def color_swatch(color: Sequence[float]) -> str:
     return f'<span style={{{{color: "rgb({red},{green},{blue})"}}}}>■</span>'
 
 
-# List of found objects in a panel: a row with buttons for each object.
-
-
 MAX_OBJECT_ROWS = 8
 OBJECT_ACTIONS = ("go to", "only", "hide", "export")
 

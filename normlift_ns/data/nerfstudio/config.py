@@ -153,7 +153,7 @@ class RunLocation:
     data: Path
     """The dataset: a folder or a .json file."""
     data_moved: bool
-    """Whether `data` differs from the path in the config, read relative to `root`."""
+    """True if `data` differs from the path in the config, read relative to `root`."""
 
     @property
     def folder(self) -> Path:
@@ -493,7 +493,7 @@ _SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
     type(None): (lambda x: x is None, "null"),
 }
-"""Checks of values by their type hint, each with what it expects."""
+"""Checks of values by their type hint, each with a description of valid values."""
 
 
 def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
@@ -548,9 +548,6 @@ def check_lift_options(options: LiftOptions, name: str) -> None:
         LiftOptions(**vars(options))
     except ValueError as error:
         raise InputError(f"{name}: {error}. {_REMEDY}") from error
-
-
-# Safe reading of a nerfstudio run's config.yml, and changes of its paths.
 
 
 SUPPORTED_METHODS = (

@@ -40,9 +40,6 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
     return register
 
 
-# Mirrors of nerfstudio's configuration classes for datasets.
-
-
 @dataclass
 class PosedDataParserConfig:
     """Fields that the configs of nerfstudio's data parsers for posed images share."""
@@ -121,9 +118,6 @@ class FullImageDatamanagerConfig:
     fps_reset_every: int = 100
 
 
-# Mirrors of nerfstudio's configuration classes for optimizers and schedulers.
-
-
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
 @dataclass
 class OptimizerConfig:
@@ -186,9 +180,6 @@ class CosineDecaySchedulerConfig(SchedulerConfig):
     warm_up_end: int = 5000
     learning_rate_alpha: float = 0.05
     max_steps: int = 300000
-
-
-# Mirrors of nerfstudio's configuration classes for models, pipelines and the trainer.
 
 
 @_mirror("nerfstudio.utils.writer")

@@ -213,9 +213,6 @@ def _exp_se3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
     return transform
 
 
-# Dataset splits: images and cameras for training and evaluation.
-
-
 @dataclass(frozen=True)
 class DatasetSplit:
     """One split of a dataset: V image files and their cameras, before undistortion."""
@@ -301,11 +298,8 @@ def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarr
     listed = set(names)
     unknown = sorted(map(str, listed - set(files)))
     if unknown:
-        raise InputError(f"some filenames for split {split} were not found, the first is {unknown[0]}")
+        raise InputError(f"some filenames for split {split} were not found; the first is {unknown[0]}")
     return np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32)
-
-
-# Cameras and files of a dataset, bit-identical to those of nerfstudio's data parsers.
 
 
 MAX_AUTO_RESOLUTION = 1600

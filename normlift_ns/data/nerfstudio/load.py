@@ -76,7 +76,7 @@ class TrainedViews(SplitViews):
         distortion = [] if self._split.distortion is None else self._split.distortion[index].tolist()
         needed = _NUM_DISTORTION[kind]
         if any(distortion) and len(distortion) < needed:
-            raise InputError(f"its distortion {distortion} cannot be undistorted (expected {needed} parameters)")
+            raise InputError(f"its distortion {distortion} cannot be removed (expected {needed} parameters)")
         k1, k2, k3, k4, p1, p2 = [*distortion, *[0.0] * 6][:6]
         fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         width, height = self._sizes[index]
@@ -107,9 +107,6 @@ class TrainedViews(SplitViews):
 def camera_type_error(file: Path, kind: str) -> str:
     """Return the message about an image whose camera is of a type that splatfacto does not support."""
     return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
-
-
-# Trained splatfacto runs as a `Scene` of the core, without CUDA and without building a model.
 
 
 _TRANSFORM_TOLERANCE = 1e-3
@@ -161,7 +158,7 @@ class NerfstudioScene:
     Gaussians."""
 
     renderer = None
-    """No renderer of its own: `normlift_ns` renders the scene as splatfacto does."""
+    """None, because `normlift_ns` renders the scene as splatfacto does."""
 
     @property
     def name(self) -> str:
@@ -190,7 +187,7 @@ class NerfstudioScene:
 
     @property
     def has_harmonics(self) -> bool:
-        """Whether colors depend on the view."""
+        """True if colors depend on the view direction."""
         return self.model_config.sh_degree > 0
 
     @property
@@ -261,7 +258,7 @@ def load_nerfstudio_scene(
     missing = [file for file in files if not file.is_file()]
     if missing:  # found before a lift that takes minutes
         raise FileNotFoundError(
-            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing, the first is "
+            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing; the first is "
             f"{missing[0]}. Put them back, or give the path of the dataset with --data."
         )
     remarks = _check_transform(dataset.transform, dataset.scale, location)
