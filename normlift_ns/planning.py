@@ -41,10 +41,10 @@ from normlift_ns.evidence_collection import (
     evidence_keys,
     observe_views,
     sample_evenly,
+    views_in_cache,
 )
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
-from normlift_ns.rasterization.evidence_cache import views_in_cache
 
 # Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
 
