@@ -18,7 +18,6 @@ from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
-from normlift_ns.data.extra_images import EXTRA_IMAGES_FILE
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import (
     FullImageDatamanagerConfig,
@@ -28,7 +27,16 @@ from normlift_ns.data.nerfstudio.config_classes import (
     VanillaPipelineConfig,
 )
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatScene, save_splat, splatfacto_checkpoint
+from normlift_ns.data.open_scene import (
+    CHECKPOINT_DIR,
+    EXTRA_IMAGES_FILE,
+    TRANSFORMS_FILE,
+    SplatScene,
+    open_scene,
+    resolve_field_paths,
+    save_splat,
+    splatfacto_checkpoint,
+)
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.build import make_source, source_settings
@@ -47,7 +55,7 @@ from normlift_ns.io.run_dir import (
     run_directory,
     run_file_digests,
 )
-from normlift_ns.lifted_run import LiftedRun, open_scene, resolve_field_paths
+from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,
     LiftOptions,

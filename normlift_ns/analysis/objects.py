@@ -21,6 +21,7 @@ from normlift_ns.core.gaussians import MIN_OPACITY, Camera, GaussianScene
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.scene import Scene
+from normlift_ns.data.transforms import capture_transforms
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_files
 from normlift_ns.options import CATALOG_FILES, FLOATER_THRESHOLD, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, check_number
@@ -413,6 +414,18 @@ class Catalogue:
     def unit(self) -> str:
         """Unit of the `capture` positions."""
         return "capture unit" if self.meters_per_unit is None else "metre"
+
+
+def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> SimilarityTransform:
+    """Return the transform from the coordinates of the Gaussians of a lifted run to those of the capture.
+
+    Args:
+        run_dir, identity: as in `capture_transforms`, which also raises the errors.
+    """
+    transform = SimilarityTransform.identity()
+    for world in capture_transforms(run_dir, identity):
+        transform = SimilarityTransform.inverse_of(world.transform, world.scale).compose(transform)
+    return transform
 
 
 def make_catalogue(

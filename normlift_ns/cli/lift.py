@@ -176,7 +176,7 @@ class NormLift:
     def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
         """Return a warning if images and renders of three views differ; add the time to that of the stages."""
         from normlift_ns.data.alignment import alignment_warning, measure_alignment  # noqa: PLC0415 (as above)
-        from normlift_ns.data.open_splat import SplatScene  # noqa: PLC0415
+        from normlift_ns.data.open_scene import SplatScene  # noqa: PLC0415
         from normlift_ns.pipeline import resolve_gsplat_version  # noqa: PLC0415
         from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
@@ -298,8 +298,8 @@ class NormLift:
     def open_scene(self) -> Scene:
         """Open the trained scene, with the images of --add-images."""
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
+        from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415 (as above)
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
-        from normlift_ns.lifted_run import open_scene  # noqa: PLC0415 (as above)
 
         splat = self.load_ply or self.load_gsplat
         if splat is not None:
