@@ -130,21 +130,18 @@ def lift_run(
     """
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
+
+    def opened() -> Scene:
+        if isinstance(config_or_scene, str | Path):
+            return open_scene(config_or_scene, data=data, load_step=load_step)
+        return config_or_scene
+
     request = LiftRequest(
-        open_scene=scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
+        open_scene=opened, source=source, features=features, texts=texts,
         lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
         device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
-
-
-def scene_opener(
-    config_or_scene: str | Path | Scene, data: str | Path | None = None, load_step: int | None = None
-) -> Callable[[], Scene]:
-    """Return a function that opens the scene when called."""
-    if not isinstance(config_or_scene, str | Path):
-        return lambda: config_or_scene
-    return partial(open_scene, config_or_scene, data=data, load_step=load_step)
 
 
 @dataclass(frozen=True, kw_only=True)

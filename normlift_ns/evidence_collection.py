@@ -7,6 +7,7 @@ import os
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -289,7 +290,7 @@ def batch_evidence(
             progress=lambda *_: on_view(),
         )
         cache_views(evidence, folder, [keys[view] for view in missing])
-        cached.update((view, CachedView(evidence, index)) for index, view in enumerate(missing))
+        cached.update((view, (evidence, index)) for index, view in enumerate(missing))
     return cells_to_regions(join_cached_views(cached).to(gaussians.means.device), block)
 
 
@@ -397,15 +398,8 @@ _VIEWS = "views"
 """Header entry that holds the keys of the views, in their order."""
 _CACHED_HEADERS = 2**14
 """File headers that a process keeps in memory."""
-
-
-class CachedView(NamedTuple):
-    """Location of the evidence of one view."""
-
-    evidence: Evidence
-    """Evidence of several views."""
-    view: int
-    """Index of the view in it."""
+CachedView = tuple[Evidence, int]
+"""Evidence of several views, and the index of one view in it."""
 
 
 def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
@@ -428,9 +422,10 @@ def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView
     places: dict[int, CachedView] = {}
     for path, file_keys in _cached_files(folder, keys):
         wanted = [number for number, key in enumerate(keys) if number not in places and key in file_keys]
-        evidence = _load_cached(path, len(file_keys)) if len(wanted) > 0 else None
-        if evidence is not None:
-            places.update((number, CachedView(evidence, file_keys.index(keys[number]))) for number in wanted)
+        with suppress(FileNotFoundError, ValueError):
+            evidence = Evidence.load(path, key=path.stem) if len(wanted) > 0 else None
+            if evidence is not None and evidence.num_views == len(file_keys):
+                places.update((number, (evidence, file_keys.index(keys[number]))) for number in wanted)
         if len(places) == len(keys):
             break
     return places
@@ -462,14 +457,6 @@ def join_cached_views(places: Mapping[int, CachedView]) -> Evidence:
 def _cache_path(folder: Path, keys: Sequence[str]) -> Path:
     name = blake2b(" ".join(keys).encode(), digest_size=16).hexdigest()
     return folder / f"{name}.safetensors"
-
-
-def _load_cached(path: Path, count: int) -> Evidence | None:
-    try:
-        evidence = Evidence.load(path, key=path.stem)
-    except (FileNotFoundError, ValueError):
-        return None
-    return evidence if evidence.num_views == count else None
 
 
 def _cached_files(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:

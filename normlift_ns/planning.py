@@ -282,8 +282,7 @@ def measure_core(
         agreed, copied = table, None
         if options.consensus:
             with stages("consensus"):
-                kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
-                agreed = consensus(observed.evidence, table, **kwargs).features
+                agreed = consensus(observed.evidence, table, **pipeline.consensus_options(options)).features
         with stages("lift"):
             lifted, own = pipeline.lift_features(observed, agreed, options)
         if options.refine:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import reduce
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -139,10 +140,6 @@ class Objects:
     """Number of those in components that are too small to be listed."""
     objects: list[SceneObject]
     """Objects by descending size."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields as plain Python types."""
-        return asdict(self)
 
 
 def find_objects(
@@ -319,7 +316,7 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
         ids = [i for i, class_id in enumerate(instances.classes, 1) if class_id == number]
-        found = _objects(field, means, in_class, instances.instance_id, ids).to_json()
+        found = asdict(_objects(field, means, in_class, instances.instance_id, ids))
         objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
         tables.append({"text": text, "class_id": number, **found, "objects": objects})
     return tables
@@ -352,11 +349,6 @@ class SimilarityTransform:
         """Return the inverse of p -> scale * (transform @ p)."""
         rotation = transform[:, :3].T
         return cls(rotation, 1 / scale, -rotation @ transform[:, 3])
-
-    @classmethod
-    def identity(cls) -> SimilarityTransform:
-        """Return the identity transform."""
-        return cls(np.eye(3), 1.0, np.zeros(3))
 
     def compose(self, other: SimilarityTransform) -> SimilarityTransform:
         """Return the composition that applies this transform first and `other` second."""
@@ -422,10 +414,9 @@ def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> Similar
     Args:
         run_dir, identity: as in `capture_transforms`, which also raises the errors.
     """
-    transform = SimilarityTransform.identity()
-    for world in capture_transforms(run_dir, identity):
-        transform = SimilarityTransform.inverse_of(world.transform, world.scale).compose(transform)
-    return transform
+    worlds = capture_transforms(run_dir, identity)
+    inverses = (SimilarityTransform.inverse_of(world.transform, world.scale) for world in reversed(worlds))
+    return reduce(SimilarityTransform.compose, inverses)
 
 
 def make_catalogue(

@@ -126,11 +126,6 @@ def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
     }
 
 
-def is_saved_splat(run_dir: Path) -> bool:
-    """Return whether the run was lifted from a splat without a nerfstudio run."""
-    return (run_dir / SPLAT_FILE).is_file()
-
-
 def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
     """Open the splat of a lifted run.
 
@@ -259,7 +254,7 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
         complete_interrupted_writes(run_dir.parent)  # a lift was killed while it replaced the run
-    if config.is_file() and is_saved_splat(run_dir):
+    if config.is_file() and (run_dir / SPLAT_FILE).is_file():  # lifted from a splat without a nerfstudio run
         scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
         scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
