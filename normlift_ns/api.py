@@ -256,15 +256,19 @@ def announce(prepared: PreparedLift) -> None:
         say(f"Warning: {remark}")
 
 
+def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
+    """Compare training images with renders of the scene; return a warning if they differ, and raise if nothing fits."""
+    settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, options))
+    match = measure_alignment(scene, settings, device=device)
+    return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+
+
 def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
     """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
     if not prepared.request.check:
         return
-    scene = prepared.scene
     with stages("check") as step:
-        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
-        match = measure_alignment(scene, settings, device=prepared.device)
-        warning = alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+        warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
         step()
     if warning is not None:
         prepared.request.say(f"Warning: {warning}")

@@ -205,8 +205,7 @@ class LiftedRun:
             raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
         refuse_run_files(*export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
-        ply, rows, names, table = export_paths(path)
-        for file, written in ((ply, True), (rows, True), (names, answer is not None), (table, objects is not None)):
+        for file, written in zip(export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
         instances = None if answer is None else answer_instances(answer, reach=reach, min_size=min_size)
