@@ -221,11 +221,10 @@ def observe_views(
 
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
-            view = (
-                read
-                if render_settings is None
-                else read._replace(image=render_image(scene, read.camera, settings=render_settings))
+            image = (
+                read.image if render_settings is None else render_image(scene, read.camera, settings=render_settings)
             )
+            view = read._replace(image=image)
             _check_sizes(view)
             waiting.append(_downscaled(view, downscale) if downscale > 1 else view)
             check_undistorted(source, view, waiting[-1])

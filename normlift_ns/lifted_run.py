@@ -1,4 +1,4 @@
-"""Opening of a trained scene or a lifted run, and methods to query, export and render a lifted run."""
+"""Opening of a lifted run, and methods to query, export and render it."""
 
 from __future__ import annotations
 
