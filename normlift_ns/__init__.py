@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from normlift_ns.core.relevancy import relevancy as relevancy
     from normlift_ns.core.scene import Scene as Scene
     from normlift_ns.core.scene import View as View
+    from normlift_ns.data.open_scene import open_scene as open_scene
     from normlift_ns.data.open_splat import open_splat as open_splat
     from normlift_ns.errors import InputError as InputError
     from normlift_ns.evaluation.coverage import Coverage as Coverage
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from normlift_ns.evaluation.studies import refine_variant as refine_variant
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
     from normlift_ns.lifted_run import open_run as open_run
-    from normlift_ns.lifted_run import open_scene as open_scene
     from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
     from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
     from normlift_ns.options import LiftOptions as LiftOptions
@@ -65,11 +65,12 @@ _HOMES = {
     "core.refine": "refine unsupported",
     "core.relevancy": "relevancy",
     "core.scene": "Scene View",
+    "data.open_scene": "open_scene",
     "data.open_splat": "open_splat",
     "errors": "InputError",
     "evaluation.coverage": "Coverage coverage",
     "evaluation.studies": "refine_variant",
-    "lifted_run": "LiftedRun open_run open_scene",
+    "lifted_run": "LiftedRun open_run",
     "options": "BACKGROUND_WORDS CANONICAL_NEGATIVES LiftOptions RefineConfig SourceOptions SplatOptions",
     "query.engine": "Answer Finding Histogram",
     "rasterization.rasterize": "Contributors contributors rasterize_evidence render",

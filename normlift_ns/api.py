@@ -18,7 +18,6 @@ from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
-from normlift_ns.data.extra_images import EXTRA_IMAGES_FILE
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import (
     FullImageDatamanagerConfig,
@@ -28,7 +27,16 @@ from normlift_ns.data.nerfstudio.config_classes import (
     VanillaPipelineConfig,
 )
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import CHECKPOINT_DIR, TRANSFORMS_FILE, SplatScene, save_splat, splatfacto_checkpoint
+from normlift_ns.data.open_scene import (
+    CHECKPOINT_DIR,
+    EXTRA_IMAGES_FILE,
+    TRANSFORMS_FILE,
+    SplatScene,
+    open_scene,
+    resolve_field_paths,
+    save_splat,
+    splatfacto_checkpoint,
+)
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.build import make_source, source_settings
@@ -47,7 +55,7 @@ from normlift_ns.io.run_dir import (
     run_directory,
     run_file_digests,
 )
-from normlift_ns.lifted_run import LiftedRun, open_scene, resolve_field_paths
+from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,
     LiftOptions,
@@ -122,21 +130,18 @@ def lift_run(
     """
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
+
+    def opened() -> Scene:
+        if isinstance(config_or_scene, str | Path):
+            return open_scene(config_or_scene, data=data, load_step=load_step)
+        return config_or_scene
+
     request = LiftRequest(
-        open_scene=scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
+        open_scene=opened, source=source, features=features, texts=texts,
         lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
         device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
-
-
-def scene_opener(
-    config_or_scene: str | Path | Scene, data: str | Path | None = None, load_step: int | None = None
-) -> Callable[[], Scene]:
-    """Return a function that opens the scene when called."""
-    if not isinstance(config_or_scene, str | Path):
-        return lambda: config_or_scene
-    return partial(open_scene, config_or_scene, data=data, load_step=load_step)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,15 +256,19 @@ def announce(prepared: PreparedLift) -> None:
         say(f"Warning: {remark}")
 
 
+def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
+    """Compare training images with renders of the scene; return a warning if they differ, and raise if nothing fits."""
+    settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, options))
+    match = measure_alignment(scene, settings, device=device)
+    return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+
+
 def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
     """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
     if not prepared.request.check:
         return
-    scene = prepared.scene
     with stages("check") as step:
-        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, prepared.lift))
-        match = measure_alignment(scene, settings, device=prepared.device)
-        warning = alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+        warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
         step()
     if warning is not None:
         prepared.request.say(f"Warning: {warning}")

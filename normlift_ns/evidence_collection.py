@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from hashlib import blake2b
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 from xxhash import xxh3_128
 
+from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.base import FeatureSource, RegionFeatures, iterate_view_features
-from normlift_ns.encoders.batching import prefetch_map
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
 from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import read_metadata
 from normlift_ns.options import BackendName, LiftOptions, RasterizeMode
-from normlift_ns.progress import StageTimer
-from normlift_ns.rasterization.evidence_cache import CachedView, cache_views, find_cached_views, join_cached_views
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
+
+if TYPE_CHECKING:
+    from normlift_ns.progress import StageTimer
 
 _MAX_CHUNK = 16
 _READERS = 8
@@ -216,11 +221,10 @@ def observe_views(
 
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
-            view = (
-                read
-                if render_settings is None
-                else read._replace(image=render_image(scene, read.camera, settings=render_settings))
+            image = (
+                read.image if render_settings is None else render_image(scene, read.camera, settings=render_settings)
             )
+            view = read._replace(image=image)
             _check_sizes(view)
             waiting.append(_downscaled(view, downscale) if downscale > 1 else view)
             check_undistorted(source, view, waiting[-1])
@@ -285,7 +289,7 @@ def batch_evidence(
             progress=lambda *_: on_view(),
         )
         cache_views(evidence, folder, [keys[view] for view in missing])
-        cached.update((view, CachedView(evidence, index)) for index, view in enumerate(missing))
+        cached.update((view, (evidence, index)) for index, view in enumerate(missing))
     return cells_to_regions(join_cached_views(cached).to(gaussians.means.device), block)
 
 
@@ -381,3 +385,107 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
             "undistorted images",
             stacklevel=2,
         )
+
+
+# Cache of the evidence of rasterized views. A file holds several views, and each view is looked up on its own.
+#
+# A file is named after the keys of its views, and its header lists them. So a view is found whichever views surround
+# it: if images are added between old ones, only the new images are rasterized.
+
+
+_VIEWS = "views"
+"""Header entry that holds the keys of the views, in their order."""
+_CACHED_HEADERS = 2**14
+"""File headers that a process keeps in memory."""
+CachedView = tuple[Evidence, int]
+"""Evidence of several views, and the index of one view in it."""
+
+
+def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
+    """Write the evidence of views to a file in a folder.
+
+    Args:
+        evidence: Evidence of the views.
+        folder: Folder of the cache.
+        keys: Digests of the inputs of each view, in the order of the views.
+
+    Raises:
+        OSError: If the file cannot be written, for instance because the disk is full.
+    """
+    path = _cache_path(folder, keys)
+    evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)})
+
+
+def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView]:
+    """Return the cached views by index into `keys`; files that are damaged or have the wrong name are skipped."""
+    places: dict[int, CachedView] = {}
+    for path, file_keys in _cached_files(folder, keys):
+        wanted = [number for number, key in enumerate(keys) if number not in places and key in file_keys]
+        with suppress(FileNotFoundError, ValueError):
+            evidence = Evidence.load(path, key=path.stem) if len(wanted) > 0 else None
+            if evidence is not None and evidence.num_views == len(file_keys):
+                places.update((number, (evidence, file_keys.index(keys[number]))) for number in wanted)
+        if len(places) == len(keys):
+            break
+    return places
+
+
+def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
+    """Return for each view whether the header of a file in a folder lists it; only headers are read."""
+    listed = {key for keys in _cache_headers(folder).values() for key in keys}
+    return [key in listed for key in keys]
+
+
+def join_cached_views(places: Mapping[int, CachedView]) -> Evidence:
+    """Return the evidence of all views in the order of their indices."""
+    runs: list[tuple[Evidence, list[int]]] = []
+    for number in sorted(places):
+        evidence, view = places[number]
+        if len(runs) > 0 and runs[-1][0] is evidence and view not in runs[-1][1]:
+            runs[-1][1].append(view)
+        else:
+            runs.append((evidence, [view]))
+    device = runs[0][0].region_view.device
+    parts = [
+        evidence if views == list(range(evidence.num_views)) else evidence.select_views(views)
+        for evidence, views in runs
+    ]
+    return parts[0] if len(parts) == 1 else Evidence.merge(*(part.to(device) for part in parts))
+
+
+def _cache_path(folder: Path, keys: Sequence[str]) -> Path:
+    name = blake2b(" ".join(keys).encode(), digest_size=16).hexdigest()
+    return folder / f"{name}.safetensors"
+
+
+def _cached_files(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
+    """Yield the files that hold any of the views, with the keys of their views.
+
+    The file of exactly these views comes first, then those that hold the most of them.
+    """
+    exact = _cache_path(folder, keys)
+    if exact.is_file():
+        yield exact, list(keys)
+    headers, wanted = _cache_headers(folder), set(keys)
+    counts = {path: len(wanted.intersection(file_keys)) for path, file_keys in headers.items()}
+    paths = (path for path, count in counts.items() if count > 0 and path != exact)
+    yield from ((path, headers[path]) for path in sorted(paths, key=lambda path: (-counts[path], path.name)))
+
+
+def _cache_headers(folder: Path) -> dict[Path, list[str]]:
+    """Return the keys that the header of each file lists."""
+    try:
+        with os.scandir(folder) as entries:
+            files = [(entry.path, entry.stat()) for entry in entries if entry.name.endswith(".safetensors")]
+    except OSError:
+        return {}
+    return {Path(path): _cache_header(path, stat.st_mtime_ns, stat.st_size).split() for path, stat in files}
+
+
+@lru_cache(_CACHED_HEADERS)
+def _cache_header(path: str, modified: int, size: int) -> str:
+    """Return the keys in the header of a file, or an empty string if it is damaged."""
+    try:
+        return read_metadata(Path(path)).get(_VIEWS, "")
+    except (FileNotFoundError, ValueError):
+        return ""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
@@ -186,39 +186,29 @@ def _comment(text: str) -> str:
 # Export of Gaussian labels as NPY arrays, in the layout of Pointcept and of SceneSplat's benchmark.
 
 
-def write_label_arrays(
-    folder: Path,
-    means: Float[Tensor, "n 3"],
-    instances: Instances,
-    rows: Int64[np.ndarray, " m"],
-    *,
-    overwrite: bool = False,
-) -> tuple[Path, ...]:
+def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
     """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, all or none.
 
     Classes and objects are numbered from 0 here, as class_id - 1 and instance_id - 1; evaluations ignore -1.
 
-    Args:
-        rows: indices of the Gaussians to write.
-        overwrite: replace existing files.
-    Returns:
-        Paths of the four files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
+        FileExistsError: a file exists, and `overwrite` of the job is False.
         OSError: a file cannot be written.
     """
-    files = tuple(folder / name for name in LABEL_ARRAY_FILES)
+    instances, files = job.instances, tuple(folder / name for name in LABEL_ARRAY_FILES)
+    assert instances is not None
     names = {
         "ignored": -1,
         "segment": {str(i): text for i, text in enumerate(instances.texts)},
         "instance": {str(i): {"segment": class_id - 1} for i, class_id in enumerate(instances.classes)},
     }
-    with atomic_files(*files, overwrite=overwrite) as drafts:
-        np.save(drafts[0], means.detach().cpu().numpy()[rows].astype(np.float32))
+    with atomic_files(*files, overwrite=job.overwrite) as drafts:
+        means = job.scene.gaussians.means.detach().cpu().numpy()
+        np.save(drafts[0], means[job.rows].astype(np.float32))
         for draft, ids in zip(drafts[1:3], (instances.class_id, instances.instance_id)):
-            np.save(draft, ids.cpu().numpy()[rows].astype(np.int32) - 1)
+            np.save(draft, ids.cpu().numpy()[job.rows].astype(np.int32) - 1)
         drafts[3].write_text(json.dumps(names, indent=2) + "\n", "utf8")
-    return files
+    return [f"Labels of {len(job.rows):,} Gaussians in {folder}"]
 
 
 class CloudTransfer(NamedTuple):
@@ -421,12 +411,6 @@ def _export_masks(job: ExportJob, folder: Path) -> list[str]:
                 "capture."
             )
     return lines
-
-
-def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
-    assert job.instances is not None
-    write_label_arrays(folder, job.scene.gaussians.means, job.instances, job.rows, overwrite=job.overwrite)
-    return [f"Labels of {len(job.rows):,} Gaussians in {folder}"]
 
 
 def _export_cloud(job: ExportJob, path: Path) -> list[str]:

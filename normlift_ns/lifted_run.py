@@ -1,20 +1,18 @@
-"""Opening of a trained scene or a lifted run, and methods to query, export and render a lifted run."""
+"""Opening of a lifted run, and methods to query, export and render it."""
 
 from __future__ import annotations
 
 import dataclasses
 import operator
-import os
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -27,16 +25,13 @@ from normlift_ns.analysis.objects import (
     find_floaters,
     find_instances,
     make_catalogue,
+    similarity_to_capture,
 )
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
-from normlift_ns.data.extra_images import add_stored_images
-from normlift_ns.data.images import SplitViews
-from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
-from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
-from normlift_ns.data.transforms import capture_transforms
+from normlift_ns.core.scene import Scene
+from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.exports import (
@@ -49,14 +44,10 @@ from normlift_ns.exports import (
     transfer_labels,
     write_splat_ply,
 )
-from normlift_ns.io.atomic import complete_interrupted_writes, refuse_run_files
+from normlift_ns.io.atomic import refuse_run_files
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
     cache_folder,
-    check_run,
-    field_folder,
-    recorded_gsplat_version,
-    resolve_manifest_paths,
     text_cache_folder,
 )
 from normlift_ns.options import (
@@ -214,8 +205,7 @@ class LiftedRun:
             raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
         refuse_run_files(*export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
-        ply, rows, names, table = export_paths(path)
-        for file, written in ((ply, True), (rows, True), (names, answer is not None), (table, objects is not None)):
+        for file, written in zip(export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
         instances = None if answer is None else answer_instances(answer, reach=reach, min_size=min_size)
@@ -382,10 +372,7 @@ class LiftedRun:
         Raises:
             FileNotFoundError, ValueError: as `catalogue`.
         """
-        transform = SimilarityTransform.identity()
-        for world in capture_transforms(self.folder, self.scene.identity):
-            transform = SimilarityTransform.inverse_of(world.transform, world.scale).compose(transform)
-        return transform
+        return similarity_to_capture(self.folder, self.scene.identity)
 
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
         """Return the classes and objects of a part."""
@@ -483,65 +470,6 @@ def _answer_of(part: Any) -> Answer | None:
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
-def load_field(
-    run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
-) -> SemanticField:
-    """Load the semantic field of a lifted run.
-
-    Args:
-        means, checkpoint: as in `SemanticField.load`.
-    Raises:
-        FileNotFoundError: the run has no semantic field.
-        ValueError: the field is damaged, or belongs to other Gaussians than `means`.
-    """
-    folder = field_folder(run_dir)
-    return resolve_field_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
-
-
-def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
-    """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
-    return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
-
-
-def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
-    """Open a trained splatfacto run or a lifted run, from any working directory.
-
-    For a splat without a nerfstudio run, see `open_splat`.
-
-    Args:
-        load_config: config.yml of the run.
-        data: current path of the dataset, if it was moved.
-        load_step: step of the checkpoint, the last one if None.
-    Raises:
-        FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
-        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
-            of the run.
-
-    >>> scene = open_scene(config)
-    >>> len(scene.train), scene.train[1].image.shape
-    (12, torch.Size([120, 160, 3]))
-    """
-    config = check_path("load_config", load_config)
-    data = None if data is None else check_path("data", data)
-    load_step = None if load_step is None else check_number("load_step", load_step, int)
-    run_dir = Path(os.path.abspath(config)).parent
-    if not run_dir.exists():
-        complete_interrupted_writes(run_dir.parent)  # a lift was killed while it replaced the run
-    if config.is_file() and is_saved_splat(run_dir):
-        scene = open_saved_splat(run_dir, data=data, load_step=load_step)
-    else:
-        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
-        scene = add_stored_images(scene, run_dir)
-    rules = recorded_gsplat_version(run_dir)
-    return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
-
-
-def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
-    from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
-
-    return nerfstudio_views(*run)
-
-
 def open_run(
     load_config: str | Path,
     *,
@@ -567,30 +495,7 @@ def open_run(
     >>> answer["yellow"].objects[0].size > 20
     True
     """
-    folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
-    check_run(folder)
-    device, scene = choose_device(device), open_scene(load_config, data=data)
-    loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
-    for remark in (*scene.remarks, *_changed_cameras(loaded, scene)):
-        warnings.warn(remark, stacklevel=2)
-    return LiftedRun(folder, scene, with_text_source(loaded, text_embeddings=vectors, template=text_template), device)
-
-
-def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
-    """Return a warning if the cameras differ from those that the field records of the lift."""
-    changed = [
-        split
-        for split, key, views in (
-            ("training", "cameras", scene.train),
-            ("held-out", "cameras_held_out", scene.held_out),
-        )
-        if (recorded := field.manifest.get(key)) is not None and cameras_differ(recorded, camera_summary(views.cameras))
-    ]
-    if len(changed) == 0:
-        return []
-    return [
-        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
-        "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
-        "Restore the dataset, give its path with --data, or lift again"
-    ]
+    device = choose_device(device)
+    folder, scene, stored = open_stored_run(load_config, data)
+    return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=text_template), device)

@@ -30,6 +30,9 @@ _MIN_DIVISOR = 1e-6
 """Smallest value of options that the code divides by."""
 MAX_PROMPT_LENGTH = 10_000
 """Largest number of characters in a prompt. CLIP reads about 70 words of it."""
+_INVALID = re.compile("[\0\ud800-\udfff]")
+"""Characters that files and encoders cannot hold: NUL, and surrogates, which have no UTF-8."""
+_hints = cache(get_type_hints)
 _MAX_SHOWN = 60
 """Largest number of characters of a value in a message."""
 
@@ -197,7 +200,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
             raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write what to search for")
         if len(text) > MAX_PROMPT_LENGTH:
             raise InputError(f"{label} has {len(text):,} characters; give at most {MAX_PROMPT_LENGTH:,}")
-        if "\0" in text or not _is_unicode(text):
+        if _INVALID.search(text):
             raise InputError(f"{label} contains an invalid character ({short_repr(text)}); remove it")
         if text in previous:
             raise InputError(f"{label}, {short_repr(text)}, is a duplicate; give every prompt once")
@@ -215,11 +218,6 @@ def short_repr(value: object) -> str:
     except Exception:  # the repr of unknown objects, or of integers with thousands of digits
         return f"a number of type {type(value).__name__}" if isinstance(value, Real) else type(value).__name__
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]} …"
-
-
-@cache
-def _hints(cls: type) -> dict[str, Any]:
-    return get_type_hints(cls)
 
 
 def _error(name: str, expected: str, value: object) -> InputError:
@@ -258,7 +256,7 @@ def _convert_scalar(name: str, value: Any, hint: type) -> Any:
         return check_path(name, value)
     if not isinstance(value, hint):
         raise _error(name, {bool: "True or False", str: "a string"}.get(hint, f"of type {hint.__name__}"), value)
-    if hint is str and ("\0" in value or not _is_unicode(value)):
+    if hint is str and _INVALID.search(value):
         raise InputError(f"{option_name(name)} contains an invalid character ({short_repr(value)}); remove it")
     return value
 
@@ -289,14 +287,6 @@ def check_path(name: str, value: object) -> Path:
             f"{option_name(name)} is not a valid path: it contains a NUL character ({short_repr(os.fspath(value))})"
         )
     return Path(value)
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 # User options as plain dataclasses. Imports no heavy package, to keep --help fast.

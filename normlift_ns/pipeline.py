@@ -91,9 +91,7 @@ def lift_scene(
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
-            agreed = consensus(
-                views.evidence, table, level=views.level, sample=options.consensus_sample, **consensus_options(options)
-            )
+            agreed = consensus(views.evidence, table, level=views.level, **consensus_options(options))
             step()
         table, facts = agreed.features, consensus_facts(options, agreed)
     with stages("lift") as step:
@@ -160,21 +158,14 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 
 
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
-    """Return the options of a lift for `sampled_consensus`."""
-    return {"power": options.consensus_power, "least": options.consensus_least}
+    """Return the options of a lift for `consensus`."""
+    return {name: getattr(options, f"consensus_{name}") for name in ("power", "sample", "least")}
 
 
 def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
     """Return the entry of the manifest about the consensus."""
-    facts = {
-        "power": options.consensus_power,
-        "sample": options.consensus_sample,
-        "least": options.consensus_least,
-        "seed": SAMPLING_SEED,
-        "gaussians": result.gaussians,
-        "agreement": result.agreement,
-    }
-    return {"consensus": facts}
+    facts = {"seed": SAMPLING_SEED, "gaussians": result.gaussians, "agreement": result.agreement}
+    return {"consensus": {**consensus_options(options), **facts}}
 
 
 def lift_features(

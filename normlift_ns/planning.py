@@ -41,10 +41,10 @@ from normlift_ns.evidence_collection import (
     evidence_keys,
     observe_views,
     sample_evenly,
+    views_in_cache,
 )
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
-from normlift_ns.rasterization.evidence_cache import views_in_cache
 
 # Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
 
@@ -282,8 +282,7 @@ def measure_core(
         agreed, copied = table, None
         if options.consensus:
             with stages("consensus"):
-                kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
-                agreed = consensus(observed.evidence, table, **kwargs).features
+                agreed = consensus(observed.evidence, table, **pipeline.consensus_options(options)).features
         with stages("lift"):
             lifted, own = pipeline.lift_features(observed, agreed, options)
         if options.refine:

@@ -349,7 +349,8 @@ class RecordedVotes:
             block, images = self._observe([vote.view])
             self._check_regions(vote.view, block)
             labels, regions = block.labels[0], block.regions[0]
-            masks = [_region_mask(labels, regions, region.region) for region in vote.regions]
+            cells = [(regions == region.region).any(dim=0) for region in vote.regions]  # of a region, at any level
+            masks = [(labels >= 0) & inside[labels.clamp(min=0).long()] for inside in cells]
             yield VoteImage(self.names[vote.view], vote, draw_outlines(images[0], torch.stack(masks)))
 
     @cached_property
@@ -424,12 +425,6 @@ class RecordedVotes:
         if not isinstance(value, (int, float) if kind is float else kind):
             raise InputError(f"the run's manifest is damaged: its option {name} is {value!r:.40}; lift again")
         return value
-
-
-def _region_mask(labels: Tensor, regions: Tensor, region: int) -> Bool[Tensor, "h w"]:
-    """Return the pixels of one region: those of its cells, at any level."""
-    cells = (regions == region).any(dim=0)
-    return (labels >= 0) & cells[labels.clamp(min=0).long()]
 
 
 def _without_networks(source: FeatureSource, cache: Path) -> FeatureSource:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import reduce
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -21,6 +22,7 @@ from normlift_ns.core.gaussians import MIN_OPACITY, Camera, GaussianScene
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.scene import Scene
+from normlift_ns.data.transforms import capture_transforms
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_files
 from normlift_ns.options import CATALOG_FILES, FLOATER_THRESHOLD, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, check_number
@@ -135,10 +137,6 @@ class Objects:
     """Number of those in components that are too small to be listed."""
     objects: list[SceneObject]
     """Objects by descending size."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields as plain Python types."""
-        return asdict(self)
 
 
 def find_objects(
@@ -312,7 +310,7 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
         ids = [i for i, class_id in enumerate(instances.classes, 1) if class_id == number]
-        found = _objects(field, means, in_class, instances.instance_id, ids).to_json()
+        found = asdict(_objects(field, means, in_class, instances.instance_id, ids))
         objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
         tables.append({"text": text, "class_id": number, **found, "objects": objects})
     return tables
@@ -342,11 +340,6 @@ class SimilarityTransform:
         """Return the inverse of p -> scale * (transform @ p)."""
         rotation = transform[:, :3].T
         return cls(rotation, 1 / scale, -rotation @ transform[:, 3])
-
-    @classmethod
-    def identity(cls) -> SimilarityTransform:
-        """Return the identity transform."""
-        return cls(np.eye(3), 1.0, np.zeros(3))
 
     def compose(self, other: SimilarityTransform) -> SimilarityTransform:
         """Return the composition that applies this transform first and `other` second."""
@@ -404,6 +397,17 @@ class Catalogue:
     def unit(self) -> str:
         """Unit of the `capture` positions."""
         return "capture unit" if self.meters_per_unit is None else "metre"
+
+
+def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> SimilarityTransform:
+    """Return the transform from the coordinates of the Gaussians of a lifted run to those of the capture.
+
+    Args:
+        run_dir, identity: as in `capture_transforms`, which also raises the errors.
+    """
+    worlds = capture_transforms(run_dir, identity)
+    inverses = (SimilarityTransform.inverse_of(world.transform, world.scale) for world in reversed(worlds))
+    return reduce(SimilarityTransform.compose, inverses)
 
 
 def make_catalogue(

@@ -32,8 +32,7 @@ from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, 
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
-from normlift_ns.io.manifest import read_manifest
-from normlift_ns.io.run_dir import FIELD_FOLDER, run_directory
+from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
 from normlift_ns.options import check_options, short_repr
 
 _PREFIX = "batch_"

@@ -175,19 +175,14 @@ class NormLift:
 
     def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
         """Return a warning if images and renders of three views differ; add the time to that of the stages."""
-        from normlift_ns.data.alignment import alignment_warning, measure_alignment  # noqa: PLC0415 (as above)
-        from normlift_ns.data.open_splat import SplatScene  # noqa: PLC0415
-        from normlift_ns.pipeline import resolve_gsplat_version  # noqa: PLC0415
+        from normlift_ns.api import compare_with_images  # noqa: PLC0415 (as above)
         from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
-        from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
 
-        scene = opened.scene
-        opened.stage_seconds["kernels"] = time_kernel_loading(scene, self.lift, device=device)
+        opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, self.lift, device=device)
         start = time.perf_counter()
-        settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, self.lift))
-        match = measure_alignment(scene, settings, device=device)
+        warning = compare_with_images(opened.scene, self.lift, device)
         opened.stage_seconds["check"] = time.perf_counter() - start
-        return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+        return warning
 
     def make_plan(self, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
         """Estimate the lift from a short measurement of the opened capture."""
@@ -298,8 +293,8 @@ class NormLift:
     def open_scene(self) -> Scene:
         """Open the trained scene, with the images of --add-images."""
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
+        from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415 (as above)
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
-        from normlift_ns.lifted_run import open_scene  # noqa: PLC0415 (as above)
 
         splat = self.load_ply or self.load_gsplat
         if splat is not None:

@@ -10,8 +10,7 @@ from pathlib import Path
 from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
-from normlift_ns.io.manifest import read_manifest
-from normlift_ns.io.run_dir import field_folder, text_cache_folder
+from normlift_ns.io.run_dir import field_folder, read_manifest, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
 _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}

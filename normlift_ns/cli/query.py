@@ -34,7 +34,7 @@ from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_d
 if TYPE_CHECKING:
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
     from normlift_ns.analysis.objects import Catalogue
-    from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.data.open_scene import StoredRun
     from normlift_ns.query.arrays import QuickRun
     from normlift_ns.query.engine import Answer
     from normlift_ns.query.question import Query
@@ -156,11 +156,11 @@ class NormLiftQuery:
         return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
 
     @cached_property
-    def _run(self) -> LiftedRun:
+    def _run(self) -> StoredRun:
         """The run with its scene, which most answers do not need."""
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (as above)
+        from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
-        return open_run(self.load_config, data=self.data)
+        return open_stored_run(self.load_config, self.data)
 
     def _answer_with_scene(self, question: Query) -> Answer:
         from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
@@ -184,7 +184,10 @@ class NormLiftQuery:
         """
         import torch  # noqa: PLC0415
 
-        votes, refined = self._run.votes, result.question.refined
+        from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415
+
+        run, refined = self._run, result.question.refined
+        votes = RecordedVotes(run.scene, run.field, cache_folder(run.folder))
         masks = torch.as_tensor(result.selected).T
         reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
         for row, why in zip(rows, reasons):
@@ -234,10 +237,19 @@ class NormLiftQuery:
 
         This opens the whole run, because best views need the cameras of the scene.
         """
-        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
+        from normlift_ns.analysis import objects  # noqa: PLC0415 (as above)
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415
 
-        answer = self._answer_with_scene(question)
-        catalog = self._run.catalogue(answer, metres_per_unit=self.metres_per_unit)
+        run, answer = self._run, self._answer_with_scene(question)
+        instances = objects.find_instances(answer.texts, answer.means, answer.relevancy, answer.selected)
+        catalog = objects.make_catalogue(
+            run.scene,
+            run.field,
+            instances,
+            objects.similarity_to_capture(run.folder, run.scene.identity),
+            metres_per_unit=self.metres_per_unit,
+            device=choose_device("auto"),
+        )
         if self.objects_dir is not None:
             metadata = {
                 "texts": list(question.texts),
@@ -245,7 +257,7 @@ class NormLiftQuery:
                 "threshold": question.threshold,
                 "min_reliability": question.min_reliability,
             }
-            write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
+            objects.write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 
     def _check(self) -> None:

@@ -35,10 +35,9 @@ from torch import Tensor
 
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.lift import Scalars
+from normlift_ns.core.lift import Scalars, check_tensors, check_unit_rows
 from normlift_ns.core.partition import Partition
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
-from normlift_ns.core.validation import check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
 
 MIN_OVERLAP = 0.1

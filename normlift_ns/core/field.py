@@ -31,7 +31,7 @@ from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
-from normlift_ns.io.manifest import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
+from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
 from normlift_ns.options import RelevancyRule, Storage
 
 

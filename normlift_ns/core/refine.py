@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.device import can_use_triton, retry_in_halves
+from normlift_ns.core.lift import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
-from normlift_ns.core.validation import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 

@@ -3,51 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 import numpy as np
 import torch
 
 from normlift_ns.core.gaussians import Camera
-from normlift_ns.core.scene import View, Views
-from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
-from normlift_ns.data.images import ImageViews
+from normlift_ns.data.frames import WorldTransform, transform_frames
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.open_splat import SplatScene, read_camera_file
-from normlift_ns.data.transforms import CameraFile, read_transforms, relative_name
+from normlift_ns.data.open_scene import AnyScene, SplatScene, with_frames
+from normlift_ns.data.open_splat import read_camera_file
+from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
-EXTRA_IMAGES_FILE = "added_photographs.json"
-"""File in a lifted nerfstudio run: cameras of the added images, in the world of its Gaussians."""
 _MAX_SHIFT, _MAX_ROTATION = 1e-3, 0.1
 """Largest change of a known camera: a fraction of the extent of all cameras, and degrees."""
-_Scene = TypeVar("_Scene", NerfstudioScene, SplatScene)
 
 
-class _ConcatenatedViews:
-    """`Views` of two datasets, one after the other."""
-
-    def __init__(self, first: Views, second: Views) -> None:
-        self._first, self._second = first, second
-        self.names = [*first.names, *second.names]
-        self.cameras = [*first.cameras, *second.cameras]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int, /) -> View:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"view {index} of {len(self)}")
-        index %= len(self)
-        first = self._first
-        return first[index] if index < len(first) else self._second[index - len(first)]
-
-
-def add_extra_images(scene: _Scene, cameras: Path, images: Path | None = None) -> _Scene:
+def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None) -> AnyScene:
     """Return the scene with extra images among its training views.
 
     The camera file must contain images of the scene too. Their names show which images are new, and their cameras align
@@ -79,35 +54,7 @@ def add_extra_images(scene: _Scene, cameras: Path, images: Path | None = None) -
     placed = [replace(frame, name=relative_name(frame.file, base)) for frame in transform_frames(new, world)]
     placed.sort(key=lambda frame: frame.file)  # the order in which a lifted run reads them
     identity = {**scene.identity, "added_photographs": [frame.name for frame in placed]}
-    return replace(_with_frames(scene, placed), identity=identity)
-
-
-def _with_frames(scene: _Scene, frames: Sequence[Frame]) -> _Scene:
-    """Return the scene with more training views, whose cameras are in its world.
-
-    Raises:
-        FileNotFoundError, ValueError: if an image is missing or cannot be read.
-    """
-    views = ImageViews(frames, scene.background)
-    remarks = (*scene.remarks, *views.check_files())
-    if isinstance(scene, SplatScene):
-        train = sorted([*scene.train.frames, *frames], key=lambda frame: frame.file)
-        return replace(scene, train=ImageViews(train, scene.background), remarks=remarks)
-    return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, extra_frames=tuple(frames))
-
-
-def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
-    """Return the scene of a lifted run with the extra images that the run stores, if any.
-
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
-    """
-    path = run_dir / EXTRA_IMAGES_FILE
-    if not path.is_file():
-        return scene
-    added = read_transforms(path, base=scene.location.folder, advice="put them back, or lift without --add-images")
-    check_frames(added.frames, path)
-    return _with_frames(scene, added.frames)
+    return replace(with_frames(scene, placed), identity=identity)
 
 
 def _key(name: str) -> str:

@@ -1,42 +1,32 @@
-"""Splats without a nerfstudio run: opening them, and storing them in a lifted run."""
+"""Opening of splats without a nerfstudio run."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FunctionType
-from typing import Any
 
-import msgspec
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
-from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
 from normlift_ns.data.colmap import read_colmap, read_colmap_points
 from normlift_ns.data.frames import Frame, WorldTransform, check_frames, rescale_intrinsics, transform_frames
-from normlift_ns.data.images import ImageViews, held_out_names
-from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
+from normlift_ns.data.images import held_out_names
+from normlift_ns.data.open_scene import SplatScene, split_views
+from normlift_ns.data.splat import SplatFile, validate_splat
 from normlift_ns.data.transforms import (
     CameraFile,
     gsplat_normalization,
-    read_json_file,
     read_transforms,
     read_world_transform,
-    write_transforms,
 )
 from normlift_ns.errors import InputError, summarize_error
-from normlift_ns.io.atomic import write_text_file
-from normlift_ns.options import Background, RasterizeMode, SplatOptions
-from normlift_ns.rasterization.rasterize import view_colors
+from normlift_ns.options import SplatOptions
 from normlift_ns.registry import Registry
 
-BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 _MIN_POINTS, _PARALLEL = 4, 1e-6
 
 
@@ -67,52 +57,6 @@ def read_camera_file(options: SplatOptions, advice: str = "give the folder of th
         cameras = read_colmap(options.colmap.absolute(), options.images, options.masks, advice=advice)
     check_frames(cameras.frames, cameras.source)
     return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
-
-
-@dataclass(frozen=True)
-class SplatScene:
-    """A `Scene` made from a splat and its images, without a nerfstudio run."""
-
-    splat: SplatParameters
-    train: ImageViews
-    held_out: ImageViews
-    name: str
-    checkpoint_path: Path
-    """The PLY file, the first gsplat checkpoint, or the checkpoint of a lifted run."""
-    step: int
-    """Training step; 0 if unknown."""
-    runs_dir: Path
-    names_root: Path
-    """Folder that image names are relative to."""
-    identity: Mapping[str, Any]
-    rasterize_mode: RasterizeMode
-    background_name: Background
-    remarks: tuple[str, ...] = ()
-    """Warnings about the images, in whole sentences."""
-
-    renderer = None
-    """None, because `normlift_ns` renders the scene."""
-    has_harmonics = True
-
-    @property
-    def gaussians(self) -> GaussianScene:
-        """The N Gaussians, activated."""
-        return self.splat.activated
-
-    @property
-    def parameters(self) -> dict[str, Tensor]:
-        """Raw parameters as trained, by splatfacto's names."""
-        return self.splat.parameters
-
-    @property
-    def background(self) -> Float[Tensor, " 3"]:
-        """Background color, RGB in 0..1."""
-        return BACKGROUND_COLORS[self.background_name]
-
-    def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
-        """Return each Gaussian's RGB color, >= 0, as seen from the camera."""
-        coefficients = torch.cat([self.splat.features_dc[:, None], self.splat.features_rest], dim=1)
-        return view_colors(self.splat.means, coefficients, camera, self.splat.degree)
 
 
 def open_splat(
@@ -153,7 +97,7 @@ def open_splat(
         placed = transform_frames(cameras.frames, world)
         if file.pose_adjust is not None:
             placed = _adjust_poses(placed, held_out, file.pose_adjust, path)
-        train, rest = _views(placed, held_out if options.views == "train" else frozenset(), options.background)
+        train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), options.background)
         return SplatScene(
             file.splat,
             train,
@@ -186,15 +130,6 @@ def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
     if len(held_out) == len(frames) and options.views == "train":
         raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
     return held_out
-
-
-def _views(frames: Sequence[Frame], held_out: frozenset[str], background: Background) -> tuple[ImageViews, ImageViews]:
-    """Return the training images and those that were held out."""
-    train, rest = (
-        ImageViews([frame for frame in frames if (frame.name in held_out) == is_rest], BACKGROUND_COLORS[background])
-        for is_rest in (False, True)
-    )
-    return train, rest
 
 
 SPLAT_READERS = Registry(
@@ -371,87 +306,3 @@ def _assumptions(
         if unused > 0:
             texts.append(f"{unused} files in {folder} have no camera and are skipped.")
     return texts
-
-
-SPLAT_FILE, TRANSFORMS_FILE, CHECKPOINT_DIR = "splat.json", "transforms.json", "nerfstudio_models"
-_EXPECTED = "the file that ns-normlift wrote next to config.yml; copy the whole run again"
-
-
-class _Saved(msgspec.Struct):
-    name: str
-    rasterize_mode: RasterizeMode
-    background: Background
-    photographs: str
-    identity: dict[str, Any]
-
-
-def save_splat(folder: Path, scene: SplatScene) -> None:
-    """Write splat.json and the cameras, transforms.json, into the folder of a run."""
-    write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
-    saved = _Saved(scene.name, scene.rasterize_mode, scene.background_name, str(scene.names_root), dict(scene.identity))
-    write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
-
-
-def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
-    """Return the checkpoint that splatfacto loads: step and parameters.
-
-    Without spherical harmonics, splatfacto would read the colors as logits, so the first degree is added as zeros.
-    """
-    parameters = scene.parameters
-    if scene.splat.degree == 0:
-        parameters["features_rest"] = torch.zeros(len(scene.splat), 3, 3)
-    return {
-        "step": scene.step,
-        "pipeline": {f"_model.gauss_params.{name}": tensor for name, tensor in parameters.items()},
-    }
-
-
-def is_saved_splat(run_dir: Path) -> bool:
-    """Return whether the run was lifted from a splat without a nerfstudio run."""
-    return (run_dir / SPLAT_FILE).is_file()
-
-
-def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
-    """Open the splat of a lifted run.
-
-    Args:
-        run_dir: folder of the lifted run.
-        data: current folder of the images, if they were moved.
-        load_step: step of the checkpoint; None: the last.
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
-    """
-    path = run_dir / SPLAT_FILE
-    try:
-        saved = msgspec.convert(read_json_file(path, _EXPECTED), _Saved)
-        if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
-            raise msgspec.ValidationError("name or photographs is empty")
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
-    checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
-    if data is not None and not data.is_dir():
-        raise FileNotFoundError(
-            f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
-        )
-    cameras = read_transforms(
-        run_dir / TRANSFORMS_FILE,
-        None if data is None else data.absolute(),
-        base=Path(saved.photographs),
-        advice="give their folder with --data",
-    )
-    check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
-    train, held_out = _views(cameras.frames, cameras.held_out, saved.background)
-    return SplatScene(
-        checkpoint.splat,
-        train,
-        held_out,
-        saved.name,
-        checkpoint.path,
-        checkpoint.step,
-        run_dir.parents[2] if len(run_dir.parents) > 2 else run_dir.parent,
-        Path(saved.photographs) if data is None else data.absolute(),
-        saved.identity,
-        saved.rasterize_mode,
-        saved.background,
-        train.check_files(),
-    )

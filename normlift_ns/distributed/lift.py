@@ -76,8 +76,7 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
-            kwargs = {"sample": options.consensus_sample, **pipeline.consensus_options(options)}
-            agreed = consensus_distributed(views, portion, **kwargs)
+            agreed = consensus_distributed(views, portion, **pipeline.consensus_options(options))
             step()
         table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
     with stages("lift") as step:

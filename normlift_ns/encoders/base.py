@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float, Float32, Int, Int32, Int64, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.batching import AdaptiveBatches, prefetch_map
+from normlift_ns.core.device import AdaptiveBatches, prefetch_map
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder, check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
 from normlift_ns.segmentation.regions import resample_nearest

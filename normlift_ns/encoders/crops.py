@@ -20,8 +20,8 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import resize_image
-from normlift_ns.encoders.batching import AdaptiveBatches
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
 from normlift_ns.options import CropFill
 

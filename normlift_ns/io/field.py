@@ -15,7 +15,7 @@ from jaxtyping import Float, Int32, Int64
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import FLOAT32_MAX, check_array, load_arrays
-from normlift_ns.io.manifest import LIFT_AGAIN, check_digests, read_manifest
+from normlift_ns.io.run_dir import LIFT_AGAIN, check_digests, read_manifest
 
 FIELD_FILE, EVIDENCE_FILE = "field.safetensors", "evidence.safetensors"
 EVIDENCE_FORMAT = "normlift_ns.evidence/1"

@@ -22,10 +22,10 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio.load import active_sh_degree
+from normlift_ns.data.open_scene import resolve_field_paths
 from normlift_ns.errors import InputError
 from normlift_ns.exports import TrainedSplat
 from normlift_ns.io.run_dir import FIELD_FOLDER, check_run
-from normlift_ns.lifted_run import resolve_field_paths
 from normlift_ns.nerfstudio_plugin.panel import SearchPanel
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.rasterization.rasterize import ray_weights, render, view_colors

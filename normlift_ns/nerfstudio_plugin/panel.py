@@ -25,12 +25,12 @@ from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.relevancy import RELEVANCY_RULES
+from normlift_ns.data.open_scene import open_scene
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT, TrainedSplat, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
-from normlift_ns.lifted_run import open_scene
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for

@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import gelu, interpolate, layer_norm, linear, pad, scaled_dot_product_attention
 
-from normlift_ns.core.device import can_use_triton
-from normlift_ns.encoders.batching import AdaptiveBatches
+from normlift_ns.core.device import AdaptiveBatches, can_use_triton
 from normlift_ns.options import DEFAULT_SAM, SamPrecision
 from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.batching import AdaptiveBatches
+from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_SAM3, SamPrecision, short_repr

@@ -98,19 +98,15 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
     except ValueError:
         for one in new:
             try:
-                vectors[one] = _read_alone(one, read)
+                if is_click(one):
+                    raise InputError(f"{one!r} is not a click of this session or run; click the scene again.")
+                vectors[one] = read([one])[0]
             except ValueError as error:
                 errors[one] = str(error)
     return tuple(
         Prompt(one, error=errors[one]) if one in errors else Prompt(one, np.asarray(vectors[one], np.float32))
         for one in texts
     )
-
-
-def _read_alone(text: str, read: EncodeTexts) -> Any:
-    if is_click(text):
-        raise InputError(f"{text!r} is not a click of this session or run; click the scene again.")
-    return read([text])[0]
 
 
 def build_query(

@@ -117,10 +117,6 @@ T = TypeVar("T")
 MAX_STATES = 100
 
 
-def _identity(state: T) -> T:
-    return state
-
-
 @dataclass(frozen=True, eq=False)
 class History(Generic[T]):
     """States in chronological order, and the index of the current one.
@@ -136,11 +132,11 @@ class History(Generic[T]):
     key: str | None = None
     """Key of the last step, if successive steps with this key are merged."""
 
-    compact: Callable[[T], T] = _identity
+    compact: Callable[[T], T] = lambda state: state
     """Applied to a state when another one becomes current, for instance `State.without_caches`."""
 
     @staticmethod
-    def of(state: T, *, lean: Callable[[T], T] = _identity) -> History[T]:
+    def of(state: T, *, lean: Callable[[T], T] = lambda state: state) -> History[T]:
         """Return a history with a single state."""
         return History((state,), compact=lean)
 

@@ -8,7 +8,7 @@ import torch
 
 from normlift_ns import Evidence, RefineConfig, consensus, lift, refine
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.validation import check_unit_rows
+from normlift_ns.core.lift import check_unit_rows
 from tests.scenes import generator, unit_rows
 
 EVIDENCE = Evidence.from_entries(

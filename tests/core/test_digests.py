@@ -25,7 +25,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import array_digest, check_array, load_arrays, save_arrays
 from normlift_ns.io.atomic import text_digest
 from normlift_ns.io.field import read_evidence
-from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
+from normlift_ns.io.run_dir import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
 from tests.examples import FACTOR, examples
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
 from tests.scenes import generator, random_evidence, unit_rows

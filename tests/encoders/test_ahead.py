@@ -6,7 +6,7 @@ from threading import get_ident
 
 import pytest
 
-from normlift_ns.encoders.batching import prefetch_map
+from normlift_ns.core.device import prefetch_map
 
 
 def test_results_come_in_the_order_of_their_items() -> None:

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.encoders.batching import AdaptiveBatches
+from normlift_ns.core.device import AdaptiveBatches
 
 
 def narrow(room: int):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import PatchFeatures, RegionFeatures, ViewFeatures, iterate_view_features
-from normlift_ns.encoders.batching import AdaptiveBatches
 from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder

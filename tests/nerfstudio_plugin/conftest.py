@@ -16,8 +16,8 @@ from normlift_ns import SemanticField, lift, rasterize_evidence
 from normlift_ns.api import write_run
 from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.open_scene import load_field
 from normlift_ns.io.run_dir import run_directory
-from normlift_ns.lifted_run import load_field
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import ENCODER_KEYS
@@ -97,7 +97,7 @@ def capture(request: pytest.FixtureRequest) -> Path:
 
 def opened(config: Path, **how: Any) -> Any:
     """The scene of a run."""
-    from normlift_ns.lifted_run import open_scene  # noqa: PLC0415
+    from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415
 
     return open_scene(config, **how)
 

@@ -12,8 +12,15 @@ import torch
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_existing, refuse_run_files
-from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest
-from normlift_ns.io.run_dir import add_digest_comment, check_run, refuse_existing_run, run_file_digests
+from normlift_ns.io.run_dir import (
+    MANIFEST_FILE,
+    add_digest_comment,
+    check_file_digests,
+    check_run,
+    read_manifest,
+    refuse_existing_run,
+    run_file_digests,
+)
 from tests.core.test_digests import as_version_0_1, example, flipped
 from tests.hostile import no_files
 

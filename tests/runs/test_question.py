@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from normlift_ns import InputError
 from normlift_ns.io.arrays import save_arrays
-from normlift_ns.io.manifest import read_manifest, write_manifest
+from normlift_ns.io.run_dir import read_manifest, write_manifest
 from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.query.text_encoder import encoder_digest
 from tests.core.test_digests import flipped

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.frames import Frame, Intrinsics
-from normlift_ns.data.open_splat import SplatScene, save_splat, splatfacto_checkpoint
+from normlift_ns.data.open_scene import SplatScene, save_splat, splatfacto_checkpoint
 from normlift_ns.data.splat import SplatParameters
 
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}

@@ -31,7 +31,7 @@ from normlift_ns.data.checkpoint import (
 )
 from normlift_ns.data.frames import Frame, Intrinsics, check_frames, rescale_intrinsics
 from normlift_ns.data.images import ImageViews
-from normlift_ns.data.open_splat import SplatScene, open_saved_splat
+from normlift_ns.data.open_scene import SplatScene, open_saved_splat
 from normlift_ns.data.splat import read_ply
 from normlift_ns.data.transforms import read_dataparser_transforms, read_transforms, read_world_transform
 from normlift_ns.errors import InputError

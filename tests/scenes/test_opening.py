@@ -26,7 +26,7 @@ from normlift_ns import (
 )
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
-from normlift_ns.data.open_splat import open_saved_splat
+from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_transforms, write_transforms
 from normlift_ns.evidence_collection import FeatureExport
