@@ -652,3 +652,7 @@ class AskOptions:
     def rules(self) -> dict[str, Any]:
         """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
         return {name: value for name, value in vars(self).items() if not name.startswith("text_")}
+
+    def encoding(self) -> dict[str, Any]:
+        """Return the other options, which encode prompts, as keyword arguments of `open_run`."""
+        return {name: value for name, value in vars(self).items() if name.startswith("text_")}

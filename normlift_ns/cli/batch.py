@@ -148,8 +148,11 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
     except InputError as error:
         raise InputError(f"{location}: {error}") from None
     key = _capture_key(command)
-    timestamp = f"{_PREFIX}{key}"
-    return Capture(line, (*options, *own, "--timestamp", timestamp), key, _run_dir(command, timestamp))
+    timestamp, run_dir = f"{_PREFIX}{key}", None
+    with suppress(InputError, OSError):  # the process of this capture reports the error
+        name, outputs = command.new_run_location()
+        run_dir = None if name is None or outputs is None else run_directory(outputs, name, timestamp)
+    return Capture(line, (*options, *own, "--timestamp", timestamp), key, run_dir)
 
 
 def _parse(words: Sequence[str]) -> NormLift:
@@ -169,13 +172,6 @@ def _parse(words: Sequence[str]) -> NormLift:
             "it out; to lift a capture again, delete its run."
         )
     return command
-
-
-def _run_dir(command: NormLift, timestamp: str) -> Path | None:
-    with suppress(InputError, OSError):  # the process of this capture reports the error
-        name, outputs = command.new_run_location()
-        return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
-    return None
 
 
 # Shards of a capture list: the part of a numbered worker.

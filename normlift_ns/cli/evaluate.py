@@ -241,10 +241,5 @@ def entrypoint() -> None:
     run_command(NormLiftEval)
 
 
-def main() -> None:
-    """Run ns-normlift-eval as a process."""
-    run_command_process(NormLiftEval)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftEval)

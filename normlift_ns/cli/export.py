@@ -110,13 +110,7 @@ class NormLiftExport:
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
-        run = open_run(
-            self.load_config,
-            data=self.data,
-            device=self.device,
-            text_vectors=self.ask.text_vectors,
-            text_template=self.ask.text_template,
-        )
+        run = open_run(self.load_config, data=self.data, device=self.device, **self.ask.encoding())
         if self.masks_dir is not None:
             refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, flags="--masks-dir")
         job = self._job(run, cloud)

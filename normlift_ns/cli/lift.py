@@ -211,20 +211,20 @@ class NormLift:
             info_progress(text)
 
         with progress_bars() as report:
-            request = LiftRequest(
-                open_scene=self.open_scene,
-                source=self.source,
-                lift=self.lift,
-                queries=self.queries,
-                output_dir=self.output_dir,
-                timestamp=self.timestamp,
-                overwrite=self.overwrite,
-                check=self.check,
-                device=self.device,
-                export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),
-                report=report,
-                say=on_message,
+            names = (
+                "open_scene",
+                "source",
+                "lift",
+                "queries",
+                "output_dir",
+                "timestamp",
+                "overwrite",
+                "check",
+                "device",
             )
+            options: dict[str, Any] = {name: getattr(self, name) for name in names}
+            export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
+            request = LiftRequest(**options, export=export, report=report, say=on_message)
             if team is None:
                 run = run_lift(request)
             else:

@@ -149,10 +149,7 @@ class NormLiftQuery:
             from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
 
             choose_device(self.device)
-        vectors, template = self.ask.text_vectors, self.ask.text_template
-        open_with = partial(
-            open_quick, self.load_config, device=self.device, text_vectors=vectors, text_template=template
-        )
+        open_with = partial(open_quick, self.load_config, device=self.device, **self.ask.encoding())
         return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
 
     @cached_property

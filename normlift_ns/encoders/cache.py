@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -40,16 +40,17 @@ def cached(source: FeatureSource, folder: Path, *, compute: bool = True) -> Feat
         NotCachedError: If `compute` is False, and a result for the image is missing.
     """
     if isinstance(source, PatchFeatures):
-        return CachedPatches(source, folder / "features", compute)
+        return cast(Any, CachedPatches(source, folder / "features", compute))
     if not isinstance(source, RegionFeatures):
         return source
-    regions = CachedRegions(source.regions, folder / "regions", compute)
-    return RegionFeatures(regions, CachedEncoder(source.encoder, folder / "features", compute))
+    regions: Any = CachedRegions(source.regions, folder / "regions", compute)
+    encoder: Any = CachedEncoder(source.encoder, folder / "features", compute)
+    return RegionFeatures(regions, encoder)
 
 
 @dataclass(frozen=True)
 class _Cached:
-    """A part of a source whose results are cached."""
+    """A part of a source whose results are cached; everything else is as in `inner`."""
 
     inner: Any
     """Computes the results."""
@@ -59,9 +60,8 @@ class _Cached:
     compute: bool = True
     """See `cached`."""
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.inner.identity
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,6 @@ class CachedRegions(_Cached):
 
     The key: the image, its name, the files that are read for it, and the settings except the selected level.
     """
-
-    @property
-    def at_once(self) -> int:
-        return self.inner.at_once
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        return self.inner.chosen
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return self.inner.files(name)
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
@@ -129,9 +118,6 @@ class CachedEncoder(_Cached):
             yield features
         yield from (rows for rows in pending if rows is not None)
 
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.inner.text(prompts)
-
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Return the cache path of the features of the regions of an image, whether the file exists or not."""
         return cache_path(self.folder, self.identity, *_key_parts(image), *_key_parts(labels))
@@ -144,9 +130,6 @@ class CachedPatches(_Cached):
     The key: the image, and the settings.
     """
 
-    def available(self, names: Sequence[str]) -> list[str]:
-        return self.inner.available(names)
-
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = cache_path(self.folder, self.identity, *_key_parts(image))
         labels = self.inner.labels(image)
@@ -155,9 +138,6 @@ class CachedPatches(_Cached):
             features = self.inner.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.inner.text(prompts)
 
 
 @dataclass(frozen=True)

@@ -627,11 +627,11 @@ class SamMasks(RegionDefaults):
     def __post_init__(self) -> None:
         check_sam_checkpoint(self.checkpoint)
 
-    @property
+    @cached_property
     def identity(self) -> dict[str, Any]:
         """Description of the regions, with the content of the checkpoint files instead of their path."""
-        precision = resolve_precision(self.precision, self.device)
-        return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
+        content, precision = sam_identity(self.checkpoint), resolve_precision(self.precision, self.device)
+        return {"kind": "sam", "checkpoint": content, "precision": precision, "rules": asdict(self.rules)}
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -717,10 +717,6 @@ class SamMasks(RegionDefaults):
 
     def _crop_masks(self, size: tuple[int, int], logits: Tensor) -> Tensor:
         return self.network.enlarge(logits, size) > 0
-
-    @cached_property
-    def _checkpoint(self) -> str:
-        return sam_identity(self.checkpoint)
 
     @cached_property
     def network(self) -> PromptedNetwork:
