@@ -33,7 +33,6 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.data.extra_images import add_stored_images
-from normlift_ns.data.images import SplitViews
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.data.transforms import capture_transforms
@@ -533,16 +532,10 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     if config.is_file() and is_saved_splat(run_dir):
         scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
-        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
+        scene = load_nerfstudio_scene(config, data=data, load_step=load_step)
         scene = add_stored_images(scene, run_dir)
     rules = recorded_gsplat_version(run_dir)
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
-
-
-def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
-    from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
-
-    return nerfstudio_views(*run)
 
 
 def open_run(

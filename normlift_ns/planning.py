@@ -366,9 +366,8 @@ def diagnose_views(scene: Scene) -> Diagnostic:
 
 def diagnose_cameras(warning: str | None) -> Diagnostic:
     """Return the result of comparing images with renders, from the warning if they differ."""
-    if warning is None:
-        return Diagnostic("cameras", "ok", "three images match renders from their cameras")
-    return Diagnostic("cameras", "warning", warning)
+    match = "three images match renders from their cameras"
+    return Diagnostic("cameras", "ok" if warning is None else "warning", warning or match)
 
 
 def diagnose_device(device: str) -> Diagnostic:
@@ -540,7 +539,7 @@ def measure_capture(
         return _Observed(block, seconds)
 
     chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
-    observe_cached = partial(observe, source=cached(source, cache, compute=False))
+    observe_cached = partial(observe, source=cached(source, cache, compute=lambda part: False))
     known: dict[int, ViewBatch] = {}
     for index in chosen if options.reuse_evidence else ():
         with suppress(NotCachedError):

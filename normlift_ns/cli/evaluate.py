@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from rich.table import Column, Table
 
 from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
-from normlift_ns.cli.preflight import check_lifted_run, check_readable_file, check_readable_folder, check_writable_file
+from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_readable_file, check_readable_folder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_output_paths
-from normlift_ns.io.atomic import refuse_existing
 from normlift_ns.options import check_device, check_options
 
 if TYPE_CHECKING:
@@ -141,9 +140,7 @@ class NormLiftEval:
         check_readable_file(self.masks.names, "--names")
         figures = [self._beside(f"{name}.svg") for name in _WITH_FIGURE if name in self.study]
         figures += pose_output_paths(self._beside("coverage")) if "coverage" in self.study else []
-        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
-        for path in (self.output_path, *figures):
-            check_writable_file(path, "--output-path")
+        check_new_files(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
 
     def _check_without_truth(self) -> None:
         """Raise InputError unless the options fit a study without ground truth."""

@@ -133,13 +133,7 @@ class NormLiftExport:
         if answer is None:
             return job
         instances = exports.answer_instances(answer, reach=self.reach, min_size=self.min_size)
-        question = answer.question
-        objects = {
-            "queries": object_tables(run.field, answer.means, instances),
-            "relevancy": question.rule,
-            "threshold": question.threshold,
-            "min_reliability": question.min_reliability,
-        }
+        objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
         transfer = None
         if cloud is not None:
             names = [*exports.INSTANCE_PROPERTIES, *(f"relevancy_{i}" for i in range(len(answer.texts)))]

@@ -236,12 +236,7 @@ class NormLiftQuery:
         answer = self._answer_with_scene(question)
         catalog = self._run.catalogue(answer, metres_per_unit=self.metres_per_unit)
         if self.objects_dir is not None:
-            metadata = {
-                "texts": list(question.texts),
-                "relevancy": question.rule,
-                "threshold": question.threshold,
-                "min_reliability": question.min_reliability,
-            }
+            metadata = {"texts": list(question.texts), **question.settings()}
             write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 
