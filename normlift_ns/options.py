@@ -137,6 +137,13 @@ def check_options(options: Any) -> None:
         object.__setattr__(options, name, _convert(name, getattr(options, name), hint))
 
 
+class CheckedOptions:
+    """Base of options dataclasses whose fields are checked by `check_options` when they are made."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
 def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -> Any:
     """Return the value of a numeric option in `OPTION_RANGES` as int or float.
 
@@ -497,7 +504,7 @@ VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class RefineConfig(CheckedOptions):
     """Parameters of the vote among neighboring Gaussians.
 
     The paper publishes no values. The defaults were tuned on scenes with ground truth: see docs/accuracy.md. The two
@@ -533,9 +540,6 @@ class RefineConfig:
     """Weight of all neighbors together in a posterior vote, in views, >= 0; larger values overrule Gaussians that more
     views saw."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Read configs of version 0.1, which had only the paper's vote."""
         vars(self).update({"vote": "paper", **state})
@@ -548,7 +552,7 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
-class LiftOptions:
+class LiftOptions(CheckedOptions):
     """Views, consensus, storage and rasterization of a lift.
 
     Raises:
@@ -607,9 +611,6 @@ class LiftOptions:
     not released yet and may still change."""
     reuse_evidence: bool = True
     """Reuse cached 2D features and evidence of earlier lifts if they match."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Read configs of version 0.1, which call `storage` `form` and have no consensus."""

@@ -34,7 +34,7 @@ from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.manifest import read_manifest
 from normlift_ns.io.run_dir import FIELD_FOLDER, run_directory
-from normlift_ns.options import check_options, short_repr
+from normlift_ns.options import CheckedOptions, short_repr
 
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
@@ -491,7 +491,7 @@ def _lift_capture(
 
 
 @dataclass
-class NormLiftBatch:
+class NormLiftBatch(CheckedOptions):
     """Lift many captures, each in its own process; several workers may share the list. A rerun skips captures that
     were lifted with the same options."""
 
@@ -509,9 +509,6 @@ class NormLiftBatch:
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400; use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> None:
         """Lift the captures and print the results.

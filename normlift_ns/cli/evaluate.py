@@ -14,7 +14,7 @@ from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_
 from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_readable_file, check_readable_folder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_output_paths
-from normlift_ns.options import check_device, check_options
+from normlift_ns.options import CheckedOptions, check_device
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.options import Evaluation
@@ -29,7 +29,7 @@ _WITHOUT_TRUTH = ("coverage", "timing")
 
 
 @dataclass
-class NormLiftEval:
+class NormLiftEval(CheckedOptions):
     """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
 
     load_config: tuple[Path, ...]
@@ -62,9 +62,6 @@ class NormLiftEval:
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> Evaluation:
         """Evaluate the runs, write the output file and print the tables."""

@@ -30,8 +30,8 @@ from normlift_ns.options import (
     OBJECT_MAX_GAP,
     OBJECT_MIN_GAUSSIANS,
     AskOptions,
+    CheckedOptions,
     check_device,
-    check_options,
     check_prompt_list,
 )
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class NormLiftExport:
+class NormLiftExport(CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
 
     load_config: Path
@@ -93,9 +93,6 @@ class NormLiftExport:
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> Path:
         """Write the files and return the path of the PLY file."""

@@ -29,7 +29,7 @@ from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_w
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
-from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
+from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, CheckedOptions, check_device, check_prompt_list
 
 if TYPE_CHECKING:
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class NormLiftQuery:
+class NormLiftQuery(CheckedOptions):
     """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
 
     load_config: Path
@@ -94,9 +94,6 @@ class NormLiftQuery:
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows."""
