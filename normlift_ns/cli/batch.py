@@ -338,12 +338,6 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
     return table
 
 
-def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> str:
-    """Return the number of lifted, skipped and failed captures as one line."""
-    states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
-    return ", ".join(f"{count} {word}" for state, word in _STATE_NAMES.items() if (count := states.count(state)) > 0)
-
-
 # Child processes that lift one capture each.
 
 
@@ -528,7 +522,9 @@ class NormLiftBatch(CheckedOptions):
         outcomes = lift_captures(captures, folder, self.patience, on_message=info)
         if len(captures) > 0:
             CONSOLE.print(outcomes_table(captures, outcomes))
-            info(count_outcomes(captures, outcomes))
+            states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
+            counts = ((states.count(state), word) for state, word in _STATE_NAMES.items())
+            info(", ".join(f"{count} {word}" for count, word in counts if count > 0))
         code = largest_exit_code(outcomes[capture.key] for capture in captures if capture.key in outcomes)
         if code != 0:
             raise SystemExit(code)
