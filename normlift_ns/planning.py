@@ -587,8 +587,7 @@ def measure_capture(
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
         write_bytes_s=write_bytes_s,
-        view_bytes=sum(4 * rows.numel() + 2 * labels.numel() for labels, rows in zip(block.labels, block.features))
-        / count,
+        view_bytes=(4 * sum(map(Tensor.numel, block.features)) + 2 * sum(map(Tensor.numel, block.labels))) / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
         measured_views=max(count, len(observed.block.cameras)),

@@ -39,6 +39,7 @@ CLASS_SETS = {
 """NYU40 ids of the three sets."""
 SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
+_OTHER: dict[WithoutDirection, WithoutDirection] = {"first": "none", "none": "first"}
 
 
 class SceneLabels(NamedTuple):
@@ -144,7 +145,7 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
     `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
     """
     min_opacity, without_direction = options.min_opacity, options.without_direction
-    other: WithoutDirection = "none" if without_direction == "first" else "first"
+    other = _OTHER[without_direction]
     names = [scene.name for scene in scenes]
     results, rows = {}, []
     by_scene: list[dict[str, Any]] = [{"scene": name} for name in names]

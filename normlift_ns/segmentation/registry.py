@@ -122,12 +122,10 @@ GRID = MaskSource(_make("segmentation.regions:Grid", lambda o, _: (o.region_coun
 """Square cells."""
 
 
-def _make_files(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.regions import LabelFiles  # noqa: PLC0415 (needs torch)
-
-    assert options.regions_dir is not None  # checked below
-    level = None if options.level is None else int(options.level)
-    return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
+_make_files = _make(
+    "segmentation.regions:LabelFiles",
+    lambda o, _: (o.regions_dir, o.regions_background, None if o.level is None else int(o.level), o.regions_resample),
+)
 
 
 def _check_files(options: SourceOptions) -> None:
@@ -145,13 +143,10 @@ FILES = MaskSource(_make_files, _check_files, ("regions_dir", "level"))
 """Label maps from a folder."""
 
 
-def _make_langsplat(options: SourceOptions, device: str) -> FeatureSource:
-    from normlift_ns.encoders.langsplat import LangSplat  # noqa: PLC0415 (needs torch)
-
-    assert options.features_dir is not None  # checked below
-    level: Any = options.level or "l"
-    texts = make_texts(options, device)
-    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+_make_langsplat = _make(
+    "encoders.langsplat:LangSplat",
+    lambda o, device: (o.features_dir, make_texts(o, device), o.level or "l", o.features_missing, o.regions_resample),
+)
 
 
 def _check_langsplat(options: SourceOptions) -> None:
