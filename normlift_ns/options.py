@@ -140,6 +140,13 @@ def check_options(options: Any) -> None:
         object.__setattr__(options, name, _convert(name, getattr(options, name), hint))
 
 
+class CheckedOptions:
+    """Base of options dataclasses whose fields are checked by `check_options` when they are made."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
 def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -> Any:
     """Return the value of a numeric option in `OPTION_RANGES` as int or float.
 
@@ -487,7 +494,7 @@ VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class RefineConfig(CheckedOptions):
     """Parameters of the vote among neighboring Gaussians.
 
     The paper publishes no values. The defaults were tuned on scenes with ground truth: see docs/accuracy.md. The two
@@ -523,9 +530,6 @@ class RefineConfig:
     """Weight of all neighbors together in a posterior vote, in views, >= 0; larger values overrule Gaussians that more
     views saw."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Read configs of version 0.1, which had only the paper's vote."""
         vars(self).update({"vote": "paper", **state})
@@ -538,7 +542,7 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
-class LiftOptions:
+class LiftOptions(CheckedOptions):
     """Views, consensus, storage and rasterization of a lift.
 
     Raises:
@@ -598,9 +602,6 @@ class LiftOptions:
     reuse_evidence: bool = True
     """Reuse cached 2D features and evidence of earlier lifts if they match."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Read configs of version 0.1, which call `storage` `form` and have no consensus."""
         options = {"storage" if name == "form" else name: value for name, value in state.items()}
@@ -642,3 +643,7 @@ class AskOptions:
     def rules(self) -> dict[str, Any]:
         """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
         return {name: value for name, value in vars(self).items() if not name.startswith("text_")}
+
+    def encoding(self) -> dict[str, Any]:
+        """Return the other options, which encode prompts, as keyword arguments of `open_run`."""
+        return {name: value for name, value in vars(self).items() if name.startswith("text_")}

@@ -354,19 +354,16 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
         return Diagnostic("in view", "error", message, "give the cameras of this splat, or --world-transform")
-    advice = "the others get no semantics; are these the cameras of the splat?"
-    return (
-        Diagnostic("in view", "warning", message, advice)
-        if share < _FEW_IN_VIEW
-        else Diagnostic("in view", "ok", message)
-    )
+    if share < _FEW_IN_VIEW:
+        advice = "the others get no semantics; are these the cameras of the splat?"
+        return Diagnostic("in view", "warning", message, advice)
+    return Diagnostic("in view", "ok", message)
 
 
 def diagnose_cameras(warning: str | None) -> Diagnostic:
     """Return the result of comparing images with renders, from the warning if they differ."""
-    if warning is None:
-        return Diagnostic("cameras", "ok", "three images match renders from their cameras")
-    return Diagnostic("cameras", "warning", warning)
+    match = "three images match renders from their cameras"
+    return Diagnostic("cameras", "ok" if warning is None else "warning", warning or match)
 
 
 def diagnose_device(device: str) -> Diagnostic:
@@ -538,8 +535,11 @@ def measure_capture(
         return _Observed(block, seconds)
 
     chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
-    observe_cached = partial(observe, source=cached(source, cache, compute=False))
-    known = _cached_views(chosen if options.reuse_evidence else (), observe_cached)
+    observe_cached = partial(observe, source=cached(source, cache, compute=lambda part: False))
+    known: dict[int, ViewBatch] = {}
+    for index in chosen if options.reuse_evidence else ():
+        with suppress(NotCachedError):
+            known[index] = observe_cached([index]).block
     new = [index for index in chosen if index not in known]
     batch = segmentation_workers(source)
     encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
@@ -550,8 +550,15 @@ def measure_capture(
     def rasterize(folder: Path) -> Evidence:
         return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
+    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:  # rasterized, read, and written once more
+        folder, file = Path(name), Path(name) / "again.safetensors"
+        if cuda:  # kernels for labels like these are compiled once for all lifts
+            rasterize(folder / "first")
+        evidence_s, evidence = timed(lambda: rasterize(folder))
+        cached_evidence_s, _ = timed(lambda: rasterize(folder))
+        write_s, _ = timed(lambda: evidence.save(file))
+        write_bytes_s = file.stat().st_size / max(write_s, 1e-6)
     count = len(block.cameras)
-    evidence, evidence_s, cached_evidence_s, write_bytes_s = _measure_evidence(rasterize, timed, warm_up=cuda)
     device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
     rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), clock)
     groups = ((_joined(list(known.values())), len(known)), (observed.block, len(new)))
@@ -576,8 +583,7 @@ def measure_capture(
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
         write_bytes_s=write_bytes_s,
-        view_bytes=sum(4 * rows.numel() + 2 * labels.numel() for labels, rows in zip(block.labels, block.features))
-        / count,
+        view_bytes=(4 * sum(map(Tensor.numel, block.features)) + 2 * sum(map(Tensor.numel, block.labels))) / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=device_bytes,
         measured_views=max(count, len(observed.block.cameras)),
@@ -588,33 +594,6 @@ def _per_view(observed: _Observed) -> float | None:
     """Return the seconds for each view; None without views."""
     count = len(observed.block.cameras)
     return observed.seconds / count if count > 0 else None
-
-
-def _cached_views(indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed]) -> dict[int, ViewBatch]:
-    """Return the views that can be observed from the cache, by index."""
-    cached: dict[int, ViewBatch] = {}
-    for index in indices:
-        with suppress(NotCachedError):
-            cached[index] = observe([index]).block
-    return cached
-
-
-def _measure_evidence(
-    rasterize: Callable[[Path], Evidence], timed: Callable[[Callable[[], Any]], tuple[float, Any]], *, warm_up: bool
-) -> tuple[Evidence, float, float, float]:
-    """Rasterize some views into a temporary folder, read them from there, and write their evidence once more.
-
-    Returns:
-        The evidence, the seconds to rasterize it and to read it, and bytes written per second.
-    """
-    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:
-        folder, file = Path(name), Path(name) / "again.safetensors"
-        if warm_up:  # kernels for labels like these are compiled once for all lifts
-            rasterize(folder / "first")
-        seconds, evidence = timed(lambda: rasterize(folder))
-        cached_seconds, _ = timed(lambda: rasterize(folder))
-        write_s, _ = timed(lambda: evidence.save(file))
-        return evidence, seconds, cached_seconds, file.stat().st_size / max(write_s, 1e-6)
 
 
 def _observe_loaded(

@@ -15,7 +15,7 @@ have the largest terms. A Gaussian that copied the direction of a neighbor count
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,9 +32,9 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures
+from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import restore_source
-from normlift_ns.encoders.cache import cached
+from normlift_ns.encoders.cache import REMEDY, cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import (
@@ -277,7 +277,6 @@ def _eroded(masks: Bool[Tensor, "r h w"], width: int) -> Bool[Tensor, "r h w"]:
 
 _FEATURE_TOLERANCE = 1e-3
 """Largest difference between a stored feature and the same feature computed again."""
-_REMEDY = "restore it by lifting again with: ns-normlift (the same options)"
 
 
 class VoteImage(NamedTuple):
@@ -384,7 +383,7 @@ class RecordedVotes:
         if evidence is None:
             raise InputError(
                 f"{self.cache / 'evidence'} no longer holds the evidence of the lift, and the run stores directions "
-                f"only; {_REMEDY}. With --storage evidence the run itself keeps the evidence"
+                f"only; {REMEDY}. With --storage evidence the run itself keeps the evidence"
             )
         return evidence
 
@@ -401,7 +400,7 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        return cached(_without_networks(restore_source(self.field.manifest), self.cache), self.cache)
+        return cached(restore_source(self.field.manifest), self.cache, compute=_is_quick)
 
     def _check_regions(self, view: int, block: ViewBatch) -> None:
         """Raise if an image no longer has the regions that voted."""
@@ -427,35 +426,6 @@ class RecordedVotes:
         return value
 
 
-def _without_networks(source: FeatureSource, cache: Path) -> FeatureSource:
-    """Return the source with networks that raise an error instead of computing what the cache does not hold."""
-    if not isinstance(source, RegionFeatures | PatchFeatures):
-        return source
-    changed = {} if isinstance(source.encoder, ColorEncoder) else {"encoder": _CacheOnly(source.encoder, cache)}
-    if isinstance(source, RegionFeatures) and isinstance(source.regions, SamMasks):
-        changed["regions"] = _CacheOnly(source.regions, cache)
-    return replace(source, **changed)
-
-
-class _CacheOnly:
-    """Stand-in for a network whose results are cached; computing a missing one might take minutes, so it raises."""
-
-    def __init__(self, network: Any, cache: Path) -> None:
-        self._network, self._cache = network, cache
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._network, name)
-
-    def labels(self, image: Tensor, name: str) -> Tensor:
-        raise InputError(f"{self._cache / 'regions'} no longer holds the regions of {name}; {_REMEDY}")
-
-    def encode_each(self, views: Iterable[tuple[Tensor, Tensor]]) -> Iterator[Tensor]:
-        for _ in views:
-            raise self._missing_features()
-        yield from ()
-
-    def patches(self, image: Tensor, rows: int, columns: int) -> Tensor:
-        raise self._missing_features()
-
-    def _missing_features(self) -> InputError:
-        return InputError(f"{self._cache / 'features'} no longer holds the features of the images; {_REMEDY}")
+def _is_quick(part: Any) -> bool:
+    """Return whether regions or an encoder may compute results that are not cached; a network might take minutes."""
+    return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))

@@ -33,7 +33,7 @@ from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
-from normlift_ns.options import check_options, short_repr
+from normlift_ns.options import CheckedOptions, short_repr
 
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
@@ -147,8 +147,11 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
     except InputError as error:
         raise InputError(f"{location}: {error}") from None
     key = _capture_key(command)
-    timestamp = f"{_PREFIX}{key}"
-    return Capture(line, (*options, *own, "--timestamp", timestamp), key, _run_dir(command, timestamp))
+    timestamp, run_dir = f"{_PREFIX}{key}", None
+    with suppress(InputError, OSError):  # the process of this capture reports the error
+        name, outputs = command.new_run_location()
+        run_dir = None if name is None or outputs is None else run_directory(outputs, name, timestamp)
+    return Capture(line, (*options, *own, "--timestamp", timestamp), key, run_dir)
 
 
 def _parse(words: Sequence[str]) -> NormLift:
@@ -168,13 +171,6 @@ def _parse(words: Sequence[str]) -> NormLift:
             "it out; to lift a capture again, delete its run."
         )
     return command
-
-
-def _run_dir(command: NormLift, timestamp: str) -> Path | None:
-    with suppress(InputError, OSError):  # the process of this capture reports the error
-        name, outputs = command.new_run_location()
-        return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
-    return None
 
 
 _MAX_SHARDS = 10**6
@@ -338,12 +334,6 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
     return table
 
 
-def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> str:
-    """Return the number of lifted, skipped and failed captures as one line."""
-    states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
-    return ", ".join(f"{count} {word}" for state, word in _STATE_NAMES.items() if (count := states.count(state)) > 0)
-
-
 LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
@@ -485,7 +475,7 @@ def _lift_capture(
 
 
 @dataclass
-class NormLiftBatch:
+class NormLiftBatch(CheckedOptions):
     """Lift many captures, each in its own process; several workers may share the list. A rerun skips captures that
     were lifted with the same options."""
 
@@ -503,9 +493,6 @@ class NormLiftBatch:
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400; use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> None:
         """Lift the captures and print the results.
@@ -525,7 +512,9 @@ class NormLiftBatch:
         outcomes = lift_captures(captures, folder, self.patience, on_message=info)
         if len(captures) > 0:
             CONSOLE.print(outcomes_table(captures, outcomes))
-            info(count_outcomes(captures, outcomes))
+            states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
+            counts = ((states.count(state), word) for state, word in _STATE_NAMES.items())
+            info(", ".join(f"{count} {word}" for count, word in counts if count > 0))
         code = largest_exit_code(outcomes[capture.key] for capture in captures if capture.key in outcomes)
         if code != 0:
             raise SystemExit(code)

@@ -19,7 +19,7 @@ from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
 from normlift_ns.io.atomic import atomic_file, write_text_file
-from normlift_ns.options import AskOptions, SourceOptions, check_options
+from normlift_ns.options import AskOptions, CheckedOptions, SourceOptions
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
@@ -31,7 +31,7 @@ _COMPILE = (
 
 
 @dataclass
-class Demo:
+class Demo(CheckedOptions):
     """Generate a room with a trained run, lift it with ns-normlift, and search it for objects by name."""
 
     folder: Path = Path("demo")
@@ -40,9 +40,6 @@ class Demo:
     """Number of Gaussians in the room, at least 2,000; larger values give finer surfaces and take longer."""
     views: int = 24
     """Number of training views, at least 3; more views take longer."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> dict[str, float]:
         """Run the demo and return the mIoU before and after refinement."""

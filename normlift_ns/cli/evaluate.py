@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from rich.table import Column, Table
 
 from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
-from normlift_ns.cli.preflight import check_lifted_run, check_readable_file, check_readable_folder, check_writable_file
+from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_readable_file, check_readable_folder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_output_paths
-from normlift_ns.io.atomic import refuse_existing
-from normlift_ns.options import check_device, check_options
+from normlift_ns.options import CheckedOptions, check_device
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.options import Evaluation
@@ -30,7 +29,7 @@ _WITHOUT_TRUTH = ("coverage", "timing")
 
 
 @dataclass
-class NormLiftEval:
+class NormLiftEval(CheckedOptions):
     """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
 
     load_config: tuple[Path, ...]
@@ -63,9 +62,6 @@ class NormLiftEval:
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> Evaluation:
         """Evaluate the runs, write the output file and print the tables."""
@@ -141,9 +137,7 @@ class NormLiftEval:
         check_readable_file(self.masks.names, "--names")
         figures = [self._beside(f"{name}.svg") for name in _WITH_FIGURE if name in self.study]
         figures += pose_output_paths(self._beside("coverage")) if "coverage" in self.study else []
-        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
-        for path in (self.output_path, *figures):
-            check_writable_file(path, "--output-path")
+        check_new_files(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
 
     def _check_without_truth(self) -> None:
         """Raise InputError unless the options fit a study without ground truth."""
@@ -241,10 +235,5 @@ def entrypoint() -> None:
     run_command(NormLiftEval)
 
 
-def main() -> None:
-    """Run ns-normlift-eval as a process."""
-    run_command_process(NormLiftEval)
-
-
 if __name__ == "__main__":
-    main()
+    run_command_process(NormLiftEval)

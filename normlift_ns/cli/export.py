@@ -30,8 +30,8 @@ from normlift_ns.options import (
     OBJECT_MAX_GAP,
     OBJECT_MIN_GAUSSIANS,
     AskOptions,
+    CheckedOptions,
     check_device,
-    check_options,
     check_prompt_list,
 )
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class NormLiftExport:
+class NormLiftExport(CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
 
     load_config: Path
@@ -94,9 +94,6 @@ class NormLiftExport:
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def main(self) -> Path:
         """Write the files and return the path of the PLY file."""
         check_device(self.device)
@@ -110,13 +107,7 @@ class NormLiftExport:
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
-        run = open_run(
-            self.load_config,
-            data=self.data,
-            device=self.device,
-            text_vectors=self.ask.text_vectors,
-            text_template=self.ask.text_template,
-        )
+        run = open_run(self.load_config, data=self.data, device=self.device, **self.ask.encoding())
         if self.masks_dir is not None:
             refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, flags="--masks-dir")
         job = self._job(run, cloud)
@@ -139,13 +130,7 @@ class NormLiftExport:
         if answer is None:
             return job
         instances = exports.answer_instances(answer, reach=self.reach, min_size=self.min_size)
-        question = answer.question
-        objects = {
-            "queries": object_tables(run.field, answer.means, instances),
-            "relevancy": question.rule,
-            "threshold": question.threshold,
-            "min_reliability": question.min_reliability,
-        }
+        objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
         transfer = None
         if cloud is not None:
             names = [*exports.INSTANCE_PROPERTIES, *(f"relevancy_{i}" for i in range(len(answer.texts)))]

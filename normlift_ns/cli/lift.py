@@ -34,7 +34,7 @@ from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
-from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
+from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, check_number
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
@@ -74,7 +74,7 @@ class OpenedCapture(NamedTuple):
 
 
 @dataclass
-class NormLift:
+class NormLift(CheckedOptions):
     """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a PLY
     file or a checkpoint of gsplat's trainer."""
 
@@ -114,9 +114,6 @@ class NormLift:
     """Folder for a copy of the lifted regions and features, in the format of LangSplat's preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> LiftedRun | None:
         """Lift and return the new run; None for a dry run, or if another process writes the run."""
@@ -206,20 +203,20 @@ class NormLift:
             info_progress(text)
 
         with progress_bars() as report:
-            request = LiftRequest(
-                open_scene=self.open_scene,
-                source=self.source,
-                lift=self.lift,
-                queries=self.queries,
-                output_dir=self.output_dir,
-                timestamp=self.timestamp,
-                overwrite=self.overwrite,
-                check=self.check,
-                device=self.device,
-                export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),
-                report=report,
-                say=on_message,
+            names = (
+                "open_scene",
+                "source",
+                "lift",
+                "queries",
+                "output_dir",
+                "timestamp",
+                "overwrite",
+                "check",
+                "device",
             )
+            options: dict[str, Any] = {name: getattr(self, name) for name in names}
+            export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
+            request = LiftRequest(**options, export=export, report=report, say=on_message)
             if team is None:
                 run = run_lift(request)
             else:

@@ -13,8 +13,6 @@ from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.run_dir import field_folder, read_manifest, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
-_LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
-
 
 def check_readable_file(path: Path | None, flag: str) -> None:
     """Raise FileNotFoundError if the path is missing, or InputError if it is not a regular file."""

@@ -29,7 +29,7 @@ from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_w
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
-from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, check_device, check_options, check_prompt_list
+from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, CheckedOptions, check_device, check_prompt_list
 
 if TYPE_CHECKING:
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class NormLiftQuery:
+class NormLiftQuery(CheckedOptions):
     """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
 
     load_config: Path
@@ -95,9 +95,6 @@ class NormLiftQuery:
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows."""
         self._check()
@@ -149,10 +146,7 @@ class NormLiftQuery:
             from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
 
             choose_device(self.device)
-        vectors, template = self.ask.text_vectors, self.ask.text_template
-        open_with = partial(
-            open_quick, self.load_config, device=self.device, text_vectors=vectors, text_template=template
-        )
+        open_with = partial(open_quick, self.load_config, device=self.device, **self.ask.encoding())
         return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
 
     @cached_property
@@ -251,12 +245,7 @@ class NormLiftQuery:
             device=choose_device("auto"),
         )
         if self.objects_dir is not None:
-            metadata = {
-                "texts": list(question.texts),
-                "relevancy": question.rule,
-                "threshold": question.threshold,
-                "min_reliability": question.min_reliability,
-            }
+            metadata = {"texts": list(question.texts), **question.settings()}
             objects.write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 

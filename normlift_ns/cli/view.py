@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, NoReturn
 from normlift_ns.cli.common import TerminatedError, info, run_command, run_command_process
 from normlift_ns.cli.preflight import check_lifted_run, check_readable_file
 from normlift_ns.errors import InputError
-from normlift_ns.options import check_device, check_options
+from normlift_ns.options import CheckedOptions, check_device
 
 if TYPE_CHECKING:
     from normlift_ns.viewer.adapter import Door
 
 
 @dataclass
-class NormLiftView:
+class NormLiftView(CheckedOptions):
     """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
     GPU.
 
@@ -45,9 +45,6 @@ class NormLiftView:
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def main(self) -> None:
         """Serve the viewer until the process is interrupted."""

@@ -8,6 +8,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from normlift_ns.errors import InputError
 
@@ -93,6 +94,19 @@ class GaussianScene:
         low, high = QUATERNION_RANGE
         small = (self.means.float().abs() <= MAX_MEAN).all(dim=1) & (self.scales.float() <= MAX_SCALE).all(dim=1)
         return small & (length >= low) & (length <= high) & self.opacities.isfinite()
+
+
+def facing_pose(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
+    """Return the `world_to_camera` of a camera at `eye` that faces `target`, in float64 as these."""
+    forward = normalize(target - eye, dim=0)
+    right = torch.linalg.cross(forward, up)
+    if float(right.norm()) < 1e-6:  # straight up or down: choose any roll
+        right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[forward.abs().argmin()])
+    right = normalize(right, dim=0)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
 
 
 @dataclass(frozen=True)

@@ -75,15 +75,10 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
     return Alignment(mean, (worst, psnrs[worst]), visible, constant, focal)
 
 
-def mean_psnr(scene: Scene) -> float:
-    """Return `Match.psnr` alone, in dB."""
-    return focal_psnrs(scene, [1.0])[0]
-
-
-def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
-    """Return the mean PSNR in dB on the three views for each factor on the focal lengths."""
-    views, render = _sample_views(scene), partial(_render, scene, scene.gaussians, RasterSettings())
-    return [_mean_psnr(render, views, factor) for factor in factors]
+def mean_psnr(scene: Scene, factor: float = 1.0) -> float:
+    """Return `Alignment.psnr` alone, in dB, with a factor on the focal lengths."""
+    render = partial(_render, scene, scene.gaussians, RasterSettings())
+    return _mean_psnr(render, _sample_views(scene), factor)
 
 
 def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:

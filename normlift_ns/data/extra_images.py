@@ -11,7 +11,6 @@ import torch
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.data.frames import WorldTransform, transform_frames
-from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import AnyScene, SplatScene, with_frames
 from normlift_ns.data.open_splat import read_camera_file
 from normlift_ns.data.transforms import CameraFile, relative_name
@@ -42,7 +41,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
         SplatOptions(transforms=path, images=images) if is_transforms else SplatOptions(colmap=path, images=images)
     )
     extended = read_camera_file(options, f"remove them from {path}")
-    known = _known_cameras(scene)
+    splits = (scene.train, scene.held_out)
+    known = {_key(name): camera for views in splits for name, camera in zip(views.names, views.cameras)}
     new = [frame for frame in extended.frames if _key(frame.name) not in known]
     if len(new) == 0:
         raise InputError(
@@ -65,11 +65,6 @@ def _key(name: str) -> str:
     """
     first, *rest = PurePosixPath(name).parts
     return "/".join(rest) if len(rest) > 0 and first.startswith("images") else name
-
-
-def _known_cameras(scene: NerfstudioScene | SplatScene) -> dict[str, Camera]:
-    splits = (scene.train, scene.held_out)
-    return {_key(name): camera for views in splits for name, camera in zip(views.names, views.cameras)}
 
 
 def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:

@@ -131,6 +131,11 @@ def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Itera
         yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
 
 
+def camera_type_error(file: Path, kind: str) -> str:
+    """Return the message about an image whose camera is of a type that splatfacto does not support."""
+    return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
+
+
 class SplitViews:
     """Lazy `Views` of V images on disk: indexing reads and undistorts one image.
 

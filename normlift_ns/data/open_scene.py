@@ -20,7 +20,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View, Views, camera_summary, cameras_differ
 from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, check_frames
-from normlift_ns.data.images import ImageViews, SplitViews
+from normlift_ns.data.images import ImageViews
 from normlift_ns.data.nerfstudio.load import NerfstudioScene, load_nerfstudio_scene
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import read_json_file, read_transforms, write_transforms
@@ -257,16 +257,10 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     if config.is_file() and (run_dir / SPLAT_FILE).is_file():  # lifted from a splat without a nerfstudio run
         scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
-        scene = load_nerfstudio_scene(config, data=data, load_step=load_step, make_nerfstudio_views=_by_nerfstudio)
+        scene = load_nerfstudio_scene(config, data=data, load_step=load_step)
         scene = add_stored_images(scene, run_dir)
     rules = recorded_gsplat_version(run_dir)
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
-
-
-def _by_nerfstudio(*run: Any) -> tuple[SplitViews, SplitViews]:
-    from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
-
-    return nerfstudio_views(*run)
 
 
 def load_field(

@@ -118,7 +118,16 @@ def open_splat(
             train.check_files(),
         )
 
-    return _first_aligned(scene_in, _candidate_worlds(file, options, cameras), say)
+    (_, first), *others = _candidate_worlds(file, options, cameras)
+    scene = scene_in(first)
+    if len(others) == 0 or mean_psnr(scene) >= MIN_PSNR:
+        return scene
+    for text, world in others:
+        other = scene_in(world)
+        if mean_psnr(other) >= MIN_PSNR:  # renders match the images
+            say(text)
+            return other
+    return scene
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
@@ -180,24 +189,6 @@ def _format(path: Path) -> str:
         return "ply"
     with path.open("rb") as file:
         return "pt" if file.read(2) == b"PK" else "ply"  # torch.save writes ZIP archives
-
-
-def _first_aligned(
-    scene_in: Callable[[WorldTransform], SplatScene],
-    worlds: Sequence[tuple[str, WorldTransform]],
-    say: Callable[[str], None],
-) -> SplatScene:
-    """Return the scene in the first world in which renders match the images, or in the first world if none does."""
-    (_, first), *others = worlds
-    scene = scene_in(first)
-    if len(others) == 0 or mean_psnr(scene) >= MIN_PSNR:
-        return scene
-    for text, world in others:
-        other = scene_in(world)
-        if mean_psnr(other) >= MIN_PSNR:
-            say(text)
-            return other
-    return scene
 
 
 _TURNED = "The axes of gsplat's normalization point the other way; rotated by half a turn, the splat fits its images."

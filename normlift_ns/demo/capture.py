@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
 from normlift_ns.demo.room import DemoRoom
 from normlift_ns.io.atomic import atomic_file, write_text_file
 from normlift_ns.rasterization.rasterize import render
@@ -109,11 +109,7 @@ def _look_at(
     """
     distance, azimuth, up = position[0], math.radians(position[1]), position[2]
     eye = torch.tensor([distance * math.cos(azimuth), distance * math.sin(azimuth), up], dtype=torch.float64)
-    forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - eye, dim=0)
-    right = torch.nn.functional.normalize(forward.cross(eye.new_tensor([0, 0, 1]), dim=0), dim=0)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, forward.cross(right, dim=0), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
+    pose = facing_pose(eye, eye.new_tensor(target), eye.new_tensor([0, 0, 1]))
     focal = width / 2 / math.tan(math.radians(_FIELD_OF_VIEW) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(K, pose.float(), width, height)

@@ -257,14 +257,11 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     regions_of = [facts[chunk][0] for chunk in range(chunks)]
     widths = [(sum(counts), len(counts)) for counts in regions_of]  # columns of both matrices
     _, weight_power, num_excluded, weight_bytes = facts[0]
-    chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
     result = []
     for i, matrix in enumerate(matrices):
         first_column = [0, *accumulate(width[i] for width in widths)]
-        received = [counts[portion.communicator.rank][i] for _, _, counts in gathered]
-        result.append(
-            _exchange_rows(matrix, chunks_by_rank, received, first_column, portion, _WEIGHT_DTYPES[weight_bytes])
-        )
+        received = [(owned, counts[portion.communicator.rank][i]) for owned, _, counts in gathered]
+        result.append(_exchange_rows(matrix, received, first_column, portion, _WEIGHT_DTYPES[weight_bytes]))
     regions = torch.tensor(list(chain.from_iterable(regions_of)))
     region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), regions)
     region_view = region_view.to(portion.order.device)
@@ -273,8 +270,7 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
 
 def _exchange_rows(
     entries: Sequence[Sequence[CooEntries]],
-    chunks_by_rank: Sequence[Sequence[int]],
-    counts: Sequence[Sequence[int]],
+    sent_counts: Sequence[tuple[Sequence[int], Sequence[int]]],
     first_column: Sequence[int],
     portion: Partition,
     dtype: torch.dtype,
@@ -283,8 +279,7 @@ def _exchange_rows(
 
     Args:
         entries: entries of this process, by chunk and receiving process.
-        chunks_by_rank: chunks of every process.
-        counts: number of entries that every process sends to this one, by chunk.
+        sent_counts: chunks of every process, and the number of entries of each that it sends to this one.
         first_column: first column of every chunk in the whole matrix.
         dtype: type of the weights.
     """
@@ -295,8 +290,8 @@ def _exchange_rows(
         sent = ([empty, *(chunk[rank] for chunk in entries)] for rank in range(team.world_size))
         arrays.append(team.all_to_all([torch.cat([getattr(part, name) for part in parts]) for parts in sent]))
     received: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
-    for rank, chunks in enumerate(chunks_by_rank):
-        parts = [array[rank].split(list(counts[rank])) for array in arrays]
+    for rank, (chunks, counts) in enumerate(sent_counts):
+        parts = [array[rank].split(list(counts)) for array in arrays]
         for chunk, row, column, weight in zip(chunks, *parts):
             received[chunk] = row.long(), column + first_column[chunk], weight
     return SparseRows.stack([received[chunk] for chunk in sorted(received)], len(portion), device)

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.base import FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures
 from normlift_ns.encoders.plugins import PluginRegions
 from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, make_encoder
 from normlift_ns.errors import InputError
@@ -23,7 +23,8 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     Args:
         device: As in `make_encoder`.
     Raises:
-        ValueError: As `make_regions` and `make_encoder`. Also if imported features have no folder, or a folder is given
+        ValueError: As `make_encoder`, `SamMasks` and `Sam3Masks`. Also if the regions are unknown, "files" has no
+            folder, or a folder or level does not apply. Also if imported features have no folder, or a folder is given
             without imported features.
         FileNotFoundError: As those. Also if the folder of features does not exist.
     """
@@ -96,19 +97,3 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
             "again with: ns-normlift"
         )
     return source
-
-
-def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
-    """Return the regions of the options. Patches are not supported, because they come with features of their own.
-
-    Args:
-        device: Device of the network, such as "cuda"; results are always on the CPU.
-    Raises:
-        ValueError: If the regions are unknown, "files" has no folder, or a folder or level does not apply. Also as
-            `SamMasks` and `Sam3Masks`.
-        FileNotFoundError: If the folder or the SAM checkpoint does not exist.
-    """
-    name = resolve_regions(options, device)
-    if MASK_SOURCES.load(name).has_features:
-        raise InputError(f"{name} have features already and cannot be used as regions; use make_source")
-    return _make_masks(options, name, device)

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -22,34 +22,38 @@ from torch import Tensor
 
 from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
+from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import load_arrays, save_arrays
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
+REMEDY = "restore it by lifting again with: ns-normlift (the same options)"
 
-class NotCachedError(Exception):
+
+class NotCachedError(InputError):
     """A result that is not in the cache."""
 
 
-def cached(source: FeatureSource, folder: Path, *, compute: bool = True) -> FeatureSource:
+def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool] = lambda part: True) -> FeatureSource:
     """Return a source that caches expensive results in a folder; sources without any are returned unchanged.
 
     Args:
-        compute: False: never compute results that would be cached.
+        compute: whether regions or an encoder may compute results that are not cached.
     Raises (later, when a view is requested):
         OSError: If the folder cannot be written to, as when the disk is full.
-        NotCachedError: If `compute` is False, and a result for the image is missing.
+        NotCachedError: If a result for the image is missing, and must not be computed.
     """
     if isinstance(source, PatchFeatures):
-        return CachedPatches(source, folder / "features", compute)
+        return cast(Any, CachedPatches(source, folder / "features", compute(source.encoder)))
     if not isinstance(source, RegionFeatures):
         return source
-    regions = CachedRegions(source.regions, folder / "regions", compute)
-    return RegionFeatures(regions, CachedEncoder(source.encoder, folder / "features", compute))
+    regions: Any = CachedRegions(source.regions, folder / "regions", compute(source.regions))
+    encoder: Any = CachedEncoder(source.encoder, folder / "features", compute(source.encoder))
+    return RegionFeatures(regions, encoder)
 
 
 @dataclass(frozen=True)
 class _Cached:
-    """A part of a source whose results are cached."""
+    """A part of a source whose results are cached; everything else is as in `inner`."""
 
     inner: Any
     """Computes the results."""
@@ -57,11 +61,10 @@ class _Cached:
     """Folder with one safetensors file per image, and per level if an encoder computes them; created if it does not
     exist."""
     compute: bool = True
-    """See `cached`."""
+    """False: raise an error instead of computing results that are not cached."""
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.inner.identity
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
 
 
 @dataclass(frozen=True)
@@ -71,20 +74,9 @@ class CachedRegions(_Cached):
     The key: the image, its name, the files that are read for it, and the settings except the selected level.
     """
 
-    @property
-    def at_once(self) -> int:
-        return self.inner.at_once
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        return self.inner.chosen
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        return self.inner.files(name)
-
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
-        labels = _read(path, "labels", lambda labels: _are_labels(labels, image), self.compute)
+        labels = _read(path, "labels", lambda labels: _are_labels(labels, image), self.compute, name)
         if labels is None:
             labels = self.inner.labels(image, name)
             labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
@@ -129,9 +121,6 @@ class CachedEncoder(_Cached):
             yield features
         yield from (rows for rows in pending if rows is not None)
 
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.inner.text(prompts)
-
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Return the cache path of the features of the regions of an image, whether the file exists or not."""
         return cache_path(self.folder, self.identity, *_key_parts(image), *_key_parts(labels))
@@ -144,9 +133,6 @@ class CachedPatches(_Cached):
     The key: the image, and the settings.
     """
 
-    def available(self, names: Sequence[str]) -> list[str]:
-        return self.inner.available(names)
-
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = cache_path(self.folder, self.identity, *_key_parts(image))
         labels = self.inner.labels(image)
@@ -155,9 +141,6 @@ class CachedPatches(_Cached):
             features = self.inner.features(image, name)
             _write(path, "features", features)
         return ViewFeatures(labels, features)
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.inner.text(prompts)
 
 
 @dataclass(frozen=True)
@@ -206,7 +189,9 @@ def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
-def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True) -> Tensor | None:
+def _read(
+    path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True, image: str = "the images"
+) -> Tensor | None:
     """Return a cached tensor; if it is missing, damaged, cached under another key, or not valid, return None, or raise
     NotCachedError if results must not be computed."""
     with suppress(FileNotFoundError, ValueError, KeyError):
@@ -214,7 +199,7 @@ def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bo
         if tensor is not None and is_valid(tensor):
             return tensor
     if not compute:
-        raise NotCachedError
+        raise NotCachedError(f"{path.parent} no longer holds the {path.parent.name} of {image}; {REMEDY}")
     return None
 
 

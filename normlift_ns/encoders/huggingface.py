@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from normlift_ns.encoders import weights
-from normlift_ns.encoders.weights import CONFIG_FILE, find_in_hub_cache, read_json
+from normlift_ns.encoders.weights import CONFIG_FILE, read_json
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
@@ -385,11 +385,8 @@ def check_model_name(model: str, family: ModelFamily) -> None:
 def find_local_model(model: str) -> Path | None:
     """Return the folder of a network on this machine, which may be in the hub cache; None if it is missing or
     incomplete."""
-    if os.path.isdir(model):
-        return Path(model).resolve()
-    config = find_in_hub_cache(model, CONFIG_FILE)
-    found = find_in_hub_cache(model, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
-    return None if config is None or found is None else config.parent
+    files = (WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
+    return Path(model).resolve() if os.path.isdir(model) else weights.find_cached_model(model, files)
 
 
 def fetch_model(model: str, family: ModelFamily) -> Path:

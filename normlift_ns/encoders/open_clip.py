@@ -205,7 +205,9 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
     problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
     remedy = f"connect to the internet once, {OPEN_CLIP_REMEDY}"
     with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
-        return _download(published), published
+        if published.get("hf_hub"):
+            check_hub_access()
+        return Path(import_open_clip_module("pretrained").download_pretrained(published)), published
 
 
 def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
@@ -217,9 +219,3 @@ def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, d
         return Path(pretrained), {key: published[key] for key in ("mean", "std") if key in published}
     published = table.get_pretrained_cfg(model, pretrained)
     return find_cached_clip_weights(published.get("hf_hub", "")), published
-
-
-def _download(published: dict[str, Any]) -> Path:
-    if published.get("hf_hub"):
-        check_hub_access()
-    return Path(import_open_clip_module("pretrained").download_pretrained(published))

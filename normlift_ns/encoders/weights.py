@@ -44,10 +44,13 @@ def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = 
 
 def find_local_sam(checkpoint: str) -> Path | None:
     """Return the path of a SAM checkpoint on this machine, given as a path or a hub name; None if there is none."""
-    if os.path.exists(checkpoint):
-        return Path(checkpoint).resolve()
-    config, weights = find_in_hub_cache(checkpoint, CONFIG_FILE), find_in_hub_cache(checkpoint, *SAM_WEIGHT_FILES)
-    return None if config is None or weights is None else weights.parent
+    return Path(checkpoint).resolve() if os.path.exists(checkpoint) else find_cached_model(checkpoint, SAM_WEIGHT_FILES)
+
+
+def find_cached_model(name: str, weight_files: Sequence[str]) -> Path | None:
+    """Return the folder of a network in the hub cache; None if it lacks config.json, or all of the weight files."""
+    config, weights = find_in_hub_cache(name, CONFIG_FILE), find_in_hub_cache(name, *weight_files)
+    return None if config is None or weights is None else config.parent
 
 
 def find_in_hub_cache(repository: str, *names: str) -> Path | None:

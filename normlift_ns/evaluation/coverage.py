@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 from normlift_ns.analysis.objects import connected_components
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
 from normlift_ns.core.lift import Scalars, reliability
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import unsupported
@@ -526,18 +526,10 @@ def look_at(
 ) -> Camera:
     """Return a camera with the size and focal length of another, and the principal point in the middle, as in
     ns-render."""
-    forward = normalize(target - eye, dim=0)
-    right = torch.linalg.cross(forward, up)
-    if float(right.norm()) < 1e-6:  # straight up or down: choose any roll
-        right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[forward.abs().argmin()])
-    right = normalize(right, dim=0)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
     width, height = (max(2, side - side % 2) for side in (like.width, like.height))  # videos need even sizes
     focal = float(like.K[1, 1])
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(K, pose.float(), width, height)
+    return Camera(K, facing_pose(eye, target, up).float(), width, height)
 
 
 def suggest_poses(

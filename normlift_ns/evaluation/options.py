@@ -15,7 +15,7 @@ import msgspec
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.io.run_dir import read_text
-from normlift_ns.options import WithoutDirection, check_options
+from normlift_ns.options import CheckedOptions, WithoutDirection
 
 Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]
 LANGSPLAT_MASKINGS: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
@@ -40,7 +40,7 @@ def pose_output_paths(stem: Path) -> tuple[Path, ...]:
 
 
 @dataclass(frozen=True)
-class ScannetOptions:
+class ScannetOptions(CheckedOptions):
     """Options of --protocol scannet, which needs one *_vh_clean_2.labels.ply per run in --labels."""
 
     min_opacity: float = 0.1
@@ -52,12 +52,9 @@ class ScannetOptions:
     """Spelling of the shower curtain prompt. script: showercurtain, as in OpenGaussian's script. paper: shower
     curtain."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 @dataclass(frozen=True)
-class LerfOptions:
+class LerfOptions(CheckedOptions):
     """Options of --protocol lerf, which needs one folder of label files per run in --labels."""
 
     masking: Masking = "background"
@@ -76,12 +73,9 @@ class LerfOptions:
     scale: Literal["unit", "norm"] = "unit"
     """Scores to composite. unit: cosines. norm: cosines times ||f||, as in SFS, whose features are not normalized."""
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
 
 @dataclass(frozen=True)
-class MaskOptions:
+class MaskOptions(CheckedOptions):
     """Options of --protocol masks, which needs a folder of PNG or NPY instance masks with the images' names."""
 
     names: Path | None = None
@@ -92,9 +86,6 @@ class MaskOptions:
     min_weight: float = 1.0
     """Smallest weight of a scored Gaussian, in pixels over all training views, >= 0; larger values score fewer
     Gaussians."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 # JSON files from other programs, validated against the types that a protocol expects.

@@ -39,8 +39,6 @@ CLASS_SETS = {
 """NYU40 ids of the three sets."""
 SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
-
-
 _OTHER: dict[WithoutDirection, WithoutDirection] = {"first": "none", "none": "first"}
 
 

@@ -151,11 +151,6 @@ def rename_if_absent(source: Path, target: Path) -> bool:
     return True
 
 
-def exchange_paths(first: Path, second: Path) -> bool:
-    """Exchange two files or folders, with both names existing at all times; return False if that is not supported."""
-    return _rename(first, second, _EXCHANGE)
-
-
 def _rename(source: Path, target: Path, flag: int) -> bool:
     """Call Linux's renameat2; return False if it is not supported."""
     if sys.platform != "linux":
@@ -360,8 +355,15 @@ def commit_directory(draft: Path, path: Path, *, overwrite: bool = False) -> boo
         if not rename_if_absent(draft, path):
             if not overwrite:
                 return False
-            if not exchange_paths(draft, path):
-                _replace_in_steps(draft, path)
+            if not _rename(draft, path, _EXCHANGE):  # not supported
+                old, temporary = f"{path.name}.old", draft.parent
+                write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
+                _flush_names(temporary)
+                try:
+                    os.rename(path, temporary / old)
+                    os.rename(draft, path)
+                finally:
+                    complete_journal(temporary)
     _flush_names(path.parent)
     return True
 
@@ -370,9 +372,7 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
     """Rename drafts to their final paths; return a path that another program has created meanwhile, if any."""
     journal, folder = None, temporary.parent
     if len(drafts) + len(remove) > 1:
-        complete_interrupted_writes(
-            folder
-        )  # complete an older interrupted export now: completing it later would overwrite this one
+        complete_interrupted_writes(folder)  # an older export, which would overwrite this one if completed later
         names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
         journal = write_journal(temporary, names | {"overwrite": overwrite})
         _flush_names(temporary)
@@ -386,17 +386,6 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
     for path in remove:
         path.unlink(missing_ok=True)
     return None
-
-
-def _replace_in_steps(draft: Path, path: Path) -> None:
-    old, temporary = f"{path.name}.old", draft.parent
-    write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
-    _flush_names(temporary)
-    try:
-        os.rename(path, temporary / old)
-        os.rename(draft, path)
-    finally:
-        complete_journal(temporary)
 
 
 def complete_interrupted_writes(folder: Path) -> None:
@@ -433,11 +422,7 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
                 shutil.rmtree(temporary, ignore_errors=True)
             finally:
                 release_lock(descriptor)
-    except (
-        OSError,
-        RuntimeError,
-        SafetensorError,
-    ) as error:  # torch and safetensors raise the latter if a disk is full
+    except (OSError, RuntimeError, SafetensorError) as error:  # the latter two from torch and safetensors, disk full
         reason = str(error)
         if temporary is not None:
             reason = reason.replace(f"{temporary}{os.sep}", f"{folder}{os.sep}")

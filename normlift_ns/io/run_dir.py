@@ -121,7 +121,15 @@ def check_run(run_dir: Path) -> None:
     """
     if not run_dir.exists():
         complete_interrupted_writes(run_dir.parent)  # completes a replacement of the run that was interrupted
-    _check_seal(run_dir / "config.yml")
+    path = run_dir / "config.yml"
+    text = path.read_bytes().decode("utf8", "replace").replace("\r\n", "\n") if path.is_file() else ""
+    first, _, rest = text.partition("\n")
+    if first.startswith(_SEAL) and first != add_digest_comment(rest).partition("\n")[0]:
+        warnings.warn(
+            f"{path} is not as normlift_ns wrote it: it was edited, or is damaged. If you edited it, delete its first "
+            "line; otherwise copy the whole run again",
+            stacklevel=2,
+        )
     if (run_dir / FIELD_FOLDER / MANIFEST_FILE).exists():
         check_file_digests(run_dir / FIELD_FOLDER)
 
@@ -138,18 +146,6 @@ def run_file_digests(folder: Path, files: Iterable[Path]) -> dict[str, str]:
 def add_digest_comment(config: str) -> str:
     """Return the text of a config.yml with its digest in a comment at the top, so that edits can be detected."""
     return f"{_SEAL}{text_digest(config)} (to change them without a warning, delete this line)\n{config}"
-
-
-def _check_seal(path: Path) -> None:
-    if not path.is_file():
-        return
-    first, _, rest = path.read_bytes().decode("utf8", "replace").replace("\r\n", "\n").partition("\n")
-    if first.startswith(_SEAL) and first != add_digest_comment(rest).partition("\n")[0]:
-        warnings.warn(
-            f"{path} is not as normlift_ns wrote it: it was edited, or is damaged. If you edited it, delete its first "
-            "line; otherwise copy the whole run again",
-            stacklevel=3,
-        )
 
 
 def complete_interrupted_lifts(run_dir: Path) -> None:

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Bool, Float
@@ -97,7 +98,8 @@ class NormLiftModel(SplatfactoModel):
             # four seed points: with none, splatfacto searches the neighbors of 50,000 random points
             seeds = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
             self.seed_points = None if self.config.semantics is None else seeds  # until the checkpoint is loaded
-        with _lazy_lpips():
+        # the stock metric downloads AlexNet
+        with patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", LazyLpips):
             super().populate_modules()
         self._field: SemanticField | None = None
         self._display: Display | None = None
@@ -313,16 +315,3 @@ def without_tracer() -> Iterator[None]:
         yield
     finally:
         sys.settrace(tracer)
-
-
-@contextmanager
-def _lazy_lpips() -> Iterator[None]:
-    """Replace LPIPS by `LazyLpips` while splatfacto builds its modules; the stock metric downloads AlexNet."""
-    from torchmetrics.image import lpip  # noqa: PLC0415 (import-light: this module is loaded by every ns-* command)
-
-    stock = lpip.LearnedPerceptualImagePatchSimilarity
-    lpip.LearnedPerceptualImagePatchSimilarity = LazyLpips
-    try:
-        yield
-    finally:
-        lpip.LearnedPerceptualImagePatchSimilarity = stock

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from threading import Lock, RLock, Thread
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.data.open_scene import open_scene
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError, describe_error
-from normlift_ns.exports import MIN_OPACITY_LOGIT, TrainedSplat, write_splat_ply
+from normlift_ns.exports import MIN_OPACITY_LOGIT, write_splat_ply
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
 from normlift_ns.query.engine import Answer
@@ -196,26 +196,6 @@ def prompt_table(state: State) -> str:
     if len(state.prompts) > len(listed):
         lines.append(f"| | and {len(state.prompts) - len(listed)} more | | |")
     return "\n".join(lines)
-
-
-class PanelHost(Protocol):
-    """Interface of the model that the panel uses."""
-
-    def show(self, display: Display | None) -> None:
-        """Replace the display that is rendered in addition to the colors."""
-        ...
-
-    def ray_weights(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """Return the weights of the Gaussians on a ray."""
-        ...
-
-    def scene(self) -> GaussianScene:
-        """Return all Gaussians."""
-        ...
-
-    def splat_parameters(self) -> TrainedSplat:
-        """Return the trained Gaussians, for `write_splat_ply`."""
-        ...
 
 
 # Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
@@ -467,18 +447,6 @@ class _Control(ViewerControl):
 
 
 _READING = "Reading the prompts. The first query also loads the text encoder, which takes a while."
-_ACTIONS = {
-    "Hide": actions.hide,
-    "Only": actions.show_only,
-    "All": actions.show_all,
-    "Suggested": actions.use_suggested_threshold,
-    "Leave out Gaussians with weak evidence": actions.remove_weak,
-}
-_SLIDERS = {
-    "Threshold": actions.set_threshold,
-    "Minimum reliability": actions.set_min_reliability,
-    "Grow": actions.resize,
-}
 
 
 def _show_prompt(state: State, option: str) -> State:
@@ -491,14 +459,31 @@ def _use_refined(state: State, refined: bool) -> State:
     return actions.update_query(state, question, "Refined features")
 
 
-_CHOICES = {"shown": _show_prompt, "refined": _use_refined}
+_ACTIONS: dict[str, Callable[..., State]] = {
+    "Hide": actions.hide,
+    "Only": actions.show_only,
+    "All": actions.show_all,
+    "Suggested": actions.use_suggested_threshold,
+    "Leave out Gaussians with weak evidence": actions.remove_weak,
+    "Threshold": actions.set_threshold,
+    "Minimum reliability": actions.set_min_reliability,
+    "Grow": actions.resize,
+    "shown": _show_prompt,
+    "refined": _use_refined,
+}
+"""Actions on a state by the name of their widget; those of sliders and choices take its value."""
+_SLIDERS = ("Threshold", "Minimum reliability", "Grow")
 
 
 class SearchPanel(torch.nn.Module):
     """The panel with its queries, clicks and history. A module, because nerfstudio searches only modules for a
-    `ViewerControl`."""
+    `ViewerControl`.
 
-    def __init__(self, host: PanelHost) -> None:
+    Args:
+        host: the `NormLiftModel`, whose module imports this one.
+    """
+
+    def __init__(self, host: Any) -> None:
         super().__init__()
         self._host = [host]  # in a list: the model is the parent of this module
         self._viewer: Any = None
@@ -588,11 +573,8 @@ class SearchPanel(torch.nn.Module):
         history = cast("History[State]", self._history)
         state, self._message = history.now, ""
         if name in _ACTIONS:
-            self._show(history.do(_ACTIONS[name](state)))
-        elif name in _SLIDERS:
-            self._show(history.do(_SLIDERS[name](state, value), key=name))
-        elif name in _CHOICES:
-            self._show(history.do(_CHOICES[name](state, value)))
+            state = _ACTIONS[name](state) if value is None else _ACTIONS[name](state, value)
+            self._show(history.do(state, key=name if name in _SLIDERS else None))
         elif name in ("Undo", "Redo"):
             history = history.undo() if name == "Undo" else history.redo()
             self._set_prompts(join_prompts([prompt.text for prompt in history.now.prompts]))

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from normlift_ns.api import query_to_store
 from normlift_ns.data.checkpoint import numpy_scalar_globals
 from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
-from normlift_ns.data.nerfstudio.dataset_views import DatasetViews, nerfstudio_views
+from normlift_ns.data.nerfstudio.dataset_views import DatasetViews
 from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.encoders.base import FeatureSource
@@ -169,7 +169,7 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     pipeline: Any = trainer.pipeline
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
-    scene = load_nerfstudio_scene(path, make_nerfstudio_views=nerfstudio_views)
+    scene = load_nerfstudio_scene(path)
     source = feature_source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"

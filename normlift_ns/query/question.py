@@ -59,6 +59,10 @@ class Query:
             if value is not None:
                 object.__setattr__(self, name, as_numpy(value))
 
+    def settings(self) -> dict[str, Any]:
+        """Return how Gaussians are selected, by the names in the JSON files of commands."""
+        return {"relevancy": self.rule, "threshold": self.threshold, "min_reliability": self.min_reliability}
+
 
 def make_query(
     field: HasManifest,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -57,11 +58,20 @@ def _check_level(options: SourceOptions, name: str, levels: Sequence[str]) -> No
         raise InputError(f"--level must be one of {', '.join(levels)} for {name}, got {short_repr(options.level)}")
 
 
-def _make_sam(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.sam import SamMasks  # noqa: PLC0415 (needs torch)
+def _make(path: str, arguments: Callable[[SourceOptions, str], tuple[Any, ...]]) -> Callable[[SourceOptions, str], Any]:
+    """Return a function that makes the source of a class, which is imported then because it needs torch.
 
-    level: Any = options.level or "l"
-    return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
+    Args:
+        path: Module of the package and class, as in "segmentation.sam:SamMasks".
+        arguments: Returns the arguments of the class from the options and the device.
+    """
+    module, _, name = path.partition(":")
+    return lambda options, device: getattr(import_module(f"normlift_ns.{module}"), name)(*arguments(options, device))
+
+
+_make_sam = _make(
+    "segmentation.sam:SamMasks", lambda o, device: (o.sam_model or DEFAULT_SAM, o.level or "l", device, o.sam_precision)
+)
 
 
 SAM_MASKS = MaskSource(
@@ -70,10 +80,10 @@ SAM_MASKS = MaskSource(
 """Masks of SAM, SAM 2 or HQ-SAM for a grid of points."""
 
 
-def _make_sam3(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.sam3 import Sam3Masks  # noqa: PLC0415 (needs torch)
-
-    return Sam3Masks(options.region_texts, options.sam_model or DEFAULT_SAM3, device, options.sam_precision)
+_make_sam3 = _make(
+    "segmentation.sam3:Sam3Masks",
+    lambda o, device: (o.region_texts, o.sam_model or DEFAULT_SAM3, device, o.sam_precision),
+)
 
 
 def _check_sam3(options: SourceOptions) -> None:
@@ -101,32 +111,18 @@ PATCHES = MaskSource(_make_patches, has_features=True)
 """Patches of the encoder's vision transformer."""
 
 
-def _make_superpixels(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.regions import Superpixels  # noqa: PLC0415 (needs torch)
-
-    return Superpixels(options.region_count or _COUNT)
-
-
-SUPERPIXEL = MaskSource(_make_superpixels)
+SUPERPIXEL = MaskSource(_make("segmentation.regions:Superpixels", lambda o, _: (o.region_count or _COUNT,)))
 """SLIC superpixels."""
 
 
-def _make_grid(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.regions import Grid  # noqa: PLC0415 (needs torch)
-
-    return Grid(options.region_count or _COUNT)
-
-
-GRID = MaskSource(_make_grid)
+GRID = MaskSource(_make("segmentation.regions:Grid", lambda o, _: (o.region_count or _COUNT,)))
 """Square cells."""
 
 
-def _make_files(options: SourceOptions, device: str) -> Regions:
-    from normlift_ns.segmentation.regions import LabelFiles  # noqa: PLC0415 (needs torch)
-
-    assert options.regions_dir is not None  # checked below
-    level = None if options.level is None else int(options.level)
-    return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
+_make_files = _make(
+    "segmentation.regions:LabelFiles",
+    lambda o, _: (o.regions_dir, o.regions_background, None if o.level is None else int(o.level), o.regions_resample),
+)
 
 
 def _check_files(options: SourceOptions) -> None:
@@ -144,13 +140,10 @@ FILES = MaskSource(_make_files, _check_files, ("regions_dir", "level"))
 """Label maps from a folder."""
 
 
-def _make_langsplat(options: SourceOptions, device: str) -> FeatureSource:
-    from normlift_ns.encoders.langsplat import LangSplat  # noqa: PLC0415 (needs torch)
-
-    assert options.features_dir is not None  # checked below
-    level: Any = options.level or "l"
-    texts = make_texts(options, device)
-    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+_make_langsplat = _make(
+    "encoders.langsplat:LangSplat",
+    lambda o, device: (o.features_dir, make_texts(o, device), o.level or "l", o.features_missing, o.regions_resample),
+)
 
 
 def _check_langsplat(options: SourceOptions) -> None:

@@ -170,10 +170,10 @@ class Sam3Masks(RegionDefaults):
     def __post_init__(self) -> None:
         check_sam_checkpoint(self.checkpoint, TEXT_PROMPT_FAMILIES)
 
-    @property
+    @cached_property
     def identity(self) -> dict[str, Any]:
         """Result of `sam3_identity` plus the prompts."""
-        return {**self._network_identity, "texts": list(self.texts)}
+        return {**sam3_identity(self.checkpoint, self.device, self.precision), "texts": list(self.texts)}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
         """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.segment`."""
@@ -181,10 +181,6 @@ class Sam3Masks(RegionDefaults):
         rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
         ascending = rows[torch.sort(scores[rows], stable=True).indices]
         return stack_masks(masks[ascending])[None]
-
-    @cached_property
-    def _network_identity(self) -> dict[str, Any]:
-        return sam3_identity(self.checkpoint, self.device, self.precision)
 
     @cached_property
     def network(self) -> Sam3Network:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from normlift_ns.encoders.base import PatchFeatures
-from normlift_ns.encoders.build import make_regions, make_source, resolve_regions
+from normlift_ns.encoders.build import make_source, resolve_regions
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
@@ -28,7 +28,7 @@ def test_options_reach_the_regions(tmp_path):
         ({"regions": "sam", "sam_model": sam, "level": "default"}, SamMasks(sam, "default", "cpu")),
         ({"regions": "sam", "sam_model": sam, "sam_precision": "bfloat16"}, SamMasks(sam, "l", "cpu", "bfloat16")),
     ):
-        assert make_regions(SourceOptions(**options)) == expected, options
+        assert make_source(SourceOptions(**options)).regions == expected, options
     (tmp_path / "moved").mkdir()
     assert LabelFiles(tmp_path).identity == LabelFiles(tmp_path / "moved").identity  # names no place
     assert [x.identity["kind"] for x in (Superpixels(9), LabelFiles(tmp_path))] == ["superpixel", "files"]

@@ -604,7 +604,6 @@ def set_dataset(config: Any, data: Path) -> None:
 def skip_seed_points(config: Any) -> None:
     """Stop the dataparser from reading the initial point cloud, which a trained run does not need."""
     dataparser = config.pipeline.datamanager.dataparser
-    if hasattr(dataparser, "load_3D_points"):
-        dataparser.load_3D_points = False
-    if hasattr(dataparser, "ply_path"):
-        dataparser.ply_path = None
+    for name, value in (("load_3D_points", False), ("ply_path", None)):
+        if hasattr(dataparser, name):
+            setattr(dataparser, name, value)

@@ -12,6 +12,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from typing_extensions import dataclass_transform
+
 from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
 
 _Class = TypeVar("_Class", bound=type)
@@ -23,8 +25,9 @@ CLASS_TARGETS: dict[type, str] = {}
 """Name of the class or function that each class configures, if it has a `_target`."""
 
 
+@dataclass_transform(field_specifiers=(field,))
 def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class]:
-    """Register a class as the mirror of the one of the same name in a module.
+    """Make a class a dataclass, and register it as the mirror of the one of the same name in a module.
 
     Args:
         module: module of the original.
@@ -35,7 +38,7 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
         CONFIG_CLASS_NAMES[cls] = f"{module}.{cls.__name__}"
         if target is not None:
             CLASS_TARGETS[cls] = target if "." in target else f"{module}.{target}"
-        return cls
+        return dataclass(cls)
 
     return register
 
@@ -58,7 +61,6 @@ class PosedDataParserConfig:
 
 
 @_mirror(f"{_DATA}.dataparsers.nerfstudio_dataparser", "Nerfstudio")
-@dataclass
 class NerfstudioDataParserConfig(PosedDataParserConfig):
     """Mirror of nerfstudio's NerfstudioDataParserConfig."""
 
@@ -67,7 +69,6 @@ class NerfstudioDataParserConfig(PosedDataParserConfig):
 
 
 @_mirror(f"{_DATA}.dataparsers.colmap_dataparser", "ColmapDataParser")
-@dataclass
 class ColmapDataParserConfig(PosedDataParserConfig):
     """Mirror of nerfstudio's ColmapDataParserConfig."""
 
@@ -83,7 +84,6 @@ class ColmapDataParserConfig(PosedDataParserConfig):
 
 
 @_mirror(f"{_DATA}.dataparsers.blender_dataparser", "Blender")
-@dataclass
 class BlenderDataParserConfig:
     """Mirror of nerfstudio's BlenderDataParserConfig."""
 
@@ -98,7 +98,6 @@ SupportedDataParserConfig = NerfstudioDataParserConfig | ColmapDataParserConfig 
 
 
 @_mirror(f"{_DATA}.datamanagers.full_images_datamanager", "FullImageDatamanager")
-@dataclass
 class FullImageDatamanagerConfig:
     """Mirror of nerfstudio's FullImageDatamanagerConfig."""
 
@@ -119,7 +118,6 @@ class FullImageDatamanagerConfig:
 
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
-@dataclass
 class OptimizerConfig:
     """Mirror of nerfstudio's OptimizerConfig."""
 
@@ -129,7 +127,6 @@ class OptimizerConfig:
 
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
-@dataclass
 class AdamOptimizerConfig(OptimizerConfig):
     """Mirror of nerfstudio's AdamOptimizerConfig."""
 
@@ -137,7 +134,6 @@ class AdamOptimizerConfig(OptimizerConfig):
 
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.radam.RAdam")
-@dataclass
 class RAdamOptimizerConfig(OptimizerConfig):
     """Mirror of nerfstudio's RAdamOptimizerConfig."""
 
@@ -145,13 +141,11 @@ class RAdamOptimizerConfig(OptimizerConfig):
 
 
 @_mirror(_SCHEDULERS, "Scheduler")
-@dataclass
 class SchedulerConfig:
     """Mirror of nerfstudio's SchedulerConfig."""
 
 
 @_mirror(_SCHEDULERS, "MultiStepScheduler")
-@dataclass
 class MultiStepSchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's MultiStepSchedulerConfig."""
 
@@ -161,7 +155,6 @@ class MultiStepSchedulerConfig(SchedulerConfig):
 
 
 @_mirror(_SCHEDULERS, "ExponentialDecayScheduler")
-@dataclass
 class ExponentialDecaySchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's ExponentialDecaySchedulerConfig."""
 
@@ -173,7 +166,6 @@ class ExponentialDecaySchedulerConfig(SchedulerConfig):
 
 
 @_mirror(_SCHEDULERS, "CosineDecayScheduler")
-@dataclass
 class CosineDecaySchedulerConfig(SchedulerConfig):
     """Mirror of nerfstudio's CosineDecaySchedulerConfig."""
 
@@ -182,7 +174,6 @@ class CosineDecaySchedulerConfig(SchedulerConfig):
     max_steps: int = 300000
 
 
-@_mirror("nerfstudio.utils.writer")
 class EventName(Enum):
     """Quantities that nerfstudio prints during training."""
 
@@ -195,8 +186,10 @@ class EventName(Enum):
     CURR_TEST_PSNR = "Test PSNR"
 
 
+CONFIG_CLASS_NAMES[EventName] = "nerfstudio.utils.writer.EventName"
+
+
 @_mirror(_BASE)
-@dataclass
 class MachineConfig:
     """Mirror of nerfstudio's MachineConfig."""
 
@@ -209,7 +202,6 @@ class MachineConfig:
 
 
 @_mirror(_BASE, "nerfstudio.utils.writer.LocalWriter")
-@dataclass
 class LocalWriterConfig:
     """Mirror of nerfstudio's LocalWriterConfig."""
 
@@ -226,7 +218,6 @@ class LocalWriterConfig:
 
 
 @_mirror(_BASE)
-@dataclass
 class LoggingConfig:
     """Mirror of nerfstudio's LoggingConfig."""
 
@@ -238,7 +229,6 @@ class LoggingConfig:
 
 
 @_mirror(_BASE)
-@dataclass
 class ViewerConfig:
     """Mirror of nerfstudio's ViewerConfig."""
 
@@ -257,7 +247,6 @@ class ViewerConfig:
 
 
 @_mirror("nerfstudio.cameras.camera_optimizers", "CameraOptimizer")
-@dataclass
 class CameraOptimizerConfig:
     """Mirror of nerfstudio's CameraOptimizerConfig."""
 
@@ -269,7 +258,6 @@ class CameraOptimizerConfig:
 
 
 @_mirror("nerfstudio.models.splatfacto", "SplatfactoModel")
-@dataclass
 class SplatfactoModelConfig:
     """Mirror of nerfstudio's SplatfactoModelConfig."""
 
@@ -311,7 +299,6 @@ class SplatfactoModelConfig:
 
 
 @_mirror(f"{_OURS}.model", "NormLiftModel")
-@dataclass
 class NormLiftModelConfig(SplatfactoModelConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
 
@@ -319,7 +306,6 @@ class NormLiftModelConfig(SplatfactoModelConfig):
 
 
 @_mirror("nerfstudio.pipelines.base_pipeline", "VanillaPipeline")
-@dataclass
 class VanillaPipelineConfig:
     """Mirror of nerfstudio's VanillaPipelineConfig."""
 
@@ -328,7 +314,6 @@ class VanillaPipelineConfig:
 
 
 @_mirror(f"{_OURS}.pipeline", "NormLiftPipeline")
-@dataclass
 class NormLiftPipelineConfig(VanillaPipelineConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.pipeline.NormLiftPipelineConfig`."""
 
@@ -338,7 +323,6 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 
 @_mirror("nerfstudio.engine.trainer", "Trainer")
-@dataclass
 class TrainerConfig:
     """Mirror of nerfstudio's TrainerConfig."""
 

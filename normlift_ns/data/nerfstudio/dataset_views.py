@@ -14,9 +14,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from normlift_ns.data.images import SplitViews
+from normlift_ns.data.images import SplitViews, camera_type_error
 from normlift_ns.data.nerfstudio.config import dump_config
-from normlift_ns.data.nerfstudio.load import camera_type_error
 from normlift_ns.data.transforms import relative_name
 from normlift_ns.errors import InputError
 

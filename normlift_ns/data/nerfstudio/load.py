@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Views
 from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, Intrinsics
-from normlift_ns.data.images import SplitViews, open_scaled
+from normlift_ns.data.images import SplitViews, camera_type_error, open_scaled
 from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
 from normlift_ns.data.nerfstudio.config_classes import (
     NAMED_COLORS,
@@ -102,11 +102,6 @@ class TrainedViews(SplitViews):
         blended, color = torch.from_numpy(image), torch.tensor(self._alpha_color)
         blended = blended[:, :, :3] * (blended[:, :, -1:] / 255.0) + 255.0 * color * (1.0 - blended[:, :, -1:] / 255.0)
         return torch.clamp(blended, min=0, max=255).to(torch.uint8).numpy()
-
-
-def camera_type_error(file: Path, kind: str) -> str:
-    """Return the message about an image whose camera is of a type that splatfacto does not support."""
-    return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
 
 
 _TRANSFORM_TOLERANCE = 1e-3
@@ -213,11 +208,7 @@ class NerfstudioScene:
 
 
 def load_nerfstudio_scene(
-    load_config: Path,
-    *,
-    data: Path | None = None,
-    load_step: int | None = None,
-    make_nerfstudio_views: Callable[..., tuple[SplitViews, SplitViews]],
+    load_config: Path, *, data: Path | None = None, load_step: int | None = None
 ) -> NerfstudioScene:
     """Load a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
 
@@ -227,9 +218,6 @@ def load_nerfstudio_scene(
         load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
         data: current path of the dataset, if it was moved.
         load_step: step of the checkpoint; None: the last.
-        make_nerfstudio_views: creates the training and evaluation views of Aria's cameras (FISHEYE624), which only
-            nerfstudio can undistort, from a config with absolute paths, the folder of the dataset, the training poses
-            and the background color.
     Raises:
         FileNotFoundError: if the config, the checkpoint, the dataset or an image is missing.
         ValueError: if the config belongs to another method or program, the checkpoint is damaged, or the dataset is not
@@ -264,8 +252,10 @@ def load_nerfstudio_scene(
     remarks = _check_transform(dataset.transform, dataset.scale, location)
     poses = _training_poses(dataset.train, model, checkpoint)
     color = _background_color(model)
-    if dataset.train.camera_type == "FISHEYE624":
-        train, held_out = make_nerfstudio_views(config, location.folder, poses, color)
+    if dataset.train.camera_type == "FISHEYE624":  # Aria's cameras, which only nerfstudio can undistort
+        from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
+
+        train, held_out = nerfstudio_views(config, location.folder, poses, color)
     else:
         train = TrainedViews(dataset.train, location.folder, poses, color, datamanager)
         held_out = TrainedViews(dataset.held_out, location.folder, dataset.held_out.poses, color, datamanager)
