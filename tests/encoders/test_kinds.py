@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 
+from normlift_ns import encoders
 from normlift_ns.cli.preflight import check_source_options
 from normlift_ns.data.open_splat import SPLAT_READERS
 from normlift_ns.encoders.build import make_source
@@ -70,6 +71,7 @@ def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     for name in OURS:
         kind = encoder_kind(name)
         assert (kind.rule, kind.threshold) == (("cosine" if name == "colour" else "lerf"), 0.5)
+        assert isinstance(kind, encoders.EncoderKind)  # where packages of others import it from
 
 
 def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
