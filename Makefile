@@ -37,7 +37,7 @@ changed-types: .venv/installed
 	{ git diff --name-only --diff-filter=d $$base; git ls-files --others --exclude-standard; } | sort -u | \
 	grep -E '^(normlift_ns|research)/.*\.py$$' | xargs -r $(BIN)/basedpyright
 
-QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metrics checks)
+QUICK := $(patsubst %,tests/core/test_%.py,lift relevancy neighbors gaussians metrics validation)
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow and not extra" $(QUICK) tests/test_imports.py
 
@@ -54,7 +54,7 @@ test-slow: .venv/installed
 
 # The core and the commands, for other versions of Python
 test-versions: .venv/installed
-	$(BIN)/pytest $(BESIDE) -m "not slow and not extra" tests/core tests/scripts
+	$(BIN)/pytest $(BESIDE) -m "not slow and not extra" tests/core tests/cli
 
 # Before a release: everything, with twenty times the examples
 test-all: lint

@@ -1,4 +1,4 @@
-"""Hard cases of the rasterizers, measured against loops over Python floats (tests/raster/oracle.py)."""
+"""Hard cases of the rasterizers, measured against loops over Python floats (tests/rasterization/oracle.py)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from normlift_ns import Camera, Evidence, GaussianScene, lift, rasterize_evidence
 from research.hard_case import Case, Setting
-from tests.raster.oracle import compositing_matrix
-from tests.scenes import dense, orbit, orbit_camera, random_labels, random_scene
+from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene
+from tests.rasterization.oracle import compositing_matrix
 
 _TURNED = (0.9, 0.2, -0.3, 0.1)
 _PARAMETERS = ("means", "quats", "scales", "opacities")

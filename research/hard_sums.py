@@ -15,7 +15,7 @@ from normlift_ns.analysis.objects import best_prompt
 from normlift_ns.core.lowrank import basis_of_rank, half_precision_error, spectral_table, store_directions
 from normlift_ns.core.sparse import SparseRows
 from research.hard_case import Case, Setting
-from tests.scenes import generator, unit_rows
+from tests.random_scenes import generator, unit_rows
 
 _GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
 

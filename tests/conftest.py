@@ -194,7 +194,7 @@ def make_lifted(made_once: Any, trained: Path, timestamp: str, *flags: str) -> P
     def make(folder: Path) -> None:
         import_nerfstudio()
         from normlift_ns.cli import lift  # noqa: PLC0415
-        from tests.scripts.conftest import QUICK, run_entry  # noqa: PLC0415
+        from tests.cli.conftest import QUICK, run_entry  # noqa: PLC0415
 
         given = ("--load-config", trained, *QUICK, *flags, "--timestamp", timestamp)
         with pytest.MonkeyPatch.context() as patch:

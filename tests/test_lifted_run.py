@@ -22,7 +22,7 @@ from normlift_ns.query.question import Query
 from normlift_ns.rasterization import rasterize
 from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.rasterize import choose_backend
-from tests.scripts.conftest import run_entry, said
+from tests.cli.conftest import run_entry, said
 
 
 @pytest.fixture(scope="module")

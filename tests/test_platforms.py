@@ -13,8 +13,8 @@ import pytest
 
 from normlift_ns import open_scene
 from normlift_ns.data.splat import SplatParameters
-from tests.scenes.made import ply_columns, write_ply
-from tests.scripts.conftest import SMALL
+from tests.cli.conftest import SMALL
+from tests.data.scene_files import ply_columns, write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from normlift_ns import open_run
-from tests.encoders.test_kinds import install
+from tests.encoders.test_plugins import install
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf8")

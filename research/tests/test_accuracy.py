@@ -18,7 +18,7 @@ from research.variants import (
     only,
     refined_scores,
 )
-from tests.scenes import dense
+from tests.random_scenes import dense
 
 
 def test_without_damage_cells_become_the_exact_masks(world):

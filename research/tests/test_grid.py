@@ -17,7 +17,7 @@ from research.second_room import second
 from research.synthetic_scenes import World, made_words
 from research.tests import ROOT, quick
 from research.tests.tiny import CLASSES, WORDS
-from tests.scenes import generator
+from tests.random_scenes import generator
 
 
 @pytest.fixture(scope="module")

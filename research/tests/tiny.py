@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from research.synthetic_scenes import World, cell_evidence, made_words
-from tests.scenes import generator, orbit, random_scene
+from tests.random_scenes import generator, orbit, random_scene
 
 CLASSES = 4
 WORDS = made_words(CLASSES, dimension=128)

@@ -15,7 +15,7 @@ from normlift_ns.core.consensus import apply_consensus, consensus, region_overla
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from tests.examples import examples
-from tests.scenes import dense, generator, random_evidence, unit_rows
+from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = [3, 0, 1, 5, 2, 4, 0]
@@ -249,7 +249,7 @@ MANY = """
 import resource
 from normlift_ns.core.consensus import consensus
 from tests.core.test_consensus import large
-from tests.scenes import unit_rows
+from tests.random_scenes import unit_rows
 evidence, features = large(40_000, 60_000, 20), unit_rows(40_000, 8, 0).float()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 found = consensus(evidence, features)

@@ -10,7 +10,7 @@ from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.base import joint_partition
 from tests.examples import examples
-from tests.scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
+from tests.random_scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
 
 VIEWS = [3, 0, 1, 5, 2]
 SEEDS = st.integers(0, 2**31)

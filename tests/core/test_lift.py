@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from normlift_ns import Evidence, Lifted, lift
 from normlift_ns.core.sparse import SparseRows
 from tests.examples import examples
-from tests.scenes import dense, generator, random_evidence, unit_rows
+from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 VIEWS = [3, 0, 1, 5, 2]
 S, D = sum(VIEWS), 7

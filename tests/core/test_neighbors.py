@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import nearest_neighbors
-from tests.scenes import generator
+from tests.random_scenes import generator
 
 
 def all_pairs(means: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -19,7 +19,7 @@ from normlift_ns.core.refine import clamp_k
 from normlift_ns.evaluation.studies import Variant, recorded_vote
 from normlift_ns.options import VOTE_DEFAULTS, VoteParameters
 from tests.examples import examples
-from tests.scenes import generator, random_evidence, unit_rows
+from tests.random_scenes import generator, random_evidence, unit_rows
 
 SEEDS = st.integers(0, 2**31)
 

@@ -15,7 +15,7 @@ from normlift_ns.encoders.open_clip import import_open_clip
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
 from tests.encoders.tiny import CLIP, HUB, write_clip, write_sam
-from tests.encoders.tiny_library import write_tiny
+from tests.segmentation.tiny_sam import write_tiny
 
 
 @pytest.fixture(scope="session")

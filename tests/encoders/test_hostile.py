@@ -25,9 +25,9 @@ from normlift_ns.encoders.text_files import TextEmbeddingFile, write_text_embedd
 from normlift_ns.io.arrays import load_arrays, read_npy, save_arrays
 from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
 from normlift_ns.segmentation.regions import Grid, LabelFiles, read_image
-from tests.encoders.test_regions import grey_png
 from tests.encoders.tiny import CLIP, copied, noise, refused
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
+from tests.segmentation.test_regions import grey_png
 
 IMAGE = noise(6, 8)
 NAME = "images/a.png"

@@ -32,7 +32,7 @@ from normlift_ns.evaluation.studies import study_ablation, study_timing, voting_
 from normlift_ns.evidence_collection import cells_to_regions
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.rasterization.backend import RasterJob
-from tests.scenes import Photographs, dense, generator, made_scene, orbit, random_scene
+from tests.random_scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
 OPTIONS = SourceOptions(encoder="colour", regions="grid", region_count=12)
@@ -212,7 +212,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA de
 
 @needs_gpu
 def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
-    from tests.raster.test_gpu import compiled_gsplat  # noqa: PLC0415
+    from tests.rasterization.test_gpu import compiled_gsplat  # noqa: PLC0415
 
     if not compiled_gsplat():
         pytest.skip("gsplat's compiled part is missing")

@@ -28,7 +28,7 @@ from normlift_ns.evaluation.coverage import (
     lifted_names,
 )
 from normlift_ns.rasterization.settings import RasterSettings
-from tests.scenes import Photographs, generator, made_scene
+from tests.random_scenes import Photographs, generator, made_scene
 
 NONE = Photographs([], [])
 

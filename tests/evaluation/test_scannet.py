@@ -16,7 +16,7 @@ from normlift_ns.evaluation.scannet import (
     evaluate_scannet,
     scene_scores,
 )
-from tests.scenes import generator
+from tests.random_scenes import generator
 
 
 def random_scene(seed: int, n: int = 400) -> SceneLabels:

@@ -22,7 +22,7 @@ from normlift_ns.evaluation.studies import (
     sweeps,
 )
 from normlift_ns.options import RefineConfig
-from tests.scenes import generator
+from tests.random_scenes import generator
 
 
 def scene(seed: int, n: int = 400) -> SceneSignals:

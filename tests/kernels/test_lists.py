@@ -13,7 +13,7 @@ from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import assign_tiles, camera_depths, prepare_gaussians, project
 from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, NEEDLES, hard_scene
-from tests.scenes import generator, orbit, random_labels, random_scene
+from tests.random_scenes import generator, orbit, random_labels, random_scene
 
 RULES = ("1.4", "1.5", "1.6")
 

@@ -5,8 +5,8 @@ import torch
 
 from normlift_ns.core.neighbors import _on_cpu
 from normlift_ns.kernels import nearest
-from tests.scenes import generator
-from tests.team.threads import together
+from tests.distributed.threads import together
+from tests.random_scenes import generator
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # infinity - infinity

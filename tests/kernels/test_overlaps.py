@@ -7,7 +7,7 @@ from normlift_ns.core import consensus as module
 from normlift_ns.core.consensus import consensus, region_overlaps
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.kernels import sparse
-from tests.scenes import dense, generator, random_evidence, unit_rows
+from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 

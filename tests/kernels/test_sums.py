@@ -7,7 +7,7 @@ from normlift_ns import Evidence, lift
 from normlift_ns.core.lift import _sums
 from normlift_ns.core.sparse import CANCELLATION_RATIO, MANY_ENTRIES, SparseRows, segment_sum
 from normlift_ns.kernels import sparse
-from tests.scenes import generator, random_evidence, unit_rows
+from tests.random_scenes import generator, random_evidence, unit_rows
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 

@@ -14,7 +14,7 @@ from normlift_ns.core.partition import spatial_order
 from normlift_ns.core.refine import decay_width, posterior_weights, voting_weights
 from normlift_ns.kernels.vote import has_reliable_neighbor, vote, voters_and_neighbors
 from tests.examples import examples
-from tests.scenes import generator, unit_rows
+from tests.random_scenes import generator, unit_rows
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 BFLOAT16 = [torch.bfloat16] if torch.cuda.is_available() else []

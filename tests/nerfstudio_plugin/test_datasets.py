@@ -16,10 +16,10 @@ from PIL import Image
 
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.errors import InputError
+from tests.data.scene_files import write_colmap
 from tests.hostile import fuzz, hostile_json
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, train_splatfacto, write_dataset
-from tests.scenes.made import write_colmap
 
 
 def write_project(folder: Path) -> Path:

@@ -19,7 +19,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.encoders.cache import _read, _write
 from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun, open_run
-from tests.core.test_digests import flipped
+from tests.io.test_digests import flipped
 
 KEPT = {"regions": "labels", "features": "features", "texts": "text"}
 """Folders of the cache, and the tensor in their files."""

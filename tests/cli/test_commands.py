@@ -1,0 +1,319 @@
+"""The commands on a small demo room, as a user types them: results, files, messages and exit codes."""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from normlift_ns import evidence_collection, open_run, open_scene
+from normlift_ns.cli import evaluate, export, lift, query
+from normlift_ns.core.metrics import class_scores, confusion
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.query.question import load_query
+from normlift_ns.segmentation.sam import MaskRules, SamMasks
+from tests.cli.conftest import QUICK, SMALL, run_entry, said
+from tests.data.scene_files import ply_columns, random_splat, write_gsplat, write_ply
+
+if TYPE_CHECKING:
+    from normlift_ns.demo.room import DemoRoom
+
+TWO = ("--max-views", "2", "--refine", "False")
+
+
+def field_of(outputs: Path, name: str) -> Any:
+    """Of a lifted run in the folder that --output-dir names."""
+    return open_run(outputs / "room" / "normlift" / name / "config.yml").field
+
+
+def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
+    run = open_run(lifted)
+    field, vectors = run.field, run.texts.text(room.names)
+    found = [field.query(vectors, refined=refined).argmax(1) for refined in (False, True)]
+    before, after = (class_scores(confusion(room.labels, classes, len(room.names))).miou for classes in found)
+    assert after > 0.7 and after > before
+    assert field.manifest["encoder"]["encoder"] == "colour"
+    assert field.manifest["statistics"]["views"] == 12
+    question = load_query(lifted.parent / "normlift")
+    assert question is not None and question.texts == ("red", "yellow")
+    assert sorted(p.name for p in lifted.parent.iterdir()) == [
+        "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
+    ]  # fmt: skip
+
+
+def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
+    places = {"--json": tmp_path / "a.json", "--output-path": tmp_path / "a.npz", "--render-dir": tmp_path / "pictures"}
+    outputs = [word for pair in places.items() for word in pair]
+    flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    shown = capsys.readouterr().out
+    assert "sky blue" in shown and "reliability" in shown and str(tmp_path / "pictures") in shown
+    document = json.loads((tmp_path / "a.json").read_text())
+    red, blue = document["queries"]
+    assert {"text", "fraction", "centroid", "peak", "mean_reliability"} <= set(red)
+    assert 0.005 < red["fraction"] < 0.1 and red["peak"] > 0.9 and 0.3 < red["mean_reliability"] < 1
+    run = open_scene(lifted)
+    scores = np.load(tmp_path / "a.npz")
+    assert scores["relevancy"].shape == (len(run.gaussians), 2)
+    assert scores["names"].tolist() == ["red", "sky blue"] and scores["valid"].dtype == bool
+    chosen = (scores["relevancy"][:, 0] > document["threshold"]) & scores["valid"]
+    assert chosen.mean() == pytest.approx(red["fraction"])
+    assert np.allclose(red["centroid"], np.average(run.gaussians.means[chosen], axis=0), atol=0.1)
+    assert blue["extent"][0] > red["extent"][0]
+
+    pictures = sorted((tmp_path / "pictures").iterdir())
+    assert [path.name for path in pictures] == [
+        "0003_0_red.png", "0003_1_sky_blue.png", "0007_0_red.png", "0007_1_sky_blue.png",
+        "contact_sheet_0_red.png", "contact_sheet_1_sky_blue.png",
+    ]  # fmt: skip
+    for path in pictures:
+        pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+        assert (np.ptp(pixels, axis=2) > 60).mean() > 0.001, path  # something is coloured, over a grey image
+
+
+def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
+    for output in ("--objects-dir", "--json", "--output-path", "--render-dir"):
+        folder = tmp_path / output
+        folder.mkdir()
+        pictures, objects = output == "--render-dir", output == "--objects-dir"
+        existing = folder / ("0003_1_sky_blue.png" if pictures else "objects.json" if objects else "mine")
+        existing.write_text("mine")
+        place = folder if objects or pictures else existing
+        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place, *["--objects"] * objects)
+        with monkeypatch.context() as patch:
+            patch.setattr("normlift_ns.query.arrays.open_quick", None)  # refused before anything is opened
+            for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
+                assert run_entry(patch, query.entrypoint, *flags, *views) == 1
+                shown = said(capsys)
+                assert f"{existing.name} exists" in shown and output in shown and "--overwrite True" in shown
+        assert [path.read_text() for path in folder.iterdir()] == ["mine"]
+        views = ("--render-views", "0003") if pictures else ()
+        assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
+        assert existing.stat().st_size > 100
+        assert len(list(folder.iterdir())) == (2 if pictures else 4 if objects else 1)
+    named = ("--load-config", lifted, "--text", "yellow", "--render-dir", folder, "--render-views", "0003")
+    assert run_entry(monkeypatch, query.entrypoint, *named) == 0  # of another text
+    assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
+
+
+def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
+    before = {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()}
+    for flag in ("--json", "--output-path"):
+        flags = ("--load-config", lifted, "--text", "red", flag, lifted, "--overwrite", True)
+        assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
+
+
+def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
+    clock = SimpleNamespace(now=lambda: datetime(2024, 5, 1, 12))
+    monkeypatch.setattr("normlift_ns.io.run_dir.datetime", clock)
+    flags = ("--load-config", little, *QUICK, *TWO, "--output-dir", tmp_path)
+    names = ["2024-05-01_120000", "2024-05-01_120000_2"]
+    for overwrite in ("False", "True"):
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
+    assert sorted(path.name for path in (tmp_path / "room" / "normlift").iterdir()) == [".cache", *names]
+    assert [len(field_of(tmp_path, name)) > 0 for name in names] == [True, True]
+
+
+def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("normlift_ns.evidence_collection._MAX_CHUNK", 2)
+    rasterize, calls = evidence_collection.batch_evidence, []
+
+    def interrupted(*args, **kwargs):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return rasterize(*args, **kwargs)
+
+    flags = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path / "out", "--timestamp", "t")
+    monkeypatch.setattr(evidence_collection, "batch_evidence", interrupted)
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
+    assert "rerun the command to resume" in capsys.readouterr().err
+    written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
+    assert {p.suffix for p in written} == {".safetensors"} and all(".cache" in p.parts for p in written)
+    fresh: list[Any] = []
+    monkeypatch.setattr(evidence_collection, "batch_evidence", rasterize)
+    save = evidence_collection.Evidence.save
+    monkeypatch.setattr(
+        evidence_collection.Evidence, "save", lambda self, *a, **how: (fresh.append(a), save(self, *a, **how))[1]
+    )
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    assert len(fresh) == 1  # of three blocks, two were kept
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> tuple[object, ...]:
+    """Flags of a small CLIP with random weights."""
+    from tests.encoders.tiny import CLIP, write_clip  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("clip")
+    write_clip(folder)
+    return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check", "False")
+
+
+def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", little, *clip, "--output-dir", tmp_path, "--timestamp", "t")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    config = tmp_path / "room" / "normlift" / "t" / "config.yml"
+    manifest = open_run(config).field.manifest
+    assert (manifest["features"]["kind"], manifest["encoder"]["text_template"]) == ("patches", "{}")
+    ask = ("--load-config", config, "--text", "table", "--json")
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
+    monkeypatch.setattr("normlift_ns.encoders.open_clip_network.load_open_clip", None)
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
+    plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
+    assert again == plain and ensemble["peak"] != plain["peak"]
+
+
+def test_levels_of_sam(little, clip, tmp_path, monkeypatch, capsys):
+    """All levels are found at once, so that another one asks SAM and the rasterizer nothing."""
+    from tests.encoders.tiny import write_sam  # noqa: PLC0415
+
+    write_sam(tmp_path / "sam.pth", seed=1, gain=6)
+    rules = MaskRules(points_per_side=4, predicted_iou=0.5, stability=0.3)
+    monkeypatch.setattr("normlift_ns.segmentation.sam.SamMasks", functools.partial(SamMasks, rules=rules))
+    flags = ("--load-config", little, *clip, "--sam-model", tmp_path / "sam.pth", "--output-dir", tmp_path)
+    shares = []
+    for level in ("l", "s"):
+        more = () if level == "l" else ("--level", level)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, *more, "--timestamp", level) == 0
+        field = field_of(tmp_path, level)
+        assert field.manifest["features"]["regions"]["kind"] == "sam"
+        assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
+        shares.append(field.manifest["statistics"]["zero_evidence_share"])
+        monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
+        monkeypatch.setattr("normlift_ns.segmentation.sam.SamNetwork", None)
+    assert shares[0] != shares[1] and max(shares) < 1
+
+
+def test_fewer_smaller_and_rendered_views(little, tmp_path, monkeypatch):
+    flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
+    given = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path)
+    assert run_entry(monkeypatch, lift.entrypoint, *given, *flags) == 0
+    found = field_of(tmp_path, "less").manifest["statistics"]
+    assert found["views"] == 5 and 0 < found["zero_evidence_share"] < 0.5
+
+
+def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--json", tmp_path / "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--render-dir", tmp_path / "pictures") == 1
+    shown = said(capsys)
+    assert "'9999'" in shown and "12" in shown and "'0000'" in shown and "'0011'" in shown
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch, capsys):
+    copy = tmp_path / "outputs" / "room" / "normlift" / "one"
+    shutil.copytree(lifted.parent, copy)
+    checkpoint = next((copy / "nerfstudio_models").iterdir())
+    state = torch.load(checkpoint, weights_only=True)
+    state["pipeline"]["_model.gauss_params.means"] += 1
+    torch.save(state, checkpoint)
+    data = lifted.parents[4] / "room"
+    flags = ("--load-config", copy / "config.yml", "--text", "red", "--data", data)
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    assert checkpoint.name in said(capsys)
+
+
+@pytest.mark.slow
+def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
+    """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
+    output = ("--load-config", little, "--k", "12", "--output-dir", tmp_path / "out")
+    exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
+    assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
+    assert len(list((tmp_path / "features").iterdir())) == 2 * 6
+    texts = ("red", "sky blue")
+    np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColorEncoder().text(texts).numpy())))
+
+    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
+    importing = ("--features", "langsplat", "--features-dir", tmp_path / "features")
+    vectors = ("--text-vectors", tmp_path / "texts.npz")
+    flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
+    for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
+        assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
+    assert torch.equal(first.source, second.source)
+    assert torch.equal(first.directions(), second.directions())
+    assert second.manifest["features"]["level"] == "l"
+    assert second.manifest["encoder"]["text_vectors"] == str(tmp_path / "texts.npz")
+
+
+@pytest.mark.slow
+def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path, monkeypatch):
+    for precision in ("standard", "double"):
+        flags = ("--load-config", little, *QUICK, "--precision", precision)
+        places = ("--output-dir", tmp_path, "--timestamp", precision)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, *places) == 0
+    double, single = field_of(tmp_path, "double"), field_of(tmp_path, "standard")
+    assert double.manifest["options"]["precision"] == "double"
+    difference = (double.scalars.reliability - single.scalars.reliability).abs()
+    assert 0 < float(difference.quantile(0.99)) < 1e-6
+    assert float(difference.max()) < 1e-2  # where a pixel of a faint Gaussian is on the other side of alpha = 1 / 255
+    assert (double.source != single.source).float().mean() < 0.01
+
+
+@pytest.fixture
+def ply(little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
+
+
+def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, tmp_path, monkeypatch, capsys) -> None:
+    """The config names cameras that nerfstudio leaves as they are."""
+    room, world = little.parents[4] / "room", little.parent / "dataparser_transforms.json"
+    cameras = ("--transforms", room / "transforms.json", "--world-transform", world)
+    flags = ("--load-ply", ply, *cameras, *SMALL, "--timestamp", "a", "--queries", "red", "yellow")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    printed = said(capsys)
+    run_dir = tmp_path / "outputs" / "room" / "normlift" / "a"
+    assert "2 of 8 images" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
+    found = open_run(run_dir / "config.yml").ask_stored()
+    assert found is not None and found["red"].peak > 0.8
+    asked = ("--load-config", run_dir / "config.yml")
+    assert run_entry(monkeypatch, query.entrypoint, *asked, "--text", "red") == 0
+    assert run_entry(monkeypatch, export.entrypoint, *asked, "--output-dir", tmp_path / "e") == 0
+    flags = ("--protocol", "masks", "--labels", room / "instance", "--output-path", tmp_path / "scores.json")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *asked, *flags) == 0
+    assert json.loads((tmp_path / "scores.json").read_text())
+    config = yaml.unsafe_load((run_dir / "config.yml").read_text())
+    parser = config.pipeline.datamanager.dataparser
+    assert (parser.orientation_method, parser.center_method, parser.eval_mode) == ("none", "none", "all")
+    assert (parser.auto_scale_poses, parser.load_3D_points, parser.downscale_factor) == (False, False, 1)
+    assert parser.data == config.data == run_dir / "transforms.json"
+    frame = json.loads((run_dir / "transforms.json").read_text())["frames"][0]
+    assert Path(frame["file_path"]).is_absolute()
+    assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} < set(frame)
+
+
+def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
+    """What shows before the splat is read is in test_early.py."""
+    columns, splat = ply_columns(random_splat(5)), ply_columns(SplatParameters(**open_scene(little).parameters))
+    write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
+    write_gsplat(ply.parent / "other.pt", random_splat(50))
+    write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})
+    given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
+    for kind, name, *facts in (
+        ("ply", "points.ply", "not a splat", "5", "f_dc_0"),
+        ("gsplat", "other.pt", "normalized"),
+        ("ply", "scene.ply", "does not show"),
+        ("ply", "far.ply", "do not look at this splat"),
+    ):
+        assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
+        text = said(capsys).replace("│", " ")
+        assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text
+        assert not (ply.parent / "outputs").exists()
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check", "False") == 0
+    assert (ply.parent / "outputs" / "room" / "normlift" / "a" / "config.yml").is_file()

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from normlift_ns import open_run
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.cli import export
+from normlift_ns.exports import answer_instances
+from normlift_ns.rendering.figures import view_mask
+from tests.cli.conftest import run_entry, said
+from tests.nerfstudio_plugin.stock_run import relocate_config
+
+EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "class_id", "instance_id"]
+
+
+@pytest.fixture(scope="module")
+def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    with pytest.MonkeyPatch.context() as patch:
+        assert run_entry(patch, export.entrypoint, "--load-config", lifted, "--output-dir", folder) == 0
+    return folder / "splat.ply"
+
+
+def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    setup = ns_export.eval_setup
+
+    def spoiled(config: Path, **options):
+        config, pipeline, *rest = setup(config, update_config_callback=lambda c: relocate_config(c, lifted), **options)
+        return config, pipeline, *rest
+
+    monkeypatch.setattr(ns_export, "eval_setup", spoiled)
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
+    ns_export.ExportGaussianSplat(load_config=lifted, output_dir=tmp_path).main()
+    theirs, ours = (PlyData.read(path)["vertex"] for path in (tmp_path / "splat.ply", scene_ply))
+    names = [p.name for p in theirs.properties]
+    assert [p.name for p in ours.properties] == [*names, *EXTRA]
+    for name in names:
+        assert np.array_equal(theirs[name], ours[name]), name
+    assert theirs.count == ours.count > 5000
+
+
+def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> None:
+    run = open_run(lifted)
+    field = run.field
+    vertices, rows = PlyData.read(scene_ply)["vertex"], np.load(scene_ply.with_name("splat_rows.npy"))
+    assert (np.diff(rows) > 0).all()
+    answer = run.ask("red", "yellow")  # what the run stores
+    assert np.array_equal(vertices["reliability"], field.scalars.reliability.numpy()[rows])
+    assert np.array_equal(vertices["n_eff"], field.scalars.n_eff.numpy()[rows])
+    assert np.allclose(vertices["relevancy_1"], answer.relevancy[:, 1].numpy()[rows], atol=1e-6)
+    class_id = torch.where(answer.selected.any(1), answer.relevancy.where(answer.selected, -9.0).argmax(1) + 1, 0)
+    assert vertices["class_id"].dtype == vertices["instance_id"].dtype == np.uint32
+    assert np.array_equal(vertices["class_id"], class_id.numpy()[rows])
+    names = json.loads(scene_ply.with_name("splat_names.json").read_text())
+    assert (names["none"], names["class_id"]) == (0, {"1": "red", "2": "yellow"})
+    instance_id = answer_instances(answer).instance_id.numpy()
+    assert np.array_equal(vertices["instance_id"], instance_id[rows])
+    assert [str(i) for i in np.unique(instance_id)] == ["0", *names["instance_id"]]
+    for number, about in names["instance_id"].items():  # an object is of one class, and hangs together
+        of_object = instance_id == int(number)
+        assert set(class_id.numpy()[of_object]) == {about["class_id"]}
+        assert names["class_id"][str(about["class_id"])] == about["text"]
+        assert of_object.sum() == about["gaussians"]
+        parts = connected_components(run.scene.gaussians.means, class_id == about["class_id"])
+        assert len(parts[torch.from_numpy(of_object)].unique()) == 1
+    assert 0.8 * len(run.scene.gaussians) < len(rows) <= len(run.scene.gaussians)
+    assert (run.scene.gaussians.opacities[rows] > 0.0039).all()
+
+
+def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
+    """trimesh, open3d, and the way in which the code of 3D Gaussian splatting picks properties by their prefix."""
+    import trimesh  # noqa: PLC0415
+
+    count = len(np.load(scene_ply.with_name("splat_rows.npy")))
+    assert trimesh.load(scene_ply).vertices.shape == (count, 3)
+    ply = PlyData.read(scene_ply)
+    names = [p.name for p in ply.elements[0].properties]
+    assert ply.header.startswith("ply\nformat binary_little_endian 1.0\n")
+    for prefix, number in (("f_rest_", 45), ("f_dc_", 3), ("scale_", 3), ("rot", 4), ("opacity", 1)):
+        assert len([n for n in names if n.startswith(prefix)]) == number
+    open3d = pytest.importorskip("open3d", reason="open3d needs system libraries here", exc_type=ImportError)
+    cloud = open3d.t.io.read_point_cloud(str(scene_ply))
+    assert cloud.point.positions.shape[0] == count
+    assert cloud.point.reliability.numpy().max() < 1
+
+
+def test_selection_and_rest_make_up_the_scene(scene_ply, lifted, tmp_path, monkeypatch, capsys) -> None:
+    rows = {}
+    for part in ("selection", "rest"):
+        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--part", part, "--text", "red")
+        assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-filename", f"{part}.ply") == 0
+        rows[part] = np.load(tmp_path / f"{part}_rows.npy")
+        assert PlyData.read(tmp_path / f"{part}.ply")["vertex"].count == len(rows[part])
+    assert np.array_equal(np.union1d(*rows.values()), np.load(scene_ply.with_name("splat_rows.npy")))
+    assert len(np.intersect1d(*rows.values())) == 0
+    assert "Objects" in capsys.readouterr().out
+
+
+def test_objects_of_the_room(lifted: Path, tmp_path: Path, monkeypatch) -> None:
+    flags = ("--load-config", lifted, "--output-dir", tmp_path, "--text", "red", "--threshold", "0.8")
+    assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
+    document = json.loads((tmp_path / "splat_objects.json").read_text())
+    (red,) = document["queries"]
+    assert (document["relevancy"], document["threshold"]) == ("cosine", 0.8)
+    sizes = [found["size"] for found in red["objects"]]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sum(sizes) + red["in_smaller_parts"] == red["gaussians"]
+    assert (red["class_id"], [found["instance_id"] for found in red["objects"]]) == (1, [*range(1, len(sizes) + 1)])
+    ball = red["objects"][0]
+    assert np.all(np.array(ball["box"]["min"]) <= ball["centroid"])
+    assert np.all(np.array(ball["centroid"]) <= ball["box"]["max"])
+    assert 0.3 < ball["mean_reliability"] < 1
+
+
+def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
+    given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
+    for flags, fact in ((("red", "--threshold", "1.5", "--part", "selection"), "no Gaussian"), (("oragne",), "orange")):
+        assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
+        assert fact in said(capsys)
+        assert not list((tmp_path / "x").glob("*"))
+    flags = ("--load-config", lifted, "--output-dir", tmp_path / "a" / "b", "--output-filename", "../../evil.ply")
+    assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.ply")] == ["a/b/evil.ply"]
+
+
+def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_path: Path, monkeypatch) -> None:
+    flags = ("--load-config", lifted, "--output-dir", tmp_path)
+    for rest in ((), ("--text", "red", "--part", "selection", "--overwrite", True)):
+        assert run_entry(monkeypatch, export.entrypoint, *flags, *rest) == 0
+    count = PlyData.read(tmp_path / "splat.ply")["vertex"].count
+    assert count == len(np.load(tmp_path / "splat_rows.npy")) < len(open_run(lifted).scene.gaussians) / 2
+    (red,) = json.loads((tmp_path / "splat_objects.json").read_text())["queries"]
+    assert red["text"] == "red"
+    open_run(lifted).export(tmp_path / "splat.ply", overwrite=True)  # has no table, and leaves none of another's
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["splat.ply", "splat_rows.npy"]
+
+
+def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("normlift_ns.lifted_run.open_run", None)  # refused before anything is opened
+    for existing in ("splat.ply", "splat_rows.npy", "splat_names.json", "splat_objects.json"):
+        (tmp_path / existing).write_text("mine")
+        assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1
+        shown = said(capsys)
+        assert f"{existing} exists" in shown and "--output-dir" in shown
+        assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+        (tmp_path / existing).unlink()
+
+
+def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:
+    run = open_run(lifted)
+    answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
+    points = np.concatenate([run.to_capture.transform_points(means[:50].double().numpy()), [[1e6, 0, 0]]])
+    table = np.array([tuple(point) for point in points], [(axis, "f8") for axis in "xyz"])
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "cloud.ply"))
+    flags = ("--load-config", lifted, "--output-dir", tmp_path, "--transfer", tmp_path / "cloud.ply")
+    more = ("--masks-dir", tmp_path / "masks", "--arrays-dir", tmp_path / "arrays")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, *more) == 0
+    assert "98.0%" in said(capsys)
+    rows, splat = np.load(scene_ply.with_name("splat_rows.npy")), PlyData.read(scene_ply)["vertex"]
+    arrays = {name: np.load(tmp_path / "arrays" / f"{name}.npy") for name in ("coord", "segment", "instance")}
+    assert [array.dtype.str for array in arrays.values()] == ["<f4", "<i4", "<i4"]
+    assert np.array_equal(arrays["coord"], np.stack([splat[axis] for axis in "xyz"], 1))
+    assert np.array_equal(arrays["segment"], splat["class_id"].astype(int) - 1)
+    assert np.array_equal(arrays["instance"], splat["instance_id"].astype(int) - 1)
+    assert arrays["segment"].min() == -1
+    cloud = PlyData.read(tmp_path / "cloud_labels.ply")["vertex"]
+    own = np.isin(np.arange(50), rows)  # the others are never drawn, and take those of a neighbour
+    assert own.sum() > 30
+    place = np.searchsorted(rows, np.arange(50)[own])
+    for name in ("class_id", "instance_id", "relevancy_0", "relevancy_1"):
+        assert np.array_equal(np.asarray(cloud[name])[:50][own], splat[name][place]), name
+        assert cloud[name][50] == 0
+    camera = run.scene.train.cameras[3]
+    found = np.array(Image.open(tmp_path / "masks" / "0003.png"))
+    assert found.shape == (camera.height, camera.width)
+    assert set(np.unique(found)) == {0, 255}
+    true = torch.isin(room.labels, torch.tensor([room.names.index(name) for name in ("red", "yellow")]))
+    wanted = view_mask(run.scene, camera, true).numpy()
+    assert ((found > 0) & wanted).sum() / ((found > 0) | wanted).sum() > 0.6
+    rest = ("--part", "rest", "--masks-dir", tmp_path / "rest", "--output-filename", "rest.ply")
+    assert run_entry(monkeypatch, export.entrypoint, *flags[:4], *rest) == 0
+    assert np.array_equal(np.array(Image.open(tmp_path / "rest" / "0003.png")), 255 - found)
+    assert answer.mask.any()
+    again = ("--masks-dir", tmp_path / "masks", "--output-dir", tmp_path / "again")
+    assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
+    assert "--masks-dir, or --overwrite True" in said(capsys)
+    again = ("--transfer", tmp_path / "cloud_labels.ply", "--output-dir", tmp_path / "again")
+    assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
+    assert "class_id, instance_id, relevancy_0, relevancy_1" in said(capsys)
+    assert not (tmp_path / "again").exists()  # refused before anything is written
+
+
+VERSION, NODE = "3.7.0", "22"
+FOLDER = Path(tempfile.gettempdir()) / f"normlift-splat-transform-{VERSION}"
+"""Kept, so that it is downloaded once."""
+
+
+@pytest.fixture(scope="module")
+def converter() -> list[str]:
+    """The words that start @playcanvas/splat-transform from npm. Its version 2.7.1, which older nodes get without a
+    word, hides what version 3 does to signed numbers."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("npm is absent, which brings the converter")
+    package = FOLDER / "node_modules" / "@playcanvas" / "splat-transform" / "package.json"
+    node = FOLDER / "node_modules" / "node" / "bin" / "node"
+    if not (package.is_file() and node.is_file()):
+        FOLDER.mkdir(exist_ok=True)
+        (FOLDER / "package.json").write_text('{"private": true}')
+        install = [npm, "install", "--no-audit", "--no-fund", f"@playcanvas/splat-transform@{VERSION}", f"node@{NODE}"]
+        done = subprocess.run(install, cwd=FOLDER, capture_output=True, text=True, timeout=300, check=False)
+        if done.returncode != 0 or not node.is_file():
+            pytest.skip(f"npm cannot install the converter: {' '.join((done.stderr + done.stdout).split())[-300:]}")
+    assert json.loads(package.read_text())["version"] == VERSION
+    binary = json.loads(package.read_text())["bin"]
+    start = package.parent / (binary if isinstance(binary, str) else binary["splat-transform"])
+    return [str(node), str(start)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_the_converter_keeps_what_we_say(mode, converter, lifted: Path, tmp_path: Path) -> None:
+    node = subprocess.run([converter[0], "--version"], capture_output=True, text=True, check=True).stdout
+    assert node.startswith(f"v{NODE}.")
+    run = open_run(lifted)
+    if mode == "antialiased":
+        run.scene.model_config.rasterize_mode = mode  # type: ignore[attr-defined]
+    run.export(tmp_path / "a.ply", answer=run.ask("red", "yellow"))
+    ours = PlyData.read(tmp_path / "a.ply")
+    assert ("SplatRenderMode: mip" in ours.comments) == (mode == "antialiased")
+    words = [*converter, str(tmp_path / "a.ply"), str(tmp_path / "b.ply")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    theirs = PlyData.read(tmp_path / "b.ply")["vertex"]
+    assert theirs.count == ours["vertex"].count
+    order = [np.lexsort([table[name] for name in "xyz"]) for table in (theirs, ours["vertex"])]
+    for name in {p.name for p in ours["vertex"].properties} - {"nx", "ny", "nz"}:
+        found, wanted = (t[name][o].astype(float) for t, o in zip((theirs, ours["vertex"]), order))
+        assert np.allclose(found, wanted, rtol=0 if name.endswith("_id") else 1e-5, atol=1e-5), name
+    kept = [*converter, str(tmp_path / "a.ply"), "--filter-value", "class_id,eq,1", str(tmp_path / "c.ply")]
+    done = subprocess.run(kept, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert PlyData.read(tmp_path / "c.ply")["vertex"].count == int((ours["vertex"]["class_id"] == 1).sum())

@@ -1,0 +1,96 @@
+"""The commands have the options of their dataclasses, each with a text; and they start."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import warnings
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import pytest
+import tyro
+
+import normlift_ns
+from normlift_ns.cli import common, start
+from research.reference import COMMANDS
+from tests.cli.conftest import run_entry
+from tests.conftest import project
+
+SCRIPTS = project()["scripts"]
+
+
+def options(command: Any) -> set[str]:
+    """The flags of a command and of the options within it."""
+    found: set[str] = set()
+    hints = get_type_hints(command, include_extras=True)
+    for field in fields(command):
+        hint, *more = (
+            get_args(hints[field.name]) if get_origin(hints[field.name]) is Annotated else (hints[field.name],)
+        )
+        if is_dataclass(hint):
+            assert not found & options(hint)
+            found |= options(hint)
+        elif tyro.conf.Suppress not in more and not any(getattr(part, "metavar", None) for part in more):
+            found.add(f"--{field.name.replace('_', '-')}")
+    return found
+
+
+def check_options(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: dict[str, Any] = {}
+    monkeypatch.setattr(tyro, "cli", lambda flags, **how: made.update(flags=flags, **how))
+    common.parse_flags(COMMANDS[name], ["--help"], name)
+    assert made["prog"] == name and "--quiet" in made["description"] and "--log-file" in made["description"]
+    summary = " ".join((COMMANDS[name].__doc__ or "").split("\n\n")[0].split())
+    assert made["description"].startswith(summary) and "Raises" not in made["description"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        parser = tyro.extras.get_parser(made["flags"], prog=name)
+    shown = [action for action in parser._actions if action.option_strings[:1] and action.dest != "help"]
+    found = []
+    for action in shown:
+        (flag,), text = action.option_strings, re.sub(r"\x1b\[\d*m", "", action.help or "")
+        told = re.search(r" ?\((?:default: (.*)|(required))\)$", text, re.DOTALL)
+        assert told is not None and len(text) > len(told[0]) + 10, f"{flag} has no text: {text}"
+        assert "\n" not in text and ">>>" not in text, f"{flag} breaks lines: {text}"
+        found.append(flag)
+    assert len(shown) == len(found) and set(found) == options(COMMANDS[name])
+    titles = [group.title or "" for group in parser._action_groups]
+    assert not [title for title in titles if "." in title or "options options" in title]
+
+
+def test_the_options_are_those_of_the_dataclasses(monkeypatch):
+    for name in COMMANDS:
+        check_options(name, monkeypatch)
+
+
+def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhile(monkeypatch, capsys):
+    assert SCRIPTS.keys() == COMMANDS.keys()
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    for name, place in SCRIPTS.items():
+        module, function = place.split(":")
+        assert module == "normlift_ns.cli.start"
+        begun: list[Any] = []
+        with monkeypatch.context() as patch:
+            command = import_module(f"normlift_ns.cli.{function}")
+            patch.setattr(common, "run_command_process", begun.append)
+            getattr(start, function)()
+            assert begun == [COMMANDS[name]], name
+            patch.setattr(command, "run_command", begun.append)
+            command.entrypoint()
+            assert begun == [COMMANDS[name]] * 2, name
+        assert run_entry(monkeypatch, command.entrypoint, "--version") == 0
+        assert capsys.readouterr() == (f"normlift_ns {normlift_ns.__version__}\n", "")
+        with monkeypatch.context() as patch:
+
+            def interrupted(module: str, begun: list[Any] = begun) -> None:
+                begun.append(module)
+                raise KeyboardInterrupt
+
+            patch.setattr(start, "import_module", interrupted)
+            with pytest.raises(SystemExit) as stop:
+                getattr(start, function)()
+        assert (stop.value.code, begun[2:]) == (130, [f"normlift_ns.cli.{function}"])
+        assert capsys.readouterr() == ("", "Interrupted.\n")

@@ -1,0 +1,182 @@
+"""The commands on LangSplat's files, with real vectors of CLIP, and on the trained captures."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from normlift_ns import Scene, open_run, render
+from normlift_ns.cli import lift, query
+from normlift_ns.core.metrics import class_scores, confusion
+from normlift_ns.encoders.text_files import TextEmbeddingFile
+from normlift_ns.rendering.figures import pixel_relevancy
+from tests.captures import SHARED, clip_vectors, needs_shared
+from tests.cli.conftest import run_entry
+
+pytestmark = needs_shared
+
+COLOURS = "cream,light brown,teal,chocolate brown,sky blue,dark green,bright blue,pink,orange,red,yellow,green,purple"
+WORDS = "curtain,mattress,doormat,table,sofa,flowerpot,crate,stool,cone,ball,doughnut,box,vase"
+THINGS = dict(zip(COLOURS.split(","), WORDS.split(",")))
+"""What the classes of the room are called here, by their colours."""
+NOISE, MERGED, UNLABELLED, SMALLEST = 1.0, 0.1, 0.2, 20
+"""Length of the noise on the unit vector of every mask; shares of masks that are merged with a neighbour and of pixels
+without any; pixels of the smallest mask."""
+
+
+def pieces(labels: NDArray, cell: int | None) -> NDArray:
+    """Masks of what is connected and of one label, cut by a grid of `cell` pixels; -1 where they are too small."""
+    if cell is not None:
+        y, x = np.indices(labels.shape)
+        labels = np.where(labels > 0, labels + 100 * (1 + y // cell * 1000 + x // cell), 0)
+    ids = np.full(labels.shape, -1)
+    count = 0
+    for label in np.unique(labels[labels > 0]):
+        parts, number = ndimage.label(labels == label, np.ones((3, 3)))
+        for part in range(1, number + 1):
+            if (parts == part).sum() >= SMALLEST:
+                ids[parts == part] = count
+                count += 1
+    return ids
+
+
+def damaged(truth: NDArray, cell: int | None, vectors: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """One level of one image: ids of masks without gaps, -1 for none, and their vectors."""
+    ids = pieces(truth, cell)
+    first = [truth[ids == i][0] - 1 for i in range(ids.max() + 1)]
+    rows = unit(vectors[first] + NOISE * unit(rng.normal(size=(len(first), vectors.shape[1]))))
+    for i in np.flatnonzero(rng.random(len(rows)) < MERGED):
+        around = np.unique(ids[ndimage.binary_dilation(ids == i, iterations=2)])
+        near = around[(around >= 0) & (around != i)]
+        if len(near) > 0:
+            other = rng.choice(near)
+            sizes = np.array([[(ids == i).sum()], [(ids == other).sum()]])
+            rows[other] = unit((sizes * rows[[i, other]]).sum(axis=0))
+            ids[ids == i] = other
+    smooth = ndimage.gaussian_filter(rng.normal(size=ids.shape), 8)
+    ids[smooth < np.quantile(smooth, UNLABELLED)] = -1
+    used = np.unique(ids[ids >= 0])
+    return np.where(ids >= 0, np.searchsorted(used, ids), -1), rows[used]
+
+
+def unit(rows: NDArray) -> NDArray:
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, seed: int) -> None:
+    """What LangSplat's preprocessing would leave of the training images."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir()
+    for path in sorted((capture / "instance").iterdir())[:views]:
+        truth = np.asarray(Image.open(path)).astype(np.int64)
+        levels = [damaged(truth, cell, vectors, rng) for cell in (None, 24, 48, None)]  # default, s, m, l
+        start = np.cumsum([0, *(len(rows) for _, rows in levels)])
+        segments = np.stack([np.where(ids >= 0, ids + first, -1) for (ids, _), first in zip(levels, start)])
+        assert segments.max() + 1 == start[-1]
+        np.save(folder / f"{path.stem}_s.npy", segments.astype(np.float32))
+        table = np.concatenate([rows for _, rows in levels])
+        np.save(folder / f"{path.stem}_f.npy", table.astype(np.float16).astype(np.float32))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("draws", "least"), [(1, 0.9), pytest.param(3, 0.92, marks=pytest.mark.extra)])
+def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
+    """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
+    from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
+    from tests.plain_room import plain_room  # noqa: PLC0415
+
+    room = plain_room()
+    names = json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text())
+    vectors = clip_vectors()[[names.index(THINGS[name]) for name in room.names]].numpy()
+    write_capture(room, tmp_path / "room", held_out=1, width=320, height=240)
+    trained = write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs")
+    np.savez(tmp_path / "texts.npz", **dict(zip(THINGS.values(), vectors)))
+    texts = TextEmbeddingFile(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])
+
+    def lifted(seed: int, level: str) -> tuple[Path, list[float]]:
+        """The run, and mIoU before and after refinement."""
+        features = tmp_path / f"features_{seed}"
+        if not features.exists():
+            write_features(tmp_path / "room", features, vectors, views=24, seed=seed)
+        name = f"{level}_{seed}"
+        importing = ("--features", "langsplat", "--features-dir", features, "--text-vectors", tmp_path / "texts.npz")
+        flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+        config = trained.parents[2] / "normlift" / name / "config.yml"
+        field = open_run(config).field
+        scores = []
+        for refined in (False, True):
+            found = torch.where(field.valid(refined=refined), field.query(texts, refined=refined).argmax(1), -1)
+            scores.append(class_scores(confusion(room.labels, found, len(room.names))).miou)
+        return config, scores
+
+    scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}
+    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)  # another level has its evidence
+    config, summed = lifted(0, "sum")
+    asking = ("--text", "sofa", "--negatives", "box", "table", "--json", tmp_path / "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
+    (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
+    before, after = np.mean(list(scores.values()), axis=0)
+    assert after >= least
+    assert all(refined > raw for raw, refined in scores.values())
+    assert after > before + 0.02
+    assert summed[1] >= 0.9
+    truth = room.labels == room.names.index("sky blue")
+    assert sofa["fraction"] == pytest.approx(float(truth.float().mean()), rel=0.2)
+
+
+def maps(config: Path, texts: list[str], split: str, count: int) -> tuple[Scene, torch.Tensor]:
+    """Relevancy of the texts in the first views of a split, [V, H, W, Q]."""
+    run = open_run(config)
+    scene, relevancy = run.scene, run.ask(*texts).relevancy
+    views = getattr(scene, split).cameras[:count]
+    return scene, torch.stack(
+        [pixel_relevancy(*render(scene.gaussians, c, relevancy, rasterize_mode=scene.rasterize_mode)) for c in views]
+    )
+
+
+@pytest.mark.slow
+def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
+    relative = Path(os.path.relpath(source, tmp_path))
+    flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
+    config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
+    asked = ("--load-config", config, "--text", "orange", "crimson", "--json", "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
+    assert "reliability" in capsys.readouterr().out
+    orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
+    assert orange["peak"] > 0.5 and crimson["peak"] > 0.6
+    _, values = maps(config, ["orange", "crimson"], "train", 1)
+    boxes = ((180, 330, 250, 330), (750, 930, 330, 480), (100, 190, 470, 535))
+    head, wallpaper, curtain = (values[0, a:b, c:d].mean(dim=(0, 1)).tolist() for a, b, c, d in boxes)
+    assert head[0] > 3 * wallpaper[0] and head[0] > 0.2
+    assert curtain[1] > 3 * max(head[1], wallpaper[1])
+
+
+@pytest.mark.slow
+def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
+    captures = SHARED / "captures"
+    source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
+    regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
+    flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
+    monkeypatch.chdir(captures)
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
+    run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)
+    masks = [captures / "tabletop" / "instance" / f"{Path(name).stem}.png" for name in run.held_out.names]
+    truth = torch.from_numpy(np.stack([np.array(Image.open(mask)).astype(int) for mask in masks]))
+    assert len(truth) == 4
+    table = truth == 1
+    for q, label, threshold in ((0, 11, 0.25), (1, 12, 0.8)):
+        thing = truth == label
+        found = (values[..., q] > threshold) & (thing | table)
+        assert float((found & thing).sum() / (found | thing).sum()) > 0.85, label

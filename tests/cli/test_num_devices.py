@@ -1,0 +1,157 @@
+"""Several processes lift one scene: the same files, whoever is killed meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.captures import SHARED, needs_shared
+from tests.cli.conftest import wait_for
+from tests.conftest import make_trained
+from tests.viewer.scenes import free_port
+
+pytestmark = pytest.mark.slow
+
+LIFT = (sys.executable, "-m", "normlift_ns.cli.lift")
+THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")}
+"""What rounding may depend on is the same for all."""
+TABLETOP = SHARED / "captures" / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
+
+
+@pytest.fixture(scope="module")
+def trained(made_once: Any) -> Path:
+    """A room of three grains of Gaussians."""
+    from tests.plain_room import plain_room  # noqa: PLC0415
+
+    return make_trained(made_once, "several", plain_room(20_000), views=9, width=96, height=72)
+
+
+@pytest.fixture(scope="module")
+def alone(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one process writes."""
+    output = tmp_path_factory.mktemp("alone")
+    done = lifted(*words(trained, output, 1))
+    assert done.returncode == 0, done.stderr
+    return output
+
+
+def words(trained: Path, output: Path, count: int, *flags: str) -> list[str]:
+    given = ("--load-config", str(trained), "--encoder", "colour", "--device", "cpu", "--timestamp", "t")
+    return [*LIFT, *given, "--output-dir", str(output), "--num-devices", str(count), *flags]
+
+
+def environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name not in ("RANK", "WORLD_SIZE")} | THREADS
+
+
+def lifted(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=400, check=False)
+
+
+def field_of(output: Path) -> dict[str, bytes]:
+    """The files of the field, by name; of the manifest what does not tell times and names."""
+    (folder,) = output.glob("*/normlift/t/normlift")
+    files = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix == ".safetensors"}
+    facts = json.loads((folder / "manifest.json").read_text())
+    facts = {name: value for name, value in facts.items() if name not in ("cost", "digest")}
+    return files | {"manifest": json.dumps(facts, sort_keys=True).replace(str(output), "").encode()}
+
+
+def check_same(outputs: Sequence[Path]) -> None:
+    first, *others = (field_of(output) for output in outputs)
+    assert "field.safetensors" in first
+    for found in others:
+        assert found.keys() == first.keys()
+        assert [name for name in first if found[name] != first[name]] == []
+
+
+def test_two_and_three_processes_write_the_files_of_one(trained, alone, tmp_path):
+    for count in (2, 3):
+        done = lifted(*words(trained, tmp_path / str(count), count))
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.count("ns-normlift-query") == 1  # one process speaks
+    check_same([alone, *(tmp_path / str(count) for count in (2, 3))])
+    assert list(tmp_path.glob("**/team-*")) == []
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("tabletop", [False, pytest.param(True, marks=needs_shared)])
+def test_other_options_too(tabletop, trained, tmp_path):
+    flags: tuple[str, ...] = ("--vote", "paper", "--consensus", "False", "--storage", "float16")
+    if tabletop:
+        trained, flags = TABLETOP, ("--max-views", "6", "--lift-downscale", "4")
+    for count in (1, 2 + tabletop):
+        done = lifted(*words(trained, tmp_path / str(count), count, *flags))
+        assert done.returncode == 0, done.stderr
+    check_same([tmp_path / str(count) for count in (1, 2 + tabletop)])
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("rank", [1, pytest.param(0, marks=pytest.mark.extra)])
+def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained, alone, tmp_path):
+    """While they keep what they have seen."""
+    command, output = words(trained, tmp_path / "killed", 2), tmp_path / "killed"
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: len(children(process.pid)) == 2)
+    victims = children(process.pid)
+    wait_for(lambda: any(output.rglob("*.safetensors")) or process.poll() is not None)
+    killed = process.poll() is None
+    if killed:
+        os.kill(victims[rank], signal.SIGKILL)
+    _, said = process.communicate(timeout=120)
+    if killed:
+        assert process.returncode == 1
+        assert f"Process {rank} of 0..1" in said and "SIGKILL" in said and "Traceback" not in said
+    again = lifted(*words(trained, output, 2, "--overwrite", "True"))
+    assert again.returncode == 0, again.stderr
+    check_same([alone, output])
+
+
+def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trained, tmp_path):
+    """As on several machines: variables alone."""
+    team = environment() | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "3"}
+    command = words(trained, tmp_path / "three", 1)
+    logs = [tmp_path / f"{r}.log" for r in range(3)]
+    processes = []
+    for rank, log in enumerate(logs):
+        with log.open("w") as file:
+            how = {"env": team | {"RANK": str(rank)}, "stdout": file, "stderr": file}
+            processes.append(subprocess.Popen(command, **how))
+    wait_for(lambda: "Opening" in logs[0].read_text())  # they have come together then
+    processes[1].kill()
+    for process in processes:
+        process.wait(timeout=110)
+    said = [log.read_text() for log in logs]
+    if processes[0].returncode != 0:  # else it had ended before
+        assert [process.returncode for process in processes] == [1, -9, 1]
+        assert any("Process 1 (" in text for text in (said[0], said[2])), said
+        assert not any("Traceback" in text or "bug in normlift_ns" in text for text in said), said
+
+
+def test_one_process_tells_of_a_mistake(trained, tmp_path):
+    for device, flags, fact in (
+        ("cpu", ("--regions", "files", "--regions-dir", str(tmp_path)), "has no label map"),
+        ("cuda", (), "GPU"),
+    ):
+        if device == "cuda" and torch.cuda.device_count() > 1:
+            continue
+        command = words(trained, tmp_path / "x", 2, *flags)
+        command[command.index("cpu")] = device
+        done = lifted(*command)
+        assert done.returncode == 1 and "Traceback" not in done.stderr
+        assert fact in done.stderr and "frame #" not in done.stderr, done.stderr
+        assert device == "cuda" or done.stderr.count(fact) == 1
+        assert list((tmp_path / "x").glob("*/normlift/t")) == []

@@ -1,0 +1,191 @@
+"""ns-normlift-query --objects and --why, honest answers in its table, and ns-normlift-export --part clean."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+
+from normlift_ns import Camera, InputError, open_run
+from normlift_ns.analysis.objects import csv_columns, view_shares
+from normlift_ns.cli import export, query
+from normlift_ns.cli.query import print_catalog
+from normlift_ns.exports import answer_instances
+from normlift_ns.rasterization.rasterize import render
+from normlift_ns.rasterization.settings import RasterSettings
+from tests.cli.conftest import run_entry, said
+
+if TYPE_CHECKING:
+    from normlift_ns.demo.room import DemoRoom
+
+
+@pytest.fixture(scope="module")
+def written(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("objects")
+    flags = ("--load-config", lifted, "--text", "red", "yellow", "--objects", "--objects-dir", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        assert run_entry(patch, query.entrypoint, *flags, "--metres-per-unit", 0.5) == 0
+    return folder
+
+
+def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: DemoRoom) -> None:
+    document = json.loads((written / "objects.json").read_text())
+    assert (document["unit"], document["metres_per_unit"], document["texts"]) == ("metre", 0.5, ["red", "yellow"])
+    ball = document["objects"][0]
+    truth = room.scene.means[room.labels == room.names.index("red")].double().numpy()  # the room as it was captured
+    assert (ball["id"], ball["text"], ball["class_id"]) == (1, "red", 1)
+    assert np.allclose(ball["capture"]["centroid"], 0.5 * truth.mean(0), atol=0.03)
+    extent = np.quantile(truth, 0.99, axis=0) - np.quantile(truth, 0.01, axis=0)
+    assert np.allclose(ball["capture"]["extent"], 0.5 * extent, atol=0.06)
+    transform = json.loads(lifted.with_name("dataparser_transforms.json").read_text())
+    there = np.array(ball["capture"]["centroid"]) / 0.5
+    back = transform["scale"] * (np.array(transform["transform"]) @ [*there, 1])
+    assert np.allclose(back, ball["scene"]["centroid"], atol=1e-5)
+    ratio = np.array(ball["scene"]["box"]["size"]) / ball["capture"]["box"]["size"]
+    assert ratio == pytest.approx(np.full(3, transform["scale"] / 0.5))
+
+
+def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None:
+    run = open_run(lifted)
+    few = run.catalogue(run.ask("red"))
+    many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
+    print_catalog(replace(few, objects=many))
+    shown = said(capsys)
+    assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
+    assert "2 smaller objects" in shown and "--objects-dir" in shown
+
+
+def test_table_boxes_and_document_say_the_same(written: Path) -> None:
+    document = json.loads((written / "objects.json").read_text())
+    with (written / "objects.csv").open(newline="", encoding="utf8") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == len(document["objects"]) >= 2
+    for row, found in zip(table, document["objects"]):
+        assert (int(row["id"]), row["text"], int(row["gaussians"])) == (found["id"], found["text"], found["gaussians"])
+        assert [row[f"best_view_{i}"] for i in (1, 2, 3)] == found["best_views"]
+        for prefix, place in (("", found["capture"]), ("scene_", found["scene"])):
+            assert [float(row[prefix + axis]) for axis in "xyz"] == place["centroid"]
+            assert [float(row[f"{prefix}box_size_{i}"]) for i in (1, 2, 3)] == place["box"]["size"]
+            axes = [[float(row[f"{prefix}box_axis_{i}_{axis}"]) for axis in "xyz"] for i in (1, 2, 3)]
+            assert axes == place["box"]["axes"]
+    for name, place in (("objects.ply", "capture"), ("objects_scene.ply", "scene")):
+        mesh = PlyData.read(written / name)
+        corners = np.stack([mesh["vertex"][axis] for axis in "xyz"], 1).reshape(-1, 8, 3)
+        faces = np.stack(mesh["face"]["vertex_indices"])
+        assert (len(corners), len(faces)) == (len(table), 6 * len(table))
+        assert mesh["vertex"]["instance_id"].tolist() == np.repeat([x["id"] for x in document["objects"]], 8).tolist()
+        for found, eight in zip(document["objects"], corners):
+            box = found[place]["box"]
+            along = (eight - box["center"]) @ np.array(box["axes"]).T
+            assert np.allclose(np.abs(along), np.array(box["size"]) / 2, atol=1e-4)
+        first = corners[0]
+        for a, b, c, _ in faces[:6]:  # counter-clockwise from outside
+            outwards = np.cross(first[b] - first[a], first[c] - first[b])
+            assert outwards @ (first[a] - first.mean(0)) > 0
+
+
+def share_inside(means: torch.Tensor, camera: Camera) -> float:
+    """Of the points that project into the picture."""
+    x, y, z = (camera.K @ (camera.world_to_camera[:3, :3] @ means.T + camera.world_to_camera[:3, 3:])).unbind()
+    return ((z > 0) & (x >= 0) & (y >= 0) & (x <= z * camera.width) & (y <= z * camera.height)).float().mean().item()
+
+
+def test_views_are_those_that_show_it(lifted: Path) -> None:
+    run = open_run(lifted)
+    answer = run.ask("red", "yellow")
+    found, instances = run.catalogue(answer), answer_instances(answer)
+    shares = view_shares(run.scene, instances, RasterSettings(), "cpu")
+    for number, thing in enumerate(found.objects, 1):
+        mask = (instances.instance_id == number).float()[:, None]
+        drawn = [render(run.scene.gaussians, camera, mask)[0].mean() for camera in run.scene.train.cameras]
+        assert np.allclose(shares[number - 1], drawn, atol=1e-6)
+        shows = [x >= 0.1 * max(drawn) for x in drawn]
+        inside = [share_inside(run.scene.gaussians.means[mask[:, 0] > 0], c) for c in run.scene.train.cameras]
+        enough = 0.95 * max(x for x, y in zip(inside, shows) if y)
+        best = sorted(range(len(drawn)), key=lambda i: (not shows[i], inside[i] < enough, -drawn[i]))[:3]
+        assert thing.best_views == tuple(run.scene.train.names[i] for i in best)
+        assert thing.views == sum(shows)
+    alone = run.catalogue(answer["yellow"])
+    assert {thing.text for thing in alone.objects} == {"yellow"}
+    (unnamed, *_) = run.catalogue(answer["red"].mask).objects
+    assert (unnamed.text, unnamed.gaussians) == ("", found.objects[0].gaussians)
+    assert run.catalogue(answer.mask & False).objects == ()
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="metres_per_unit"):
+            run.catalogue(answer, metres_per_unit=wrong)
+
+
+def test_the_page_explains_every_column() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
+    explained = set(re.findall(r"`([a-z0-9_]+)`", page))
+    assert set(csv_columns()) <= explained | {f"scene_{name}" for name in explained}
+
+
+def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    pictures, table = tmp_path / "why", tmp_path / "table.json"
+    flags = ("--load-config", lifted, "--text", "red", "--why", "--why-dir", pictures, "--json", table)
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    shown = said(capsys)
+    assert "C_inter 0.9" in shown
+    (row,) = json.loads(table.read_text())["queries"]
+    why = row["why"]
+    assert why["gaussians"] == round(row["fraction"] * len(open_run(lifted).field))
+    assert sum(view["share"] for view in why["views"]) == pytest.approx(1)
+    names = sorted(path.name for path in pictures.iterdir())
+    heaviest = [Path(view["photograph"]).stem for view in why["views"][:3]]
+    assert names[:3] == [f"0_red_{i}_{stem}.png" for i, stem in enumerate(heaviest, 1)]
+    assert len(names) == 6
+    assert Image.open(pictures / names[0]).size == (160, 120)
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2]) == 1
+    assert "exists" in said(capsys)
+
+
+def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    flags = ("--load-config", lifted, "--text", "red", "bright magenta", "--json", tmp_path / "x.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    shown = said(capsys)
+    assert "bright magenta: probably not in this scene" in shown
+    assert "red: probably not" not in shown
+    there, absent = json.loads((tmp_path / "x.json").read_text())["queries"]
+    assert (there["stands_out"], absent["stands_out"]) == (True, False)
+    assert absent["histogram"]["top"] < 0.9 < there["histogram"]["top"]
+    assert sum(there["histogram"]["counts"]) == sum(absent["histogram"]["counts"]) > 1000
+    nothing = ("--load-config", lifted, "--text", "bright magenta", "--why")
+    assert run_entry(monkeypatch, query.entrypoint, *nothing, "--threshold", "0.999") == 0
+    assert "bright magenta: nothing is selected" in said(capsys)
+
+
+def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch) -> None:
+    flags = ("--load-config", lifted, "--text", "red", "--threshold", "auto", "--json", tmp_path / "x.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    document = json.loads((tmp_path / "x.json").read_text())
+    (row,) = document["queries"]
+    assert document["threshold"] == pytest.approx(row["suggested_threshold"])
+    found = open_run(lifted).ask("red", threshold="auto")
+    assert found.question.threshold == pytest.approx(document["threshold"], abs=1e-5)
+    assert found["red"].suggested_threshold == pytest.approx(found.question.threshold)
+    assert row["fraction"] == pytest.approx(found["red"].fraction, abs=1e-3)
+
+
+def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    rows = {}
+    for part in ("scene", "clean"):
+        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", "--part", part)
+        assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
+        rows[part] = np.load(tmp_path / f"{part}_rows.npy")
+    mask = open_run(lifted).floaters().mask
+    assert np.array_equal(np.setdiff1d(rows["scene"], rows["clean"]), np.flatnonzero(mask.numpy()))
+    assert 0 < int(mask.sum()) < 0.05 * len(mask)
+    assert f"{int(mask.sum()):,} likely floaters are left out" in said(capsys)
+    limit = ("--floater-limit", "100", "--overwrite")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, *limit) == 0
+    assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), rows["scene"])

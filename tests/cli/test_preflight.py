@@ -1,0 +1,253 @@
+"""Mistakes that show before torch is imported: what they say, and what they cost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from normlift_ns.cli import evaluate, export, lift, query, view
+from normlift_ns.cli.preflight import check_unused_options
+from normlift_ns.data.nerfstudio.config import read_config_paths
+from normlift_ns.encoders import open_clip
+from normlift_ns.errors import InputError
+from normlift_ns.options import LiftOptions, RefineConfig
+from tests.cli.conftest import run_entry, said
+
+CONFIG = """!!python/object:nerfstudio.engine.trainer.TrainerConfig
+experiment_name: room
+method_name: splatfacto
+timestamp: run
+output_dir: !!python/object/apply:pathlib.PosixPath
+- outputs
+pipeline: !!python/object:a.B
+  datamanager: !!python/object:a.C
+    data: !!python/object/apply:pathlib.PosixPath
+    - room
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """A trained and lifted run, as far as one can see without opening it, and things that are no files."""
+    folder = tmp_path / "outputs" / "room" / "splatfacto" / "run"
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    (folder / "nerfstudio_models" / "step-000000009.ckpt").touch()
+    (folder / "normlift").mkdir()
+    (folder / "config.yml").write_text(CONFIG)
+    (tmp_path / "room").mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "dangling").symlink_to("nothing")
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "outputs" / "room" / "normlift" / "old").mkdir(parents=True)
+    return folder / "config.yml"
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("api.lift_run", "lifted_run.open_run"):
+        monkeypatch.setattr(f"normlift_ns.{name}", None)
+
+
+COLOUR = ("--encoder", "colour")
+LIFT = [
+    ("--encoder colour --beta nan", "--beta", "got nan"),
+    ("--encoder words", "'words'", "--encoder"),
+    ("--queries oragne", "oragne", "orange"),
+    ("--threshold 0.5", "--threshold"),
+    ("--device cuda:x:", "--device must be auto, cpu or cuda, got 'cuda:x:'"),
+    ("--timestamp ../x", "'../x'", "name of a folder"),
+    ("--timestamp old", "old exists", "--timestamp", "--output-dir", "--overwrite True"),
+    ("--output-dir file", "file, named with --output-dir"),
+    ("--output-dir dangling/x", "dangling", "link"),
+    ("--export-langsplat file", "file, named with --export-langsplat"),
+    ("--data nowhere", "nowhere, given with --data"),
+    ("--load-step 3", "step-000000003.ckpt"),
+    ("--regions-dir [/red]", "[/red], given with --regions-dir"),
+    ("--regions files", '"files"', "--regions-dir"),
+    ("--regions sam --level x", "--level must be one of s, m, l, default for sam, got 'x'"),
+    ("--regions grid --level l", "--level l", '"grid"'),
+    ("--regions-dir room --level x", "--level", "number of a map"),
+    ("--sam-model a/b/c.pth", "a/b/c.pth, given with --sam-model"),
+    ("--features langsplat", "'langsplat'", "--features-dir"),
+    ("--features langsplat --features-dir loop", "'loop', given with --features-dir"),
+    ("--features langsplat --features-dir room --level x", "s, m, l, default, sum for langsplat, got 'x'"),
+    ("--features langsplat --features-dir room --text-vectors fifo", "fifo, given with --text-vectors", "pipe"),
+    ("--encoder open_clip --encoder-pretrained missing.pt", "missing.pt"),
+    (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
+]
+SPLATS = [
+    ("--load-ply nowhere.ply", "nowhere.ply, given with --load-ply"),
+    ("--load-gsplat fifo", "fifo, given with --load-gsplat", "pipe"),
+    ("--load-ply file", "cameras", "none"),
+    ("--load-ply file --colmap room --transforms x", "cameras", "two"),
+    ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
+    ("--load-ply file --colmap room --masks none", "none, given with --masks"),
+    ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
+    ("--load-config room", "config at room"),
+    ("", "got 0"),
+    ("--load-ply file --load-config config.yml", "got 2"),
+    ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),
+    ("--load-ply file --transforms room --data x", "--data", "--load-config"),
+    ("--load-ply file --transforms room --views some", "--views", "'some'"),
+    ("--load-config config.yml --colmap x", "--colmap is for --load-ply and --load-gsplat"),
+    ("--load-config config.yml --background white", "--background is for --load-ply"),
+]
+QUERY = [
+    ("--text", "--text", "--interactive"),
+    (("--text", ""), "prompt 1 of 1 in --text"),
+    (("--text", "a", "--negatives", "b", ""), "prompt 2 of 2 in --negatives"),
+    ("--text a --min-reliability nan", "--min-reliability must be in 0..1, got nan"),
+    ("--text a --json room", "room exists", "--json"),
+    ("--text a --json room --overwrite True", "room, given with --json", "not a regular file"),
+    ("--text a --json file/x", "file, named with --json"),
+    ("--text a --json n --output-path n", "--json and --output-path", ", n"),
+    ("--text a --render-dir file", "file, named with --render-dir"),
+    ("--text a --why --why-dir file", "file, named with --why-dir"),
+    ("--text a --objects --objects-dir file", "file, named with --objects-dir"),
+    ("--text a --text-vectors none.npz", "none.npz, given with --text-vectors"),
+    ("--text a --render-views 9999 --json a.json", "--render-views", "--render-dir"),
+    ("--text a --objects-dir x", "--objects-dir", "--objects"),
+    ("--text a --metres-per-unit 2", "--metres-per-unit", "--objects"),
+    ("--text a --why-dir x", "--why-dir", "--why True"),
+    ("--text a --segment-views 3", "--segment-views", "--segment sam3"),
+    ("--stdin --why", "--why", "--text", "--stdin"),
+    ("--text a --stdin", "--text and --stdin"),
+    ("--interactive", "--interactive", "terminal"),
+    ("", "no prompts"),
+    ("--stdin --interactive True", "--stdin", "--interactive"),
+    ("--stdin --json a.json", "--json", "--text", "--stdin"),
+    ("--interactive --save", "--save", "--text", "--interactive"),
+]
+EXPORT = [
+    ("--part selection", "--part selection", "--text"),
+    ("--transfer file", "--transfer", "--text"),
+    ("--part nothing", "--part", "'nothing'"),
+    ("--reach nan", "--reach", "got nan"),
+    ("--output-dir file", "file, named with --output-dir"),
+    ("--output-filename /", "--output-filename"),
+    ("--text a --transfer none.ply", "none.ply, given with --transfer"),
+    ("--text a --part clean --masks-dir m", "--masks-dir"),
+]
+EVAL = [
+    ("--protocol masks --labels none", "none, given with --labels"),
+    ("--protocol lerf --labels none", "none, given with --labels"),
+    ("--protocol scannet --labels none", "none, given with --labels"),
+    ("--protocol masks --labels room --purity nan", "--purity must be in 0..1, got nan"),
+    ("--protocol masks --labels room --names none", "none, given with --names"),
+    ("--protocol masks --labels room --output-path file/x", "file, named with --output-path"),
+    ("--protocol masks --labels room room", "1 runs", "2 --labels"),
+    ("--protocol none", "protocol none", "--labels", "--study coverage"),
+    ("--protocol none --study coverage --labels .", "protocol none", "--study coverage"),
+]
+VIEW = [
+    ("--port 70000", "--port", "65,535", "70000"),
+    ("--device tpu", "--device", "'tpu'"),
+    ("--host 192.0.2.1", "--host 192.0.2.1"),
+    (f"--host {'a' * 70}", f"--host {'a' * 70}"),
+    ("--text-vectors none.npz", "none.npz, given with --text-vectors"),
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "cases"),
+    [
+        pytest.param(lift, ("--load-config", "CONFIG", *COLOUR), LIFT, id="lift"),
+        pytest.param(lift, COLOUR, SPLATS, id="splat"),
+        pytest.param(query, ("--load-config", "CONFIG"), QUERY, id="query"),
+        pytest.param(export, ("--load-config", "CONFIG", "--output-dir", "out"), EXPORT, id="export"),
+        pytest.param(evaluate, ("--load-config", "CONFIG"), EVAL, id="eval"),
+        pytest.param(view, ("--load-config", "CONFIG"), VIEW, id="view"),
+    ],
+)
+def test_a_mistake_is_told_early_and_leaves_nothing(command, given, cases, config, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    for flags, *facts in cases:
+        words = [str(config) if word == "CONFIG" else word for word in given]
+        words += flags.split() if isinstance(flags, str) else flags
+        assert run_entry(monkeypatch, command.entrypoint, *words) == 1, flags
+        text = said(capsys).replace("│", "")
+        assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, (flags, text)
+        assert sorted(tmp_path.rglob("*")) == before, flags
+
+
+@pytest.mark.parametrize("command", [query, view])
+def test_a_run_that_is_not_lifted_is_told(command, config, monkeypatch, capsys):
+    text = ("--text", "a") if command is query else ()
+    assert run_entry(monkeypatch, command.entrypoint, "--load-config", config.parent / "no.yml", *text) == 1
+    assert str(config.parent / "no.yml") in said(capsys)
+    (config.parent / "normlift").rmdir()
+    assert run_entry(monkeypatch, command.entrypoint, "--load-config", config, *text) == 1
+    assert "run without semantics" in said(capsys)
+
+
+def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, capsys):
+    (tmp_path / "room").rmdir()
+    monkeypatch.chdir("/")
+    for entrypoint, flags in ((lift.entrypoint, COLOUR), (query.entrypoint, ("--text", "a"))):
+        assert run_entry(monkeypatch, entrypoint, "--load-config", config, *flags) == 1
+        assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "with --data" in shown
+
+
+def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_early(
+    config, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "room" / "normlift").mkdir(parents=True)
+    (tmp_path / "room" / "normlift" / ".cache").touch()
+    (tmp_path / "locked").mkdir(mode=0o500)
+    folders = {tmp_path: ".cache, named with --output-dir", tmp_path / "locked" / "new": "is not writable"}
+    for folder, fact in list(folders.items())[: 1 if os.geteuid() == 0 else 2]:  # root may write everywhere
+        assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", folder) == 1
+        assert fact in said(capsys)
+
+
+def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsys):
+    def unreachable(request: object, timeout: float) -> None:
+        raise OSError("no route")
+
+    monkeypatch.setattr("urllib.request.urlopen", unreachable)
+    monkeypatch.setenv("HF_ENDPOINT", "https://hub")
+    for there in (False, True, None):
+        asked: list[tuple[str, ...]] = []
+
+        def at_hand(*name: str, asked: list[tuple[str, ...]] = asked, there: bool | None = there) -> bool | None:
+            asked.append(name)
+            return there
+
+        monkeypatch.setattr(open_clip, "has_local_clip_weights", at_hand, raising=False)
+        code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, "--timestamp", "old")
+        assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
+        text = said(capsys)
+        assert ("laion2b_s34b_b88k" in text and "https://hub cannot be reached" in text) == (there is False)
+
+
+def test_what_is_no_config_is_one_message(tmp_path, monkeypatch, capsys):
+    broken = ("", "[", "a: [", "- 1", "\0", "&a [*a]", "[" * 5000, "method_name: [1]", "{" * 3000, "a: !!x", "\ud800")
+    for text in broken:
+        (tmp_path / "config.yml").write_bytes(text.encode("utf8", "surrogatepass"))
+        assert run_entry(monkeypatch, lift.entrypoint, "--load-config", tmp_path / "config.yml", *COLOUR) == 1
+        assert "is not a nerfstudio config" in said(capsys), text[:20]
+
+
+def test_places_of_a_config_and_others_are_looked_at_without_harm(config, tmp_path):
+    seen = read_config_paths(config)
+    assert (seen.experiment, seen.output_dir, seen.data[0]) == ("room", tmp_path / "outputs", tmp_path / "room")
+    for key in ("experiment_name", "timestamp", "output_dir", "pipeline"):
+        lines = [line for line in CONFIG.splitlines() if not line.startswith((f"{key}:", " ", "-"))]
+        for value in ("null", "[1, 2]", "{a: b}", "7", "!!python/object/apply:os.system [x]"):
+            (tmp_path / "config.yml").write_text("\n".join([*lines, f"{key}: {value}"]))
+            read_config_paths(tmp_path / "config.yml")
+
+
+def test_options_of_what_is_off_are_refused():
+    for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_least": 0.0}.items():
+        with pytest.raises(InputError, match=f"--{name.replace('_', '-')} is for --consensus True"):
+            check_unused_options(LiftOptions(consensus=False, **{name: value}))
+    with pytest.raises(InputError, match="--prior is for --vote posterior"):
+        check_unused_options(LiftOptions(vote=RefineConfig(vote="paper", prior=2.0)))
+    check_unused_options(
+        LiftOptions(consensus=True, consensus_power=2.0, vote=RefineConfig(vote="posterior", prior=2.0))
+    )

@@ -1,0 +1,186 @@
+"""What the commands print, and where: --quiet, --log-file, colours, warnings of others, errors that can be copied."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from normlift_ns.cli import evaluate, export, lift, query, view
+from normlift_ns.cli.common import (
+    OutputSettings,
+    info,
+    info_opening,
+    info_progress,
+    one_line_errors,
+    split_output_flags,
+)
+from normlift_ns.errors import InputError
+from tests.cli.conftest import SMALL, run_entry
+
+
+def talk(word: str) -> None:
+    info_opening(Path("run"))
+    info_progress("lift")
+    info(f"answer {word}")
+    for text, category in (("old", FutureWarning), ("wrong", UserWarning)):
+        warnings.warn_explicit(text, category, "/site-packages/torch/jit.py", 7)
+    sys.stdout.write("\x1b[31mred\x1b[0m\n")
+    if word == "no":
+        raise InputError("no")
+
+
+def test_quiet_leaves_results_warnings_and_errors(ended) -> None:
+    for words, quiet in (
+        (("--word", "a"), False),
+        (("--word", "a", "--quiet", "False"), False),
+        (("--quiet", "--word", "a"), True),
+        (("--word", "a", "--quiet", "True"), True),
+    ):
+        code, out, err = ended(talk, *words)
+        assert (code, out.splitlines()[:-1]) == (0, ["answer a"] if quiet else ["lift", "answer a"])
+        assert err.startswith("Opening run") != quiet and "wrong" in err and "old" not in err
+    code, _, err = ended(talk, "--quiet", "--word", "no")
+    assert (code, err.splitlines()[-2:]) == (1, ["Error", "no"])
+
+
+def test_a_log_file_gets_everything_without_colours_and_is_added_to(ended, tmp_path: Path) -> None:
+    log = tmp_path / "a.log"
+    for word, ends in (("a", 0), ("no", 1)):
+        code, out, _ = ended(talk, "--word", word, "--log-file", str(log))
+        assert code == ends and "\x1b[31mred" in out
+    text = log.read_text("utf8")
+    assert "\x1b" not in text
+    assert {"Opening run", "lift", "answer a", "answer no", "red", "Error", "no"} <= set(text.splitlines())
+    assert text.count("FutureWarning: old") == 2 and text.count("UserWarning: wrong") == 2
+    assert f"--word no --log-file {log}" in text
+
+
+def test_mistakes_are_messages(ended) -> None:
+    for flags, *facts in (
+        (("--log-file", "."), ".", "not a regular file"),
+        (("--log-file", "nowhere/a.log"), "nowhere/a.log, given with --log-file", "No such file"),
+        (("--log-file",), "--log-file"),
+        (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
+    ):
+        code, out, err = ended(info, *flags)
+        assert (code, out) == (1, "") and "Traceback" not in err
+        assert [fact for fact in facts if fact not in err] == [], flags
+
+
+def test_words_for_another_command_stay() -> None:
+    words = ["list.txt", "--quiet", "False", "--", "--quiet", "--log-file", "x"]
+    assert split_output_flags(words) == (["list.txt", *words[3:]], OutputSettings())
+    with pytest.raises(InputError):
+        split_output_flags(["--log-file", "--k"])
+
+
+def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    for name in ("FORCE_COLOR", "NO_COLOR"):
+        monkeypatch.delenv(name, raising=False)
+    for code, *flags in ((0, "--help"), (1, "--load-config", tmp_path / "no.yml"), (1, "--wrod")):
+        assert run_entry(monkeypatch, lift.entrypoint, *flags) == code
+        shown = capsys.readouterr()
+        assert len(shown.out + shown.err) > 20 and "\x1b" not in shown.out + shown.err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+@pytest.mark.parametrize("no_color", [True, False])
+def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_path: Path) -> None:
+    import pty  # noqa: PLC0415 (Windows has none)
+
+    environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "NO_COLOR")}
+    environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
+    program = "from normlift_ns.cli.start import lift; lift()"
+    config = tmp_path / ("long-" * 30) / "no.yml"
+    for flags, fact in ((("--load-config", str(config)), str(config)), (("--k", "many"), "--k cannot be 'many'.")):
+        master, slave = pty.openpty()
+        words = [sys.executable, "-c", program, *flags]
+        subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
+        os.close(slave)
+        shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
+        os.close(master)
+        assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
+        lines = shown.splitlines()
+        assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
+        assert fact in re.sub(r"\x1b\[[\d;]*m", "", lines[1])  # one line, at the left, however long
+        assert not set("│╭╰") & set(shown)
+
+
+def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys, tmp_path: Path) -> None:
+    places = ("--output-dir", tmp_path / ("deep-" * 20), "--timestamp", "next", "--queries", "red mug", "blue")
+    flags = ("--load-config", little, *SMALL, *places, "--max-views", "3")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    shown = capsys.readouterr().out
+    config = next(tmp_path.glob("deep-*/*/normlift/next/config.yml"))
+    assert shown.splitlines()[-1] == f"ns-normlift-query --load-config {config} --text 'red mug'"
+    words = " ".join(shown.replace("│", " ").split())
+    assert re.search(r"half of the Gaussians above 0\.\d", words) and re.search(r"% of Gaussians took over", words)
+    assert "not visible in any image" in words
+    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True", "--quiet") == 0
+    assert capsys.readouterr().out.splitlines() == [shown.splitlines()[-1]]
+
+
+ALL = "All options: command --help"
+CASES = (
+    (lift, "--load-confg x", "Unknown options: --load-confg, x.", "Perhaps you meant: --load-config", ALL),
+    (lift, "--load-config x y", "Unknown options: y.", ALL),
+    (lift, "--load-config", "--load-config needs a value.", ALL),
+    (lift, "--refine perhaps", "--refine cannot be 'perhaps'.", "'True', 'False'", ALL),
+    (lift, "--k many", "--k cannot be 'many'. --k INT: "),
+    (lift, "--beta high", "--beta cannot be 'high'. --beta FLOAT: "),
+    (lift, "--max-views few", "--max-views cannot be 'few'. --max-views {None}|INT: "),
+    (query, "--load-config x --threshold low", "--threshold cannot be 'low'. --threshold"),
+    (export, "--load-config x", "command needs: --output-dir PATH: "),
+    (evaluate, "--studdy x", "Unknown options: --studdy x.", ALL),
+    (view, "", "command needs: --load-config PATH: "),
+)
+
+
+def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
+    for i, (command, words, *facts) in enumerate(CASES):
+        monkeypatch.setenv("COLUMNS", "40" if i % 2 == 0 else "200")
+        assert run_entry(monkeypatch, command.entrypoint, *words.split()) == 1, words
+        shown = capsys.readouterr()
+        title, line = shown.err.splitlines()
+        assert (shown.out, title) == ("", "Error")
+        assert [fact for fact in facts if fact not in line] == [], line
+        assert not set("│╭╰─\\") & set(line)
+
+
+def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> None:
+    assert run_entry(monkeypatch, lift.entrypoint, "--help") == 0
+    assert "usage: " in capsys.readouterr().out
+    with one_line_errors("command"):
+        print("k is lowered", file=sys.stderr)
+    assert capsys.readouterr().err == "k is lowered\n"
+
+
+def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
+    doors: list[tuple[str, int]] = []
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def door(host: str, port: int) -> SimpleNamespace:
+        doors.append((host, port))
+        return SimpleNamespace(server=SimpleNamespace(port=7010))
+
+    monkeypatch.setattr("normlift_ns.viewer.adapter.Door", door)
+    monkeypatch.setattr(view, "check_lifted_run", lambda *_: None)
+    monkeypatch.setattr(view.NormLiftView, "open", interrupted)
+    for host, port in (("127.0.0.1", 7008), ("0.0.0.0", 7010)):
+        view.NormLiftView(Path("config.yml"), host=host, port=port).main()
+    taken, *lines = capsys.readouterr().out.splitlines()
+    assert "7008" in taken and len(lines) == 4
+    assert "http://127.0.0.1:7010" in lines[0] and lines[:2] == lines[2:]
+    assert doors == [("127.0.0.1", 7008), ("0.0.0.0", 7010)]
+    assert view.NormLiftView(Path("config.yml")).host == "127.0.0.1"

@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from normlift_ns.data.colmap import (
+    colmap_intrinsics,
+    colmap_pose,
+    find_colmap_model,
+    read_colmap_model,
+    read_colmap_points,
+)
+from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.errors import InputError
+from tests.data.scene_files import write_colmap
+from tests.hostile import damaged, fuzz
+
+DISTORTED = Intrinsics(500.5, 500.5, 320.25, 240.75, 640, 480, k1=0.05, k2=-0.01, p1=1e-3, p2=-2e-3)
+KEPT = {
+    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+}  # fmt: skip
+
+
+def read_cameras(folder: Path) -> dict[int, Intrinsics]:
+    return {number: colmap_intrinsics(camera, folder) for number, camera in read_colmap_model(folder)[0].items()}
+
+
+def read_images(folder: Path) -> list:
+    return sorted(read_colmap_model(folder)[1], key=lambda image: image.name)
+
+
+def frames(count: int = 5) -> list[Frame]:
+    rotations = Rotation.random(count, random_state=0).as_matrix()
+    centres = np.random.default_rng(0).normal(size=(count, 3))
+    return [
+        Frame(Path(f"{i}.jpg"), f"images/photo {i}.jpg", np.column_stack([r, c]), DISTORTED)
+        for i, (r, c) in enumerate(zip(rotations, centres))
+    ]
+
+
+def test_projects_are_read(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal(size=(9, 3))
+    for model, kept in KEPT.items():
+        for binary in (False, True):
+            project = write_colmap(tmp_path / f"{model}{binary}", frames(), model, binary=binary, points=points)
+            folder = find_colmap_model(project)
+            cameras, images = read_cameras(folder), read_images(folder)
+            assert [image.name for image in images] == [f"photo {i}.jpg" for i in range(5)]
+            lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in kept}
+            for image, frame in zip(images, frames()):
+                assert np.allclose(colmap_pose(image), frame.pose, atol=1e-12)
+                assert cameras[image.camera_id] == DISTORTED._replace(**lost), (model, binary)
+            assert np.array_equal(read_colmap_points(folder), points)
+
+
+def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "a", frames())
+    found = tmp_path / "a" / "sparse" / "0"
+    assert find_colmap_model(tmp_path / "a") == found == find_colmap_model(found)
+    (tmp_path / "b").mkdir()
+    for name, message in (("b", "COLMAP"), ("c", "no folder")):
+        with pytest.raises(FileNotFoundError, match=message):
+            find_colmap_model(tmp_path / name)
+
+
+def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:
+    for binary in (False, True):
+        folder = find_colmap_model(write_colmap(tmp_path / str(binary), frames(), "OPENCV_FISHEYE", binary=binary))
+        with pytest.raises(InputError, match=r"OPENCV_FISHEYE; .* SIMPLE_PINHOLE, PINHOLE"):
+            read_cameras(folder)
+    folder = find_colmap_model(write_colmap(tmp_path, frames()))
+    for name, start, count, message in (
+        ("cameras", 12, b"\x4d", r"cameras\.bin .* 77"),
+        ("cameras", 0, struct.pack("<Q", 10**12), "1,000,000,000,000"),  # more than the file can hold
+        ("images", 0, struct.pack("<Q", 10**12), "1,000,000,000,000"),
+    ):
+        whole = (folder / f"{name}.bin").read_bytes()
+        (folder / f"{name}.bin").write_bytes(whole[:start] + count + whole[start + len(count) :])
+        with pytest.raises(InputError, match=message):
+            read_cameras(folder)
+        (folder / f"{name}.bin").write_bytes(whole)
+    (folder / "images.bin").unlink()
+    for make in (lambda path: None, os.mkfifo):
+        make(folder / "images.txt")
+        with pytest.raises(FileNotFoundError, match=r"images\.bin nor images\.txt"):
+            read_images(folder)
+
+
+def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), binary=False))
+    for name, line, read in (
+        ("cameras", "1 PINHOLE 640 480 500 500 320", read_cameras),
+        ("cameras", "1 PINHOLE 640", read_cameras),
+        ("cameras", "1 PINHOLE wide 480 500 500 320 240", read_cameras),
+        ("images", "1 1 0 0 0 0 0 0", read_images),
+        ("images", "1 nan 0 0 0 0 0 0 1 a.jpg", read_images),
+        ("images", "1 0 0 0 0 0 0 0 1 a.jpg", read_images),
+        ("points3D", "1 2 3", read_colmap_points),
+        ("points3D", "1 nan 3 4 0 0 0 1", read_colmap_points),
+    ):
+        whole = (folder / f"{name}.txt").read_text()
+        (folder / f"{name}.txt").write_text(line + "\n")
+        with pytest.raises(InputError, match=str(folder)):
+            read(folder)
+        (folder / f"{name}.txt").write_text(whole)
+
+
+def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
+    cameras, images = (folder / "cameras.txt").read_text(), (folder / "images.txt").read_text()
+    for changed, message in (
+        (cameras + cameras.splitlines()[-1], "twice"),
+        (cameras.replace("640", "1000000000"), "65,536"),
+        (cameras.replace("500.5", "inf"), "inf"),
+        ("# nothing", "camera 5"),
+    ):
+        (folder / "cameras.txt").write_text(changed)
+        with pytest.raises(InputError, match=message):
+            read_colmap_model(folder)
+    (folder / "cameras.txt").write_text(cameras)
+    (folder / "images.txt").write_text(images + "\n".join(images.splitlines()[-2:]))
+    with pytest.raises(InputError, match="same ID"):
+        read_colmap_model(folder)
+    (folder / "images.txt").write_text("# none")
+    with pytest.raises(InputError, match="0 registered images"):
+        read_colmap_model(folder)
+
+
+def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> None:
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), binary=False))
+    expected = read_images(folder)
+    lines = (folder / "images.txt").read_text().splitlines()
+    pairs = [f"\n{first}\n{second}\n" for first, second in zip(lines[2::2], lines[3::2])]
+    (folder / "images.txt").write_text("\n".join([*lines[:2], *pairs]), "utf-8-sig")
+    assert [image.name for image in read_images(folder)] == [image.name for image in expected]
+    (folder / "images.txt").write_text("\n".join(lines[2::2]))  # without the lines of points
+    with pytest.raises(ValueError, match="points"):
+        read_images(folder)
+
+
+def test_no_damage_gets_through_as_another_error(tmp_path: Path) -> None:
+    for suffix in ("bin", "txt"):
+        project = write_colmap(tmp_path / suffix, frames(2), binary=suffix == "bin", points=np.eye(3))
+        model = find_colmap_model(project)
+
+        def load(folder: Path = model) -> None:
+            try:
+                _ = (
+                    read_colmap_points(folder),
+                    read_cameras(folder),
+                    [colmap_pose(image) for image in read_images(folder)],
+                )
+            except (InputError, FileNotFoundError) as error:
+                assert str(folder) in str(error)
+                raise
+
+        for path in sorted(model.iterdir()):
+            whole = path.read_bytes()
+            fuzz(5, damaged(whole), path, load)
+            path.write_bytes(whole)

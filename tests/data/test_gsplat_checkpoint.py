@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from normlift_ns.data.checkpoint import read_gsplat_checkpoint
+from normlift_ns.errors import InputError
+from tests.data.scene_files import random_splat, rows_of, write_gsplat
+
+
+def test_one_file_and_its_ranks_are_read_alike(tmp_path: Path) -> None:
+    splat = random_splat(101)
+    alone = read_gsplat_checkpoint(write_gsplat(tmp_path / "alone.pt", splat))
+    for rank in range(12):  # in the order of numbers, not of names
+        rows = slice(8 * rank, 8 * rank + 8 if rank < 11 else None)
+        write_gsplat(tmp_path / f"ckpt_29999_rank{rank}.pt", rows_of(splat, rows))
+    write_gsplat(tmp_path / "ckpt_6999_rank0.pt", random_splat(5), step=6999)
+    together = read_gsplat_checkpoint(tmp_path / "ckpt_29999_rank1.pt")
+    assert together.step == alone.step == 29999
+    for name, value in splat.parameters.items():
+        assert torch.equal(alone.splat.parameters[name], value)
+        assert torch.equal(together.splat.parameters[name], value)
+    assert alone.pose_adjust is None
+
+
+def test_ranks_that_are_missing_or_of_two_trainings_are_refused(tmp_path: Path) -> None:
+    for rank in (0, 2):
+        write_gsplat(tmp_path / f"ckpt_7_rank{rank}.pt", random_splat())
+    with pytest.raises(FileNotFoundError, match="not rank 1"):
+        read_gsplat_checkpoint(tmp_path / "ckpt_7_rank0.pt")
+    write_gsplat(tmp_path / "ckpt_7_rank1.pt", random_splat(degree=1))
+    with pytest.raises(InputError, match="spherical harmonics"):
+        read_gsplat_checkpoint(tmp_path / "ckpt_7_rank0.pt")
+    write_gsplat(tmp_path / "ckpt_7_rank1.pt", random_splat(), step=3)
+    with pytest.raises(InputError, match="steps: 3, 29999"):
+        read_gsplat_checkpoint(tmp_path / "ckpt_7_rank0.pt")
+
+
+class _Payload:
+    def __reduce__(self):
+        return (print, ("run",))
+
+
+def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
+    path = tmp_path / "a.pt"
+    for content, message in (
+        ({"step": 1, "pipeline": {}}, "config.yml with --load-config"),
+        ([1, 2], "`splats` in it, found list"),
+        ({"splats": {"means": torch.zeros(2, 3)}}, "quats, scales, opacities, sh0, shN"),
+        ({"splats": {"means": _Payload()}}, "Python objects"),
+    ):
+        torch.save(content, path)
+        with pytest.raises(InputError, match=message):
+            read_gsplat_checkpoint(path)
+    write_gsplat(path, random_splat(), app_module={"embeds.weight": torch.zeros(3, 16)})
+    with pytest.raises(InputError, match=r"`app_module`.*--app_opt"):
+        read_gsplat_checkpoint(path)
+    for name, value, message in (
+        ("means", torch.full((200, 3), torch.nan), "means are NaN"),
+        ("means", torch.zeros(200, 2), r"means is torch.float32 \(200, 2\)"),
+        ("means", torch.zeros(200, 3, dtype=torch.int64), "means is torch.int64"),
+        ("quats", torch.zeros(100, 4), r"quats is torch.float32 \(100, 4\)"),
+        ("sh0", torch.zeros(200, 3), r"sh0 has shape \(200, 3\)"),
+        ("shN", torch.zeros(200, 7, 3), r"harmonics have shape \(200, 7, 3\)"),
+    ):
+        content = torch.load(write_gsplat(path, random_splat()))
+        content["splats"][name] = value
+        torch.save(content, path)
+        with pytest.raises(InputError, match=message):
+            read_gsplat_checkpoint(path)
+    assert "run" not in capfd.readouterr().out
+
+
+def test_moved_poses_are_read_or_refused(tmp_path: Path) -> None:
+    moves = torch.randn(4, 9)
+    path = write_gsplat(tmp_path / "a.pt", random_splat(), pose_adjust={"embeds.weight": moves, "identity": moves[0]})
+    assert np.allclose(read_gsplat_checkpoint(path).pose_adjust, moves)
+    for wrong in ({}, {"embeds.weight": torch.zeros(4, 6)}, {"embeds.weight": torch.full((4, 9), torch.nan)}):
+        write_gsplat(path, random_splat(), pose_adjust=wrong)
+        with pytest.raises(InputError, match=r"`pose_adjust` .*--pose_opt"):
+            read_gsplat_checkpoint(path)

@@ -1,0 +1,406 @@
+"""One scene by every way in: evidence and answers are those of the nerfstudio run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from normlift_ns import (
+    InputError,
+    LiftOptions,
+    RefineConfig,
+    SourceOptions,
+    SplatOptions,
+    lift_run,
+    open_run,
+    open_scene,
+    open_splat,
+)
+from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.images import ImageViews
+from normlift_ns.data.open_scene import open_saved_splat
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_transforms, write_transforms
+from normlift_ns.evidence_collection import FeatureExport
+from normlift_ns.rasterization.rasterize import rasterize_evidence
+from tests.captures import SHARED, needs_shared
+from tests.data.scene_files import in_file_world, ply_columns, rows_of, saved_run, write_colmap, write_gsplat, write_ply
+from tests.random_scenes import generator
+
+ROUNDED = 5e-4
+"""Where the Gaussians themselves were moved to another world in float32, single pixels cross thresholds: 9e-5 seen."""
+OPTIONS = {
+    "source": SourceOptions(encoder="colour", regions="grid"),
+    "lift": LiftOptions(storage="evidence", max_views=4, vote=RefineConfig(k=12)),
+}
+
+
+@pytest.fixture(scope="module")
+def native(trained: Path):
+    return open_scene(trained)
+
+
+@pytest.fixture(scope="module")
+def splat(native) -> SplatParameters:
+    return SplatParameters(**native.parameters)
+
+
+@pytest.fixture(scope="module")
+def frames(native) -> list[Frame]:
+    """The cameras of the run, as nerfstudio has them, in the world of the splat."""
+    found = []
+    for views in (native.train, native.held_out):
+        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
+            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+            intrinsics = Intrinsics(fx, fy, cx, cy, camera.width, camera.height)
+            found.append(Frame(file, name, pose.double().numpy(), intrinsics))
+    return found
+
+
+def difference(native, scene, views=(0, 3, 6, 9)) -> float:
+    """Relative Frobenius difference of the evidence of some cells: of sums and random projections of its rows."""
+    sums = []
+    for one in (native, scene):
+        cameras = [one.train.cameras[i] for i in views]
+        labels = [(torch.arange(c.height)[:, None] // 16 * 10 + torch.arange(c.width) // 16).int() for c in cameras]
+        evidence = rasterize_evidence(one.gaussians, cameras, labels, rasterize_mode=one.rasterize_mode)
+        vectors = torch.randn(evidence.num_regions, 2, generator=generator(0), dtype=torch.float64)
+        sums.append(torch.cat([evidence.rows.row_sums()[:, None], evidence.rows.matmul(vectors)], dim=1))
+    return float((sums[0] - sums[1]).norm() / sums[0].norm())
+
+
+@pytest.fixture
+def of_run(native, trained: Path) -> SplatOptions:
+    """Cameras and world of the run."""
+    world = trained.parent / "dataparser_transforms.json"
+    return SplatOptions(transforms=native.location.folder, world_transform=world)
+
+
+def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_path: Path) -> None:
+    said: list[str] = []
+    scene = open_splat(write_ply(tmp_path / "s.ply", ply_columns(splat)), of_run, say=said.append)
+    assert scene.train.names == native.train.names
+    assert scene.held_out.names == native.held_out.names  # transforms.json names them
+    for fact in ("2 of 14", "classic", "Inria"):
+        assert any(fact in text for text in said), fact
+    for view, other in zip(scene.train, native.train):
+        assert torch.equal(view.image, other.image)
+        assert torch.equal(view.camera.K, other.camera.K)
+        torch.testing.assert_close(view.camera.world_to_camera, other.camera.world_to_camera, atol=1e-7, rtol=0)
+    assert difference(native, scene) < 1e-5
+    camera = native.train.cameras[0]
+    torch.testing.assert_close(scene.colors(camera), native.colors(camera))
+
+
+@pytest.fixture
+def given(native) -> SplatOptions:
+    """Images and held-out names of the run."""
+    return SplatOptions(
+        colmap=Path("p"), images=native.location.folder / "images", holdout=tuple(native.held_out.names),
+        gsplat_normalize=False,
+    )  # fmt: skip
+
+
+def test_a_ply_file_with_a_colmap_project(native, splat, frames, given, tmp_path: Path) -> None:
+    matrix = np.diag([3.0, 3, 3, 1]) @ [[0, 0, 1, 2.0], [1, 0, 0, -1], [0, 1, 0, 0.5], [0, 0, 0, 1]]
+    (tmp_path / "world.json").write_text(json.dumps(matrix.tolist()))
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    there = in_file_world(frames, matrix)
+    for binary, turned, world in ((True, frames, None), (False, there, tmp_path / "world.json")):
+        project = write_colmap(tmp_path / f"p{binary}", turned, "PINHOLE", binary=binary)
+        scene = open_splat(path, replace(given, colmap=project, world_transform=world))
+        assert scene.train.names == native.train.names
+        assert difference(native, scene) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["ranks", "normalized", "moved"])
+def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "ckpt_29999_rank0.pt"
+    points = splat.means.numpy()[::3]
+    if kind == "ranks":
+        write_gsplat(path, rows_of(splat, slice(0, 4000)))
+        write_gsplat(tmp_path / "ckpt_29999_rank1.pt", rows_of(splat, slice(4000, None)))
+    elif kind == "moved":  # the training turned and shifted the cameras a little; the project has them as they were
+        moves = 0.05 * torch.randn(len(native.train), 9, generator=generator(0), dtype=torch.float64)
+        frames = _before(frames, moves, given.holdout)
+        write_gsplat(path, splat, pose_adjust={"embeds.weight": moves, "identity": torch.zeros(6)})
+    else:  # the project lies in another world, and the training normalized it
+        matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+        frames, back = in_file_world(frames, matrix), np.linalg.inv(matrix)
+        points = points @ back[:3, :3].T + back[:3, 3]
+        write_gsplat(path, _in_world(splat, _normalization(frames, points) @ back))
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
+    scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=kind == "normalized"))
+    assert scene.step == 29999
+    assert difference(native, scene) < (ROUNDED if kind == "normalized" else 1e-5)
+
+
+def _normalization(frames: list[Frame], points: np.ndarray, number: int = 0) -> np.ndarray:
+    """[4, 4]: one of the worlds in which gsplat may have trained."""
+    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[number]
+    return np.vstack([world.scale * world.transform, [0, 0, 0, 1]])
+
+
+def _in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
+    """The Gaussians in another world, computed in float64."""
+    world = decompose_similarity(matrix, "test")
+    turn = torch.from_numpy(world.transform[:, :3])
+    quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
+    return replace(
+        splat,
+        means=(world.scale * (splat.means.double() @ turn.T + torch.from_numpy(world.transform[:, 3]))).float(),
+        quats=torch.from_numpy(quats.as_quat()[:, [3, 0, 1, 2]]).float(),
+        scales=(splat.scales.double() + np.log(world.scale)).float(),
+    )
+
+
+def _before(frames: list[Frame], moves: torch.Tensor, kept: tuple[str, ...]) -> list[Frame]:
+    """Poses to which gsplat's CameraOptModule gives those of the frames: pose = before @ move, by matrices."""
+    trained = sorted((f for f in frames if f.name not in kept), key=lambda frame: frame.name)
+    found = {frame.name: frame for frame in frames}
+    for frame, move in zip(trained, moves):
+        first = torch.nn.functional.normalize(move[3:6] + torch.eye(3)[0], dim=0)
+        second = move[6:9] + torch.eye(3)[1]
+        second = torch.nn.functional.normalize(second - (first @ second) * first, dim=0)
+        change = torch.eye(4, dtype=torch.float64)
+        change[:3, :3] = torch.stack([first, second, torch.linalg.cross(first, second)])
+        change[:3, 3] = move[:3]
+        opencv = np.vstack([frame.pose * [1, -1, -1, 1], [0, 0, 0, 1]])
+        pose = (opencv @ np.linalg.inv(change.numpy()))[:3] * [1, -1, -1, 1]
+        found[frame.name] = replace(frame, pose=pose)
+    return list(found.values())
+
+
+@pytest.mark.parametrize("numbers", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
+def test_a_normalized_world_is_found(native, splat, frames, given, tmp_path: Path, numbers: tuple[int, ...]) -> None:
+    """PLY files of gsplat's trainer lie in it too. gsplat before 1.5 does not turn the world over, and signs of axes
+    depend on the library that computes them."""
+    points = splat.means.numpy()[::3]
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
+    for number in numbers:
+        there = _in_world(splat, _normalization(frames, points, number))
+        if number == 0:
+            path = write_ply(tmp_path / "point_cloud_29999.ply", ply_columns(there))
+        else:
+            path = write_gsplat(tmp_path / f"ckpt_{number}_rank0.pt", there)
+        said: list[str] = []
+        scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
+        assert any(("normalized world" if number == 0 else "half a turn") in text for text in said)
+        assert not any("have no camera" in text for text in said)
+        assert difference(native, scene) < ROUNDED
+
+
+def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    capture = shutil.copytree(native.location.folder, tmp_path / "capture")
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    scene = open_splat(path, replace(of_run, transforms=capture))
+    run = lift_run(scene, timestamp="t", **OPTIONS)
+    assert run.folder == tmp_path / "outputs" / "capture" / "normlift" / "t"
+    path.unlink()  # the run holds its own copy
+    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check=False, **OPTIONS)
+    expected = of_native.ask("red", "yellow")
+    again = open_run(run.config)
+    assert again.scene.train.names == scene.train.names
+    assert again.scene.held_out.names == scene.held_out.names
+    for view, other in zip(again.scene.train.cameras, scene.train.cameras):
+        assert torch.equal(view.world_to_camera, other.world_to_camera)
+        assert torch.equal(view.K, other.K)
+    found = again.ask("red", "yellow")
+    assert torch.equal(found.selected, expected.selected)
+    torch.testing.assert_close(found.relevancy, expected.relevancy, atol=1e-3, rtol=0)
+    assert again.field.manifest["source_splat"] == str(path)
+    photograph = np.asarray(Image.open(capture / "images" / "0003.png"))
+    assert np.abs(again.render("0003").numpy().astype(int) - photograph).mean() < 3
+    rows = again.export(tmp_path / "again.ply", found["red"])
+    assert 0.9 * int(found["red"].mask.sum()) < len(rows) <= int(found["red"].mask.sum())  # all but the faintest
+    second = lift_run(again.config, timestamp="second", check=False, **OPTIONS)  # and can be lifted again
+    assert torch.equal(second.ask("red").selected, again.ask("red").selected)
+
+    capture.rename(tmp_path / "elsewhere")
+    with pytest.raises(FileNotFoundError, match=r"14 of the 14 .* --data"):
+        open_run(run.config)
+    assert open_run(run.config, data=tmp_path / "elsewhere").scene.train[0].image.shape == (120, 160, 3)
+    moved = (tmp_path / "outputs").rename(tmp_path / "results") / run.config.relative_to(tmp_path / "outputs")
+    opened = open_run(moved, data=tmp_path / "elsewhere" / "images")
+    assert opened.scene.train.names == scene.train.names
+    assert torch.equal(opened.ask("red").selected, found.selected[:, :1])
+    with pytest.raises(FileNotFoundError, match=r"nowhere, given with --data"):
+        open_run(moved, data=tmp_path / "nowhere")
+
+
+def test_every_degree_is_saved_and_drawn(splat, of_run, tmp_path: Path) -> None:
+    for degree in range(4):
+        rest = 0.2 * torch.randn(len(splat), (degree + 1) ** 2 - 1, 3, generator=generator(0))
+        scene = open_splat(write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest))), of_run)
+        again = open_saved_splat(saved_run(tmp_path / str(degree), scene))
+        camera = scene.train.cameras[2]
+        assert torch.equal(again.colors(camera), scene.colors(camera))
+        assert again.splat.degree == max(1, degree)  # splatfacto takes colours without harmonics for logits
+
+
+def test_undistortion_and_masks_are_nerfstudios(nerfstudio, tmp_path: Path) -> None:
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: PLC0415
+    from nerfstudio.data.datasets.base_dataset import InputDataset  # noqa: PLC0415
+
+    from normlift_ns.data.nerfstudio.dataset_views import DatasetViews  # noqa: PLC0415
+    from tests.nerfstudio_plugin.stock_run import write_dataset  # noqa: PLC0415
+
+    write_dataset(tmp_path / "a", masks=True, channels=4)
+    content = json.loads((tmp_path / "a" / "transforms.json").read_text())
+    content |= {"k2": -0.02, "k3": 0.01, "p1": 0.004, "p2": -0.003, "fl_y": 43.0, "cx": 22.5}
+    (tmp_path / "a" / "transforms.json").write_text(json.dumps(content))
+    kept = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False, "eval_mode": "all"}
+    parser = NerfstudioDataParserConfig(data=tmp_path / "a", downscale_factor=1, **kept).setup()
+    dataset = InputDataset(parser.get_dataparser_outputs("train"))
+    background = torch.tensor([0.2, 0.4, 0.6])
+    stock = DatasetViews(dataset, tmp_path / "a", dataset.cameras.camera_to_worlds, background)
+    ours = ImageViews(read_transforms(tmp_path / "a").frames, background)
+    assert ours.names == stock.names
+    for view, other in zip(ours, stock):
+        assert torch.equal(view.image, other.image)
+        assert torch.equal(view.mask, other.mask)
+        assert torch.equal(view.camera.K, other.camera.K)
+        assert torch.equal(view.camera.world_to_camera, other.camera.world_to_camera)
+        assert view.image.shape[:2] == (view.camera.height, view.camera.width)
+
+
+def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    images = native.location.folder / "images"
+    write_colmap(tmp_path / "p", frames, "PINHOLE")
+    write_colmap(tmp_path / "empty", [], "PINHOLE", binary=False)
+    for folder, names, size in (("half", frames[:1], (160, 120)), ("flat", frames, (160, 60))):
+        (tmp_path / folder).mkdir()
+        for frame in names:
+            Image.open(frame.file).resize(size).save(tmp_path / folder / frame.file.name)
+    (tmp_path / "masks").mkdir()
+    transforms = json.loads((images.parent / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["file_path"] = str(images.parent / frame["file_path"])
+    transforms = {name: value for name, value in transforms.items() if not name.endswith("_filenames")}
+    (tmp_path / "t.json").write_text(json.dumps(transforms))
+    path = write_gsplat(tmp_path / "ckpt_1_rank0.pt", rows_of(splat, slice(0, 50)))
+    every = {"colmap": "p", "images": str(images)}
+    for options, message in (
+        ({"images": "."}, "camera file, got none"),
+        ({"colmap": "p", "images": "none"}, "folder none, given with --images"),
+        ({"colmap": "p"}, "folder .*p/images"),
+        ({"colmap": "p", "images": "half"}, "13 of the 14 .*half"),
+        ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
+        ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
+        ({**every, "test_every": 1}, "test_every must be at least 2"),
+        ({**every, "test_every": 8, "holdout": ("0001",)}, "give only one of them"),
+        ({**every, "holdout": ("1.5",)}, r"1\.5 .* between 0 and 1"),
+        ({**every, "holdout": ("list.txt",)}, r"--holdout .*list\.txt"),
+        ({**every, "holdout": ("cat",)}, "--holdout .*cat"),
+        ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
+        ({"transforms": "t.json"}, "--colmap"),
+        (every, "0 points"),
+    ):
+        with pytest.raises((InputError, FileNotFoundError), match=message):
+            open_splat(path, SplatOptions(**options))
+    with pytest.raises(TypeError, match="SplatOptions, got str and str"):
+        open_splat("x.ply", "capture")  # type: ignore[arg-type]
+
+
+def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
+    options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), holdout=())
+    for count, hint in ((12, "--test-every 8"), (5, "--test-every or --holdout")):
+        moves = {"embeds.weight": torch.zeros(count, 9)}
+        path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
+        with pytest.raises(InputError, match=f" {count} training views.*{hint}"):
+            open_splat(path, options)
+    assert len(open_splat(tmp_path / "ckpt_12_rank0.pt", replace(options, test_every=8)).train) == 12
+
+
+def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames, given, tmp_path: Path) -> None:
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE")
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    base = replace(given, colmap=project, holdout=())
+    (tmp_path / "images_2").mkdir()
+    for frame in frames:  # of other format, as gsplat's trainer makes them
+        Image.open(frame.file).resize((81, 60)).save(tmp_path / "images_2" / f"{frame.file.stem}.webp")
+    scene = open_splat(path, replace(base, images=tmp_path / "images_2", test_every=8, views="all"))
+    assert (len(scene.train), len(scene.held_out), scene.train.names[0]) == (14, 0, "images_2/0000.webp")
+    camera, full = scene.train.cameras[0], native.train.cameras[0]
+    assert (camera.width, camera.height) == (81, 60)
+    torch.testing.assert_close(camera.K, full.K * torch.tensor([[81 / 160], [0.5], [1.0]]))
+
+    names = [f"images/{i:04d}.png" for i in range(14)]
+    (tmp_path / "list.txt").write_text("0003\nimages/0005.png\n\n")
+    shares = [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]  # as ns-train
+    for more, expected in (
+        ({"test_every": 8}, [names[0], names[8]]),  # as gsplat
+        ({"holdout": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
+        ({"holdout": ("0.1",)}, shares),
+    ):
+        scene = open_splat(path, replace(base, **more))
+        assert scene.held_out.names == expected
+        assert scene.train.names == [name for name in names if name not in expected]
+
+
+def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
+    """Two cameras with images of the same names, in copies outside the dataset, which are moved later."""
+    entries = []
+    for i, frame in enumerate(frames):
+        name = f"{('left', 'right')[i % 2]}/{i // 2:04d}.png"
+        for folder in ("cap/images", "photos"):
+            (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / folder / name).write_bytes(frame.file.read_bytes())
+        camera = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), frame.intrinsics))
+        pose = [*frame.pose.tolist(), [0, 0, 0, 1]]
+        entries.append({"file_path": f"images/{name}", "transform_matrix": pose, **camera})
+    (tmp_path / "cap" / "transforms.json").write_text(json.dumps({"frames": entries}))
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    options = SplatOptions(transforms=tmp_path / "cap", images=tmp_path / "photos")
+    scene = open_splat(path, options)
+    assert (scene.train.names[0], scene.train.names[-1]) == ("photos/left/0000.png", "photos/right/0006.png")
+    run = saved_run(tmp_path / "run", scene)
+    facts = {"name", "rasterize_mode", "background", "photographs", "identity"}
+    assert set(json.loads((run / "splat.json").read_text())) == facts  # which runs of older versions have, too
+    for move in (False, True):
+        again = open_saved_splat(run, data=(tmp_path / "photos").rename(tmp_path / "moved") if move else tmp_path)
+        assert again.train.names == scene.train.names
+        assert again.train[3].image.shape == (120, 160, 3)
+    with pytest.raises(InputError, match=r" 0000_s\.npy"):
+        lift_run(again, export=FeatureExport(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
+    (tmp_path / "moved" / "left" / "0001.png").rename(tmp_path / "moved" / "0001.png")
+    (tmp_path / "moved" / "right" / "0001.png").unlink()
+    with pytest.raises(InputError, match=r"moved/0001\.png for both"):
+        open_splat(path, replace(options, images=tmp_path / "moved"))
+
+
+@needs_shared
+@pytest.mark.slow
+def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
+    """Two views, one at either end of the capture, with lens distortion.
+
+    Quaternions hold rotations only, but the matrices of fox's transforms.json are none by 1e-6, which turns single
+    pixels on and off; so COLMAP's project is held against the same poses made orthonormal.
+    """
+    config = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
+    scene = open_scene(config)
+    path = write_ply(tmp_path / "s.ply", ply_columns(SplatParameters(**scene.parameters)))
+    folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
+    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
+    assert of_json.train.names == scene.train.names
+    assert difference(scene, of_json, (0, -1)) < 1e-5
+    rigid = []
+    for frame in read_transforms(folder).frames:
+        rotation = Rotation.from_matrix(frame.pose[:, :3]).as_matrix()
+        rigid.append(replace(frame, pose=np.column_stack([rotation, frame.pose[:, 3]])))
+    write_transforms(tmp_path / "rigid.json", rigid, [])
+    expected = open_splat(path, SplatOptions(transforms=tmp_path / "rigid.json", world_transform=world))
+    for binary in (True, False):
+        project = write_colmap(tmp_path / f"p{binary}", rigid, binary=binary)
+        options = SplatOptions(colmap=project, images=folder / "images", world_transform=world)
+        assert difference(expected, open_splat(path, options), (0, -1)) < 1e-5

@@ -1,0 +1,424 @@
+"""Damage and files in the wrong place are noticed before any number is used, and nothing is read outside of arrays."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from normlift_ns import Evidence, SemanticField, lift
+from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import array_digest, check_array, load_arrays, save_arrays
+from normlift_ns.io.atomic import text_digest
+from normlift_ns.io.field import read_evidence
+from normlift_ns.io.run_dir import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
+from tests.examples import FACTOR, examples
+from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
+from tests.random_scenes import generator, random_evidence, unit_rows
+
+VIEWS = [6, 5, 0, 7]
+S, D, N = sum(VIEWS), 12, 40
+FORMS = ["evidence", "float16", "low_rank"]
+FLIPS = 20 * FACTOR
+"""Of each file, besides its first bit and its last."""
+
+
+@cache
+def example(form: str = "evidence", seed: int = 0) -> SemanticField:
+    table = torch.nn.functional.normalize(unit_rows(S, 4, seed) @ unit_rows(4, D, seed + 1), dim=1).float()
+    lifted = lift(random_evidence(N, VIEWS, seed, fill=0.15, dtype=torch.float32), table)
+    means, source = torch.rand(N, 3, generator=generator(seed)), torch.randint(0, N, (N,), generator=generator(seed))
+    return SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)  # type: ignore[arg-type]
+
+
+def flipped(content: bytes, bit: int) -> bytes:
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def some_bits(content: bytes) -> list[int]:
+    size = 8 * len(content)
+    return [0, size - 1, *random.Random(0).sample(range(size), FLIPS)]
+
+
+def test_every_flipped_bit_of_a_field_is_noticed(tmp_path: Path) -> None:
+    for form in FORMS:
+        example(form).save(tmp_path / form)
+        files = sorted((tmp_path / form).iterdir())
+        assert len(files) == (3 if form == "evidence" else 2)
+        for path in files:
+            whole = path.read_bytes()
+            for bit in some_bits(whole):
+                path.write_bytes(flipped(whole, bit))
+                with pytest.raises(ValueError, match=rf"{path}|schema version"):
+                    SemanticField.load(path.parent)
+            path.write_bytes(whole)
+        assert SemanticField.load(tmp_path / form).manifest == example(form).manifest
+
+
+def test_a_message_says_what_was_found_expected_and_what_to_type(tmp_path: Path) -> None:
+    example("float16").save(tmp_path)
+    path = tmp_path / "field.safetensors"
+    path.write_bytes(flipped(path.read_bytes(), 8 * path.stat().st_size - 1))
+    with safe_open(path, "pt") as file:
+        written = file.metadata()["digest"]
+    found = array_digest(load_file(path), {})
+    with pytest.raises(ValueError, match=rf"^{path} .*{found}.*{written}.*ns-normlift --load-config"):
+        SemanticField.load(tmp_path)
+
+
+def test_files_of_different_lifts_do_not_pass_together(tmp_path: Path) -> None:
+    """Also where one is of version 0.1, without digests."""
+    for name in ("right", "old"):
+        example().save(tmp_path / name)
+    example(seed=1).save(tmp_path / "other")
+    as_version_0_1(tmp_path / "old")
+    for other in ("other", "old"):
+        for name in ("field.safetensors", "evidence.safetensors", "manifest.json"):
+            mixed = shutil.copytree(tmp_path / "right", tmp_path / f"{other} {name}")
+            shutil.copy(tmp_path / other / name, mixed)
+            with pytest.raises(ValueError, match=r"safetensors .* different lifts: .*lift again"):
+                SemanticField.load(mixed)
+
+
+def test_a_field_that_is_loaded_and_saved_again_has_its_own_digests(tmp_path: Path) -> None:
+    example().save(tmp_path / "a")
+    loaded = SemanticField.load(tmp_path / "a")
+    replace(loaded, source=loaded.source.flip(0)).save(tmp_path / "b")
+    assert read_manifest(tmp_path / "a")[1] != read_manifest(tmp_path / "b")[1]
+    assert torch.equal(SemanticField.load(tmp_path / "b").source, loaded.source.flip(0))
+
+
+def as_version_0_1(folder: Path) -> None:
+    """Takes the digests away, as if there had never been any."""
+    for path in folder.glob("*.safetensors"):
+        with safe_open(path, "pt") as file:
+            facts = {name: value for name, value in (file.metadata() or {}).items() if name != "digest"}
+        save_file(load_file(path), path, metadata=facts or None)
+    manifest = json.loads((folder / MANIFEST_FILE).read_text())
+    facts = {name: value for name, value in manifest.items() if name not in ("digest", "digests")}
+    (folder / MANIFEST_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_field_of_version_0_1_opens_with_a_note(form: str, tmp_path: Path) -> None:
+    field = example(form)
+    field.save(tmp_path)
+    as_version_0_1(tmp_path)
+    with pytest.warns(UserWarning, match=rf"^{tmp_path} .*0\.1.*lift again"):
+        loaded = SemanticField.load(tmp_path)
+    assert torch.equal(loaded.query(torch.eye(D)), field.query(torch.eye(D)))
+    assert loaded.manifest == field.manifest
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded.save(tmp_path / "again")
+        SemanticField.load(tmp_path / "again")
+
+
+def with_value(tensor: torch.Tensor, value: float) -> torch.Tensor:
+    changed = tensor.clone()
+    changed.view(-1)[3] = value
+    return changed
+
+
+def with_scalar(name: str, value: float) -> Callable[[SemanticField], SemanticField]:
+    return lambda f: replace(f, scalars=replace(f.scalars, **{name: with_value(getattr(f.scalars, name), value)}))
+
+
+def with_rows(**arrays: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
+    """Other evidence, put together without the checks of its constructor."""
+
+    def change(field: SemanticField) -> SemanticField:
+        assert isinstance(field.store, StoredEvidence)
+        rows = field.store.evidence.rows
+        new = replace(rows, **{name: make(getattr(rows, name)) for name, make in arrays.items()})
+        evidence = replace(field.store.evidence)
+        object.__setattr__(evidence, "rows", new)
+        return replace(field, store=replace(field.store, evidence=evidence))
+
+    return change
+
+
+def with_table(make: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
+    def change(field: SemanticField) -> SemanticField:
+        name = "features" if isinstance(field.store, StoredEvidence) else "coordinates"
+        return replace(field, store=replace(field.store, **{name: make(getattr(field.store, name))}))
+
+    return change
+
+
+NAN, INF = float("nan"), float("inf")
+TABLE = "(features|coordinates)"
+WRONG = {
+    "negative source": (lambda f: replace(f, source=with_value(f.source, -1)), "source .* -1"),
+    "source out of range": (lambda f: replace(f, source=with_value(f.source, N)), rf"source .*\.\.{N}"),
+    "short source": (lambda f: replace(f, source=f.source[1:]), r"source is int32 \(39,\)"),
+    "long source": (lambda f: replace(f, source=f.source.long()), r"source is int64 \(40,\)"),
+    "NaN norm": (with_scalar("norm", NAN), "norm .* nan"),
+    "negative weight": (with_scalar("weight", -1.0), "weight .* -1"),
+    "infinite reliability": (with_scalar("reliability", INF), r"reliability .*\.\.inf"),
+    "short table": (with_table(lambda x: x[:-1]), rf"{TABLE} is .*, expected"),
+    "narrow table": (with_table(lambda x: x[:, 1:]), rf"{TABLE} is .*, expected"),
+    "wrong type": (with_table(lambda x: x.double()), rf"{TABLE} is float64 .*, expected"),
+    "NaN in the table": (with_table(lambda x: with_value(x, NAN)), rf"{TABLE} .* nan"),
+    "infinite table": (with_table(lambda x: with_value(x, INF)), rf"{TABLE} .*inf"),
+}
+WRONG_ROWS = {
+    "column out of range": (with_rows(column=lambda x: with_value(x, 10**6)), r"columns .*\.\.1000000, .* 0\.\.17"),
+    "negative column": (with_rows(column=lambda x: with_value(x, -7)), "columns .* -7"),
+    "falling offsets": (with_rows(offsets=lambda x: with_value(x, 10**9)), "offsets must rise"),
+    "offsets past the end": (with_rows(offsets=lambda x: x + 1), "offsets must rise"),
+    "no offsets": (with_rows(offsets=lambda x: x[:0]), "offsets must rise"),
+    "short offsets": (with_rows(offsets=lambda x: torch.cat([x[:5], x[-1:]])), r"evidence.*\(5 Gaussians .*40"),
+    "short columns": (with_rows(column=lambda x: x[:-1]), "offsets must rise"),
+    "narrow columns": (with_rows(column=lambda x: x.to(torch.int16)), r"columns are int16"),
+    "NaN weight": (with_rows(weight=lambda x: with_value(x, NAN)), r"weights .* nan"),
+    "negative weight of a region": (with_rows(weight=lambda x: with_value(x, -1.0)), r"weights .* -1"),
+    "integer weights": (with_rows(weight=lambda x: x.int()), r"weights are int32"),
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
+def test_arrays_that_lead_outside_are_refused(form: str, tmp_path: Path) -> None:
+    """Also where somebody wrote them with right digests."""
+    for name, (change, message) in (WRONG | WRONG_ROWS if form == "evidence" else WRONG).items():
+        folder = tmp_path / name
+        change(example(form)).save(folder)
+        for old in (False, True):
+            if old:
+                as_version_0_1(folder)
+            with pytest.raises(ValueError, match=message) as caught:
+                SemanticField.load(folder)
+            assert str(folder) in str(caught.value) and "ns-normlift" in str(caught.value), name
+
+
+@pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
+def test_a_field_without_an_array_is_refused(tmp_path: Path) -> None:
+    for form, name in (("float16", "n_eff"), ("low_rank", "basis")):
+        example(form).save(tmp_path / form)
+        as_version_0_1(tmp_path / form)
+        path = tmp_path / form / "field.safetensors"
+        save_file({key: x for key, x in load_file(path).items() if key != name}, path)
+        with pytest.raises(ValueError, match=f"is damaged.*'{name}' is missing"):
+            SemanticField.load(tmp_path / form)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_product_never_reads_outside_of_its_table() -> None:
+    rows = SparseRows(torch.tensor([0, 2]), torch.tensor([0, 5]).int(), torch.ones(2))
+    assert rows.num_columns == 6
+    with pytest.raises(ValueError, match=r" 6 columns.* 5"):
+        rows.matmul(torch.ones(5, 1))
+    assert rows.matmul(torch.ones(6, 1)).tolist() == [[2.0]]
+    for broken in (
+        replace(rows, column=torch.tensor([0, -5]).int()),
+        replace(rows, offsets=torch.tensor([0, 3])),
+        replace(rows, offsets=torch.tensor([0, 5, -3, 2])),
+        replace(rows, weight=torch.ones(1)),
+    ):
+        with pytest.raises(ValueError, match=r"must (be 0 or more|rise from 0)"):
+            broken.matmul(torch.ones(6, 1))
+
+
+def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
+    path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
+    digest = evidence.save(path, key="a")
+    assert digest == read_evidence(path, key="a").digest != evidence.save(tmp_path / "f.safetensors")
+    for key in ("", "b"):
+        with pytest.raises(ValueError, match=r"is damaged.*digest"):
+            Evidence.load(path, key=key)
+    whole = path.read_bytes()
+    for bit in some_bits(whole):
+        path.write_bytes(flipped(whole, bit))
+        with pytest.raises(ValueError, match=r"e\.safetensors is damaged"):
+            Evidence.load(path, key="a")
+
+
+def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
+    path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
+    evidence.save(path)
+    save_file(
+        load_file(path),
+        path,
+        metadata={k: v for k, v in load_arrays(path).metadata.items() if k != "digest"},
+    )
+    assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
+    with pytest.raises(ValueError, match="does not record one"):
+        Evidence.load(path, key="a")
+
+
+def test_a_digest_covers_names_types_shapes_numbers_facts_and_key() -> None:
+    base, facts = {"a": torch.arange(6.0), "b": torch.ones(2)}, {"f": "1"}
+    digests = [
+        array_digest(base, facts),
+        array_digest(base, facts, "key"),
+        array_digest(base, {"f": "2"}),
+        array_digest(base, {"g": "1"}),
+        array_digest({"a": base["b"], "b": base["a"]}, facts),
+        array_digest({**base, "a": base["a"].view(2, 3)}, facts),
+        array_digest({**base, "a": base["a"].view(torch.int32)}, facts),
+        array_digest({**base, "c": torch.zeros(0)}, facts),
+        array_digest({**base, "b": torch.tensor([1.0, 1.0000001])}, facts),
+    ]
+    assert len(set(digests)) == len(digests)
+    assert array_digest(dict(reversed(base.items())), facts) == digests[0]
+    strided = torch.stack([base["a"], base["a"]], dim=1)[:, 0]
+    assert array_digest({**base, "a": strided}, facts) == digests[0]
+
+
+def test_tensors_of_any_kind_come_back(tmp_path: Path) -> None:
+    kinds = (torch.zeros(0, 3), torch.tensor(3.0), torch.ones(2).bfloat16(), torch.tensor([True]), torch.ones(2).half())
+    for i, tensor in enumerate(kinds):
+        digest = save_arrays(tmp_path / str(i), {"größe/\n": tensor}, {"fact": "ü"})
+        tensors, facts, found = load_arrays(tmp_path / str(i), framework="pt")
+        assert (facts, found) == ({"fact": "ü"}, digest)
+        assert torch.equal(tensors["größe/\n"], tensor)
+        array = tensor.float().numpy()
+        check_array("a", array, "float32", array.shape, 0, 3)
+        with pytest.raises(ValueError, match="a is "):
+            check_array("a", array, "float32", (*array.shape, 1), 0, 3)
+
+
+def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
+    contents = set()
+    tensors = {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()}
+    facts = {"a": "1\t/", "b": "ü\x7f\\", "c": '"'}
+    for i in range(20):  # safetensors alone makes many files of it
+        save_arrays(tmp_path / str(i), tensors, facts)
+        contents.add((tmp_path / str(i)).read_bytes())
+    assert load_arrays(tmp_path / "0").metadata == facts
+    assert len(contents) == 1
+
+
+def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
+    needed = {"schema_version": 1, "num_gaussians": 3, "dimension": 2, "means_fingerprint": "", "form": "float16"}
+    facts = {**needed, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
+    write_manifest(tmp_path, facts, {"a": "b"})
+    assert read_manifest(tmp_path) == ({k: v for k, v in facts.items() if k != "digest"}, {"a": "b"})
+    path = tmp_path / MANIFEST_FILE
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
+    assert read_manifest(tmp_path)[1] == {"a": "b"}
+    deep = '{"schema_version": 1, "encoder": ' + "[" * 900 + "]" * 900 + "}"
+    for text in ("[" * 10**6, '{"a":' * 10**6, deep, "[]", "null", "{", "ÿ"):
+        path.write_bytes(text.encode("latin1"))
+        with pytest.raises(InputError, match=r"manifest\.json|schema version None"):
+            read_manifest(tmp_path)
+    for text, found in (('{"schema_version": 1, "digest": 7}', "damaged.* 7"), ('{"schema_version": 99}', " 99.* 1")):
+        path.write_text(text)
+        with pytest.raises(InputError, match=found):
+            read_manifest(tmp_path)
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match=r"1,099,511,627,776"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("sealed", [True, False])
+def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
+    """With a right digest, and without any as version 0.1 wrote them."""
+    field = example("float16")
+    more = {"encoder": {"encoder": "open_clip", "text_vectors": None}, "features": {"kind": "given", "content": "0"}}
+    SemanticField(field.scalars, field.source, field.store, {**field.manifest, **more}, field.means).save(tmp_path)
+    if not sealed:
+        as_version_0_1(tmp_path)
+    facts = json.loads((tmp_path / MANIFEST_FILE).read_text())
+    facts.pop("digest", None)
+
+    def seal(content: bytes) -> bytes:
+        text = content.decode().replace("{", '{"digest": "", ', 1)
+        return text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1).encode()
+
+    def load() -> None:
+        survives(lambda: check_file_digests(tmp_path))
+        SemanticField.load(tmp_path, field.means)
+
+    contents = hostile_json(facts)
+    fuzz(15, contents.map(seal) if sealed else contents, tmp_path / MANIFEST_FILE, load)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("digests", [True, False])
+def test_damaged_files(digests: bool, tmp_path: Path) -> None:
+    field = example("evidence")
+    field.save(tmp_path)
+    if not digests:
+        as_version_0_1(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        fuzz(10, damaged(whole), path, lambda: SemanticField.load(tmp_path, field.means))
+        path.write_bytes(whole)
+
+
+def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_arrays(path, framework="pt")
+    views = tensors["region_view"]
+    for facts_changed, tensors_changed, message in (
+        ({"num_views": "-1"}, {}, "num_views.*-1, 1, 0"),
+        ({"weight_power": "3"}, {}, "weight_power.*4, 3, 0"),
+        ({"num_excluded": "16"}, {}, "num_excluded.*4, 1, 16"),
+        ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"),
+        ({"format": "other"}, {}, "'other'"),
+        ({}, {"region_view": views.flip(0)}, "rising"),
+        ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
+        ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
+        ({"num_excluded": "15"}, {}, None),
+    ):
+        save_arrays(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
+        if message is None:
+            assert Evidence.load(path).num_excluded == 15
+        else:
+            with pytest.raises(InputError, match=message):
+                Evidence.load(path)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
+    """With right digests."""
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_arrays(path, framework="pt")
+
+    @examples(15, suppress_health_check=list(HealthCheck))
+    @given(st.data())
+    def test(data: st.DataObject) -> None:
+        fact, array = data.draw(st.sampled_from(sorted(facts))), data.draw(st.sampled_from(sorted(tensors)))
+        other = tensors[data.draw(st.sampled_from(sorted(tensors)))]
+        value = data.draw(st.sampled_from(["", "-1", "1e3", "99999999999999", "9" * 5000, "nan", "²", facts[fact]]))
+        given = {name: tensor for name, tensor in tensors.items() if name != array}
+        if data.draw(st.booleans()):
+            given[array] = other[: data.draw(st.integers(0, 4))].clone() if data.draw(st.booleans()) else -other
+        save_arrays(path, given, {**facts, fact: value}, overwrite=True)
+        survives(lambda: Evidence.load(path))
+
+    test()
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    example().save(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        for _ in no_files(path):
+            with pytest.raises((InputError, FileNotFoundError), match=path.name):
+                SemanticField.load(tmp_path)
+        path.write_bytes(whole)
+    SemanticField.load(tmp_path)

@@ -1,0 +1,274 @@
+"""The GPU backends: what they refuse, and, where there is a GPU, that they agree."""
+
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import PackageNotFoundError
+
+import pytest
+import torch
+
+from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
+from normlift_ns.core import device
+from normlift_ns.rasterization import gsplat, triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from tests.captures import SHARED, fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
+from tests.kernels.test_regions import hard_scene
+from tests.random_scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
+from tests.rasterization.test_gsplat_fixtures import fixture_difference
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: the kernels cannot run")
+
+
+@cache
+def compiled_gsplat() -> bool:
+    """Whether gsplat's compiled part is there, or can be made now."""
+    try:
+        from gsplat.cuda._backend import _C  # noqa: PLC0415
+    except ImportError:
+        return False
+    return _C is not None
+
+
+@pytest.mark.parametrize("backend", ["triton", "gsplat"])
+def test_gpu_backends_refuse_other_scenes(backend):
+    scene, cameras = random_scene(5, dtype=torch.float32), orbit(1)
+    labels = [random_labels(cameras[0], 2)]
+    for dtype in (torch.float32, torch.float64):
+        told = rf'"{backend}".* float32 on a GPU.* {str(dtype).removeprefix("torch.")} on cpu'
+        with pytest.raises(ValueError, match=told):
+            rasterize_evidence(scene, cameras, labels, backend=backend, dtype=dtype)
+        with pytest.raises(ValueError, match=told):
+            render(scene, cameras[0], torch.ones(5, 1), backend=backend, dtype=dtype)
+    if backend == "gsplat":
+        with pytest.raises(ValueError, match=r'weight_power 2.*backend="triton"'):
+            gsplat.views_evidence(replace(job(scene), weight_power=2), RasterBatch([], [], []))
+
+
+def job(scene, **constants):
+    return RasterJob(scene, False, RasterSettings(**constants), torch.float32)
+
+
+class OnGpu:
+    """What `check` looks at, of a scene on a GPU."""
+
+    means = torch.zeros(1, 3, device="meta")
+
+
+@pytest.fixture
+def on_gpu(monkeypatch, unchecked):
+    scene = OnGpu()
+    monkeypatch.setattr(type(scene.means), "device", torch.device("cuda"), raising=False)
+    return scene
+
+
+def test_gsplat_draws_what_its_compiled_code_can(on_gpu, monkeypatch):
+    gsplat.check(job(on_gpu, eps2d=0.1))
+    with pytest.raises(ValueError, match=r"max_alpha"):
+        gsplat.check(job(on_gpu, max_alpha=0.99))
+    triton.check(job(on_gpu, max_alpha=0.99, tile_size=32))
+    for size in (0, 20):
+        with pytest.raises(ValueError, match=rf"tile_size .*power of two.* {size};"):
+            triton.check(job(on_gpu, tile_size=size))
+    for installed, rules, changed in (
+        ("1.4.0", "1.4", None),
+        ("1.4.0", "1.5", "per_axis, radius_sigmas"),
+        ("1.5.3", "1.4", None),
+        ("1.5.3", "1.5", None),
+        ("1.5.3", "1.6", "min_compensation, max_alpha"),
+        ("1.6.0", "1.4", "min_compensation, max_alpha"),
+        ("1.6.0", "1.6", None),
+    ):
+        monkeypatch.setattr(gsplat, "installed_gsplat_version", lambda installed=installed: installed)
+        wanted = RasterJob(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
+        if changed is None:
+            gsplat.check(wanted)
+        else:
+            with pytest.raises(ValueError, match=rf'gsplat {installed} .* {changed} .*"triton"'):
+                gsplat.check(wanted)
+
+
+def test_views_in_flight_are_as_many_as_short_numbers_and_memory_hold():
+    sizes = ((10, 64, 64, 16), (10, 988, 731, 11), (10**7, 988, 731, 5), (3 * 10**7, 64, 64, 2), (10, 9000, 9000, 1))
+    for gaussians, width, height, views in sizes:
+        camera = Camera(torch.eye(3), torch.eye(4), width, height)
+        assert triton.in_flight(job(range(gaussians)), camera) == views, (gaussians, width)
+
+
+def test_a_missing_or_unknown_gsplat_is_said(monkeypatch):
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    for version, told in ((missing, "not installed"), (lambda name: "7.1.0", r"7\.1\.0.* 1\.4, 1\.5, 1\.6")):
+        gsplat.installed_gsplat_version.cache_clear()
+        monkeypatch.setattr(gsplat, "version", version)
+        with pytest.raises(ValueError, match=told):
+            gsplat.installed_settings()
+    gsplat.installed_gsplat_version.cache_clear()
+
+
+def test_a_full_gpu_is_answered_by_smaller_parts():
+    asked = []
+
+    def run(items):
+        asked.append(len(items))
+        if len(items) > 2:
+            raise torch.cuda.OutOfMemoryError("no room")
+        return sum(items)
+
+    assert device.retry_in_halves(run, [1, 2, 3, 4, 5], "buy memory") == [3, 3, 9]
+    assert asked == [5, 2, 3, 1, 2]
+
+    def never(items):
+        raise torch.cuda.OutOfMemoryError("no room")
+
+    with pytest.raises(MemoryError, match=r"memory is full \(no room\); buy memory"):
+        device.retry_in_halves(never, [1, 2], "buy memory")
+
+
+@needs_gpu
+@pytest.mark.parametrize("regions", [1, 40, 5000])
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("kind", ["random", "hard"])
+def test_all_backends_agree(regions, mode, kind):
+    scene = hard_scene() if kind == "hard" else random_scene(3000, seed=1, dtype=torch.float32, size=0.05)
+    scene = scene.to("cuda")
+    cameras = orbit(3, width=333, height=201, focal=300.0)
+    cameras.append(Camera(cameras[0].K, cameras[0].world_to_camera, 100, 64))  # of another size
+    labels = [random_labels(camera, regions, seed=v, cell=2) for v, camera in enumerate(cameras)]
+    labels[1][:] = -1
+    counts = [regions] * 4
+    found = {
+        backend: rasterize_evidence(scene, cameras, labels, num_regions=counts, backend=backend, rasterize_mode=mode)
+        for backend in ("triton", "torch", *(["gsplat"] if compiled_gsplat() else []))
+    }
+    # float32 loses most digits of a needle's determinant, on which antialiasing scales its opacity; the reference does
+    # not lose the same ones.
+    of_reference = 5e-5 if (kind, mode) == ("hard", "antialiased") else 1e-5
+
+    ours = found.pop("triton")
+    for name, theirs in found.items():
+        tolerance = of_reference if name == "torch" else 1e-5
+        for *pair, columns in ((ours.rows, theirs.rows, 4 * regions), (ours.unlabeled, theirs.unlabeled, 4)):
+            a, b = (dense(x.to("cpu"), columns) for x in pair)
+            assert (a - b).norm() <= tolerance * b.norm(), name
+            assert abs(a.sum() / b.sum() - 1) < 0.2 * tolerance, name
+    again = rasterize_evidence(scene, cameras, labels, num_regions=counts, rasterize_mode=mode)
+    assert torch.equal(again.rows.weight, ours.rows.weight)
+    assert torch.equal(again.rows.column, ours.rows.column)
+
+
+@needs_gpu
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("kind", ["random", "hard", "fox"])
+def test_projection_is_that_of_gsplat_bit_for_bit(kind, mode):
+    if not compiled_gsplat():
+        pytest.skip("no compiled gsplat")
+    camera = orbit(1, width=333, height=201, focal=300.0)[0]
+    if kind == "fox":
+        if not SHARED.is_dir():
+            pytest.skip(f"needs {SHARED}")
+        scene, camera = trained_scene("fox"), training_cameras("fox")[3]
+    else:
+        scene = hard_scene() if kind == "hard" else random_scene(20_000, seed=1, dtype=torch.float32, size=0.05)
+    rules = gsplat.installed_settings()
+    ready = RasterJob(scene.to("cuda"), mode == "antialiased", rules, torch.float32)
+    _, seen, _ = triton.project_and_bin(ready, [camera])
+    theirs = gsplat.project_views(ready, [camera])
+    drawn = (theirs.radii[0].view(len(scene), -1) > 0).all(1) & (theirs.opacities[0] >= rules.min_alpha)
+    found = torch.zeros_like(drawn)
+    found[seen.keys] = True
+    both = found & drawn
+    row, splat = (found.cumsum(0) - 1)[both], seen.splats
+    ours = {
+        "means2d": (splat[:, 0:2], theirs.means2d),
+        "conics": (torch.stack([2 * splat[:, 2], splat[:, 4], 2 * splat[:, 3]], 1), theirs.conics),
+        "opacities": (splat[:, 5], theirs.opacities),
+        "depths": (seen.depth, theirs.depths),
+        "radii": (splat[:, 6:8], theirs.radii.view(1, len(scene), -1).expand(-1, -1, 2).float()),
+    }
+    assert torch.equal(found, drawn)
+    for name, (mine, other) in ours.items():
+        assert torch.equal(mine[row], other[0][both]), name
+
+
+@needs_gpu
+@pytest.mark.parametrize("rules", ["1.4", "1.5", "1.6"])
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_leaving_cells_out_changes_no_bit_on_a_gpu(rules, mode):
+    scene = random_scene(20_000, seed=3, dtype=torch.float32, size=0.1).to("cuda")
+    cameras = orbit(3, width=333, height=201, focal=300.0)
+    labels = [random_labels(camera, 40, seed=v).cuda() for v, camera in enumerate(cameras)]
+    constants = RasterJob(scene, mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
+    found, whole, again = (
+        triton.views_evidence(constants, RasterBatch(cameras, labels, [40] * 3), cull=cull)
+        for cull in (True, False, True)
+    )
+    for ours, theirs, repeated in zip(found[:3], whole[:3], again[:3]):
+        assert torch.equal(ours, theirs)
+        assert torch.equal(ours, repeated)
+
+
+@needs_gpu
+@needs_shared
+def test_weights_on_the_gpu_are_those_of_gsplat_1_4():
+    for path in weight_fixtures():
+        name, _, mode = path.stem.split("_")
+        camera, labels, arrays = fixture_view(path)
+        frobenius, total = fixture_difference(trained_scene(name).to("cuda"), camera, labels, arrays, "triton", mode)
+        print(f"{path.stem}: Frobenius {frobenius:.1e}, total {total:.1e}")
+        assert frobenius <= 1e-5 and total < 1e-6, path.stem
+
+
+@needs_gpu
+@pytest.mark.parametrize("channels", [0, 1, 3, 40])
+@pytest.mark.parametrize("backend", ["triton", "gsplat"])
+def test_pictures_are_those_of_the_reference(channels, backend):
+    if backend == "gsplat" and not compiled_gsplat():
+        pytest.skip("no compiled gsplat")
+    scene = hard_scene()
+    scene.scales[0], scene.scales[1], scene.quats[2], scene.means[3, 0] = 4.8e8, 1e12, 0.0, torch.nan
+    scene, camera = scene.to("cuda"), orbit(1, width=333, height=201, focal=300.0)[0]
+    values = torch.rand(len(scene), channels, generator=generator(0)).cuda()
+    found, expected = (render(scene, camera, values, backend=name) for name in (backend, "torch"))
+    assert expected[1].max() > 0.1
+    for ours, theirs in zip(found, expected):
+        assert ours.shape == theirs.shape
+        if channels > 0:
+            assert (ours - theirs).norm() <= 1e-4 * theirs.norm()
+
+
+@needs_gpu
+def test_the_whole_lift_equals_that_of_the_cpu():
+    scene, cameras = (
+        random_scene(4000, seed=2, dtype=torch.float32, size=0.05),
+        orbit(4, width=160, height=120, focal=150),
+    )
+    labels = [random_labels(camera, 9, seed=v) for v, camera in enumerate(cameras)]
+    table = unit_rows(36, 512, 1, torch.float32)
+    results = []
+    for place in ("cpu", "cuda"):
+        there = scene.to(place)
+        lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(place))
+        neighbors = nearest_neighbors(there.means, 36)
+        given = {"own": lifted.scalars.own_evidence, "neighbors": neighbors}
+        source = refine(there.means, lifted.directions, lifted.scalars.reliability, **given)
+        results.append(
+            [x.cpu() for x in (lifted.scalars.reliability, neighbors.index, lifted.directions(source.long()))]
+        )
+    (reliability, index, refined), (reliability_gpu, index_gpu, refined_gpu) = results
+    assert (reliability - reliability_gpu).abs().max() < 1e-4
+    assert torch.equal(index, index_gpu)
+    assert ((refined - refined_gpu).norm(dim=1) > 1e-3).float().mean() < 0.01
+
+
+@needs_gpu
+def test_neighbours_that_the_kernel_is_not_sure_of_come_from_the_cpu():
+    points = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
+    points[5] = torch.nan
+    found, expected = nearest_neighbors(points.cuda(), 12), nearest_neighbors(points, 12)
+    assert torch.equal(found.index.cpu(), expected.index)
+    uneven = torch.randn(50_000, 3, generator=generator(0)) ** 5
+    uneven[17] = torch.inf
+    found, expected = nearest_neighbors(uneven.cuda(), 36), nearest_neighbors(uneven, 36)
+    assert torch.equal(found.index.cpu(), expected.index)
+    assert torch.allclose(found.spacing.cpu(), expected.spacing, rtol=1e-15, atol=0)

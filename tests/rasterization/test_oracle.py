@@ -1,0 +1,70 @@
+"""Both CPU backends against the Python loops, in float64, on tiny scenes."""
+
+import numpy as np
+import pytest
+import torch
+
+from normlift_ns import GaussianScene, rasterize_evidence, render
+from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene
+from tests.rasterization.oracle import compositing_matrix
+
+BACKENDS = ["torch", "numba"]
+
+
+def _region_sums(weights: np.ndarray, labels: torch.Tensor, regions: int) -> torch.Tensor:
+    """[N, regions + 1], unlabelled last."""
+    flat = torch.from_numpy(weights.reshape(-1, weights.shape[-1]))
+    onehot = torch.nn.functional.one_hot(labels.long().flatten() % (regions + 1), regions + 1).double()
+    return flat.T @ onehot
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_evidence_and_pictures_equal_the_python_loops(mode):
+    scene = random_scene(60, seed=1, size=0.4)
+    cameras = orbit(2, width=37, height=21)  # no multiple of the tile size
+    labels = [random_labels(camera, 4, seed=v) for v, camera in enumerate(cameras)]
+    exact = [compositing_matrix(scene, camera, mode == "antialiased") for camera in cameras]
+    values = torch.rand(60, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for backend in BACKENDS:
+        how = {"backend": backend, "rasterize_mode": mode}
+        found = {
+            power: rasterize_evidence(scene, cameras, labels, weight_power=power, num_regions=[4, 4], **how)
+            for power in (0, 1, 2)
+        }
+        default = rasterize_evidence(scene, cameras, labels, num_regions=[4, 4], **how)
+        assert torch.equal(default.rows.weight, found[1].rows.weight) and default.weight_power == 1
+        for view, weights in enumerate(exact):
+            for power, evidence in found.items():
+                powers = np.where(weights > 0, weights**power, 0)  # of power 0: which pixels it contributes to
+                expected, one = _region_sums(powers, labels[view], 4), evidence.select_views([view])
+                assert (dense(one.rows, 4) - expected[:, :4]).abs().max() < 1e-12 * expected.max()
+                assert (dense(one.unlabeled, 1) - expected[:, 4:]).abs().max() < 1e-12 * expected.max()
+                assert expected.max() > 1  # the scene does show something
+            matrix = torch.from_numpy(weights)
+            image, alpha = render(scene, cameras[view], values, **how)
+            assert (image - matrix @ values).abs().max() < 1e-12
+            assert (alpha - matrix.sum(-1)).abs().max() < 1e-12
+
+
+def test_pixels_as_regions_give_the_matrix_itself():
+    scene, camera = random_scene(30, seed=3, size=0.5), orbit_camera(0.3, width=18, height=17)
+    labels = torch.arange(18 * 17, dtype=torch.int32).view(17, 18)
+    expected = torch.from_numpy(compositing_matrix(scene, camera)).view(-1, 30).T
+    for backend in BACKENDS:
+        evidence = rasterize_evidence(scene, [camera], [labels], backend=backend)
+        assert (dense(evidence.rows, 306) - expected).abs().max() < 1e-13
+
+
+def test_equal_depths_are_drawn_by_index():
+    """Two Gaussians at the same place: the first one hides the second."""
+    scene = GaussianScene(
+        torch.zeros(2, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        torch.full((2, 3), 0.5),
+        torch.tensor([0.9, 0.9]),
+    )
+    camera = orbit_camera(0.0)
+    labels = torch.zeros(camera.height, camera.width, dtype=torch.int32)
+    for backend in BACKENDS:
+        first, second = rasterize_evidence(scene, [camera], [labels], backend=backend).rows.row_sums().tolist()
+        assert first > 1.5 * second

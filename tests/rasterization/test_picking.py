@@ -1,0 +1,72 @@
+import math
+
+import pytest
+import torch
+
+from normlift_ns import Camera, GaussianScene, render
+from normlift_ns.rasterization.rasterize import ray_weights
+from tests.random_scenes import generator, random_scene
+
+
+def scene(*rows: tuple[float, float, float, float]) -> GaussianScene:
+    """Round Gaussians of size 0.1 at (x, y, z) with an opacity."""
+    table = torch.tensor(rows, dtype=torch.float64)
+    quats = torch.tensor([1.0, 0, 0, 0]).double().expand(len(table), 4)
+    return GaussianScene(table[:, :3], quats, torch.full((len(table), 3), 0.1).double(), table[:, 3])
+
+
+ORIGIN, FORWARD = torch.zeros(3).double(), torch.tensor([0.0, 0.0, 2.0]).double()
+
+
+def test_nearer_gaussians_take_light_from_those_behind():
+    found = ray_weights(scene((0, 0, 3, 0.8), (0, 0, 1, 0.3), (0, 0, 2, 0.5)), ORIGIN, FORWARD)
+    assert torch.allclose(found, torch.tensor([0.7 * 0.5 * 0.8, 0.3, 0.7 * 0.5]).double())
+
+
+def test_what_lies_aside_behind_or_is_faint_is_not_met():
+    found = ray_weights(scene((0.1, 0, 1, 0.8), (0.6, 0, 1, 0.9), (0, 0, -1, 0.9), (0, 0, 2, 0.003)), ORIGIN, FORWARD)
+    assert found[0] == pytest.approx(0.8 * math.exp(-0.5))  # one standard deviation away
+    assert found[1:].tolist() == [0, 0, 0]
+
+
+def test_a_turned_needle_is_met_where_it_lies():
+    half = math.sqrt(0.5)
+    quats = torch.tensor([[half, 0, 0, half]]).double()  # a quarter turn about z: its long x axis points along y
+    needle = GaussianScene(
+        torch.tensor([[0.0, 0, 2]]).double(), quats, torch.tensor([[1.0, 0.01, 0.01]]).double(), torch.ones(1).double()
+    )
+    aside = torch.tensor([0.0, 0.5, 0]).double()
+    assert float(ray_weights(needle, aside, FORWARD)[0]) == pytest.approx(math.exp(-0.125))
+    assert float(ray_weights(needle, aside.roll(-1), FORWARD)[0]) == 0
+
+
+def test_flat_gaussians_and_broken_ones_give_numbers():
+    flat = random_scene(50, seed=3)
+    flat.scales[:10] = 0
+    flat.scales[10:20, 2] = 0
+    flat.means[20] = torch.nan
+    flat.quats[21] = 0
+    found = ray_weights(flat, torch.tensor([0.0, 0, -4]).double(), FORWARD)
+    assert found.isfinite().all()
+    assert found[20] == found[21] == 0
+    assert 0 < float(found.sum()) <= 1
+
+
+def test_it_agrees_with_the_rendered_image():
+    """A pixel in the middle of a large image of small blur: the same Gaussian weighs most in nearly all of them."""
+    world = random_scene(120, seed=5, size=0.3)
+    pose = torch.eye(4).double()
+    pose[2, 3] = 5
+    size, agree = 200, 0
+    K = torch.tensor([[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]).double()
+    image, _ = render(world, Camera(K, pose, size, size), torch.eye(120).double())
+    places = torch.randint(50, 150, (60, 2), generator=generator(1))
+    for x, y in places.tolist():
+        ray = torch.tensor([(x + 0.5 - 100) / 200, (y + 0.5 - 100) / 200, 1]).double()
+        weights = ray_weights(world, torch.tensor([0.0, 0, -5]).double(), ray)
+        seen = image[y, x]
+        if float(seen.max()) < 0.05:
+            continue
+        agree += int(weights.argmax()) == int(seen.argmax())
+        assert abs(float(weights.sum()) - float(seen.sum())) < 0.25
+    assert agree >= 40

@@ -1,0 +1,130 @@
+"""A lift with more views encodes and rasterizes the new ones only. Stored evidence is used again only if it is whole
+and that of the same views, rules and backend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from normlift_ns import LiftOptions, evidence_collection
+from normlift_ns.core.field import SemanticField
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.evidence_collection import RasterConfig, ViewBatch, batch_evidence
+from normlift_ns.options import BackendName
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.segmentation.regions import Superpixels
+from tests.random_scenes import Photographs, made_scene, orbit_camera, random_scene
+
+ALL = tuple(range(11))
+OLD = (0, 2, 3, 5, 6, 7, 9, 10)
+"""New views stand before, between and behind old ones, so that no block of the second lift is one of the first."""
+
+
+@pytest.fixture
+def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How many views were cut, encoded and rasterized."""
+    counts = dict.fromkeys(("cut", "encoded", "rasterized"), 0)
+    cut, encode, rasterize = Superpixels.labels, ColorEncoder.encode_each, evidence_collection.rasterize_evidence
+
+    def count(what: str, number: int, given: Any) -> Any:
+        counts[what] += number
+        return given
+
+    def rasterizing(gaussians: Any, cameras: Any, *more: Any, **options: Any) -> Any:
+        return rasterize(gaussians, count("rasterized", len(cameras), cameras), *more, **options)
+
+    def encoding(self: ColorEncoder, views: Any) -> Any:
+        return encode(self, (count("encoded", 1, view) for view in views))
+
+    monkeypatch.setattr(Superpixels, "labels", lambda self, image, name: cut(self, count("cut", 1, image), name))
+    monkeypatch.setattr(ColorEncoder, "encode_each", encoding)
+    monkeypatch.setattr(evidence_collection, "rasterize_evidence", rasterizing)
+    monkeypatch.setattr(evidence_collection, "_MAX_CHUNK", 4)
+    return counts
+
+
+def lifted(numbers: Sequence[int], cache: Path, mode: str = "classic") -> SemanticField:
+    cameras = [orbit_camera(0.3 * number) for number in numbers]
+    views = Photographs([f"{number:02}.png" for number in numbers], cameras, seeds=numbers)
+    scene = made_scene(random_scene(60, dtype=torch.float32), views, rasterize_mode=mode)
+    options = LiftOptions(refine=False, storage="evidence", consensus=False)
+    source = RegionFeatures(Superpixels(9), ColorEncoder())
+    return lift_scene(scene, source, options, cache, encoder={}).field
+
+
+def test_more_views_cost_only_the_new_ones(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted(OLD, tmp_path / "cache")
+    assert worked == dict.fromkeys(worked, len(OLD))
+    more = lifted(ALL, tmp_path / "cache")
+    assert worked["rasterized"] == len(ALL)
+    assert worked["cut"] == worked["encoded"] == len(ALL)
+    again = lifted(ALL, tmp_path / "cache")
+    fewer = lifted(OLD[::2], tmp_path / "cache")
+    assert worked == dict.fromkeys(worked, len(ALL))
+    for found, numbers in ((more, ALL), (again, ALL), (fewer, OLD[::2])):
+        expected = lifted(numbers, tmp_path / f"fresh{len(numbers)}").store.evidence
+        evidence = found.store.evidence
+        for part in ("rows", "unlabeled"):
+            ours, theirs = getattr(evidence, part), getattr(expected, part)
+            for name in ("offsets", "column", "weight"):
+                assert torch.equal(getattr(ours, name), getattr(theirs, name))
+        assert torch.equal(evidence.region_view, expected.region_view)
+        assert evidence.nnz > 50 * len(numbers)
+
+
+def test_a_damaged_file_costs_its_views(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted(OLD, tmp_path)
+    first, _ = sorted((tmp_path / "evidence").iterdir())
+    first.write_bytes(first.read_bytes()[:-40] + bytes(40))
+    lifted(ALL, tmp_path)
+    assert worked["rasterized"] == len(ALL) + 4
+    lifted(ALL, tmp_path, "antialiased")
+    assert worked["rasterized"] == 2 * len(ALL) + 4
+    assert worked["encoded"] == len(ALL)
+
+
+def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted((1, 1, 2), tmp_path / "cache")
+    found = lifted((2, 1, 3, 1), tmp_path / "cache").store.evidence
+    assert worked["rasterized"] == 4
+    expected = lifted((2, 1, 3, 1), tmp_path / "fresh").store.evidence
+    assert torch.equal(found.rows.column, expected.rows.column) and torch.equal(found.rows.weight, expected.rows.weight)
+
+
+def evidence_of(
+    shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba", cells: int = 2
+) -> torch.Tensor:
+    """Of one view of two regions, whose border is somewhere else for every shift, and cells without a pixel."""
+    camera, done = orbit_camera(0.0), []
+    labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
+    block = ViewBatch([camera], [labels], [torch.arange(cells).int()[None]], [torch.eye(cells)])
+    found = batch_evidence(
+        random_scene(30, dtype=torch.float32), block, folder,
+        RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, on_view=lambda: done.append(1),
+    )  # fmt: skip
+    assert done == [1]
+    return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])
+
+
+def test_swapped_files_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    expected = [evidence_of(shift, tmp_path) for shift in (0, 4)]
+    assert not torch.equal(*expected)
+    assert [torch.equal(evidence_of(shift, tmp_path), x) for shift, x in zip((0, 4), expected)] == [True, True]
+    assert worked["rasterized"] == 2
+    first, second = tmp_path.iterdir()
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    assert [torch.equal(evidence_of(shift, tmp_path), x) for shift, x in zip((0, 4), expected)] == [True, True]
+    assert worked["rasterized"] == 4
+
+
+def test_other_rules_backends_and_cells_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    for changed in (("1.4", "numba"), ("1.6", "numba"), ("1.4", "torch"), ("1.4", "numba", 3)) * 2:
+        evidence_of(0, tmp_path, *changed)
+    assert worked["rasterized"] == 4
