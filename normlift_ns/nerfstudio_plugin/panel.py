@@ -32,7 +32,7 @@ from normlift_ns.io.run_dir import cache_folder, text_cache_folder
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for
-from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors
+from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text
 from normlift_ns.rendering.figures import Display, make_display, output_names
 from normlift_ns.session import actions
 from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
@@ -40,7 +40,7 @@ from normlift_ns.session.objects import ObjectRow, list_objects, unoccluded_view
 from normlift_ns.session.prompts import join_prompts, prompts_of_query, split_prompts
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
-from normlift_ns.viewer.adapter import handle_in_order, ignore_closed_clients, send_in_order
+from normlift_ns.viewer.adapter import KEYS_SCRIPT, handle_in_order, ignore_closed_clients, send_in_order
 from normlift_ns.viewer.controller import NO_FIELD_MESSAGE, Controller, Session, splat_bytes, store_query
 from normlift_ns.viewer.widgets import (
     ALL_PROMPTS,
@@ -50,9 +50,9 @@ from normlift_ns.viewer.widgets import (
     ActionWidgets,
     Explanation,
     ObjectRows,
-    color_swatch,
     diagnostics_mdx,
     escape_mdx,
+    prompt_rows,
 )
 
 VISER_SCALE = 10.0
@@ -148,26 +148,10 @@ def prompt_table(state: State) -> str:
         return ""
     counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
     peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
-    colors = prompt_colors(answer.texts).tolist()
-    rows = {text: (counts[i], peaks[i], colors[i]) for i, text in enumerate(answer.texts)}
-    lines = [
-        f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}",
-        "",
-        "| | prompt | selected | peak |",
-        "|---|---|---|---|",
-    ]
-    failed = [prompt for prompt in state.prompts if prompt.error]  # listed first, to be noticed
-    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.error)][:_MAX_TABLE_ROWS]
-    for prompt in listed:
-        name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.error or prompt.text not in rows:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} | |")
-            continue
-        count, peak, color = rows[prompt.text]
-        lines.append(f"| {color_swatch(color)} | {name} | {count:,} | {peak:.2f} |")
-    if len(state.prompts) > len(listed):
-        lines.append(f"| | and {len(state.prompts) - len(listed)} more | | |")
-    return "\n".join(lines)
+    numbers = {text: (f"{counts[i]:,}", f"{peaks[i]:.2f}") for i, text in enumerate(answer.texts)}
+    failed_first = sorted(state.prompts, key=lambda prompt: not prompt.error)  # to be noticed
+    rows = prompt_rows(failed_first, ("selected", "peak"), numbers, max_rows=_MAX_TABLE_ROWS)
+    return "\n".join([f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}", "", *rows])
 
 
 # Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
@@ -177,28 +161,6 @@ def prompt_table(state: State) -> str:
 
 
 TAB_LABEL = "Search"
-_SCRIPT = """
-(() => {
-  if (window.normlift) return;
-  window.normlift = true;
-  const style = document.createElement("style");
-  style.textContent = `.mantine-Button-root[data-variant="outline"] { padding-inline: 2px; }
-    .mantine-Flex-root > div:has(label:empty) { display: none; }`;
-  document.head.append(style);
-  const press = (text) => {
-    const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
-    if (found && !found.disabled) found.click();
-  };
-  addEventListener("keydown", (event) => {
-    const row = event.target.closest ? event.target.closest("div:has(label)") : null;
-    const label = row && row.querySelector("label") ? row.querySelector("label").textContent : "";
-    const asks = event.target.tagName === "INPUT" && ["Prompts", "Negatives"].includes(label);
-    if (event.key === "Enter" && asks) setTimeout(() => press("Ask"), 150);
-    if (event.key === "Escape") press("Cancel");
-  });
-})();
-"""
-"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
 
 
 class PanelWidgets(ActionWidgets):
@@ -251,7 +213,7 @@ class PanelWidgets(ActionWidgets):
                 self.rule = gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
                 refined = gui.add_checkbox("Refined", True, hint="Use refined features.")
                 self.refined = self._input(Action.REFINED, refined)
-        gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=_SCRIPT))
+        gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=KEYS_SCRIPT))
 
     def reset_query_settings(self, negatives: str) -> None:
         """Reset the settings that apply to the next query.
@@ -440,8 +402,8 @@ class SearchPanel(Controller):
         super()._discard()
         self._clicks.disarm()
 
-    def _go_to_object(self, row: ObjectRow, client: Any) -> None:
-        move_camera(client, row, self._host.scene(), self.history.now.drawn)
+    def _move_camera(self, target: ObjectRow, client: Any) -> None:
+        move_camera(client, target, self._host.scene(), self.history.now.drawn)
 
     def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:
         if not bool(mask.any()):

@@ -24,7 +24,7 @@ from normlift_ns.session.actions import ClickMode, carry_threshold
 from normlift_ns.session.objects import ObjectRow
 from normlift_ns.session.prompts import build_query, click_name, encode_prompts, merge_queries
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
-from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, ActionWidgets, Explanation
+from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
 NO_FIELD_MESSAGE = "No semantics yet. They are lifted at the end of training."
 _CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "take away"}
@@ -41,11 +41,9 @@ def _use_refined(state: State, refined: bool) -> State:
 
 
 _CHANGES: dict[Action, Callable[..., State]] = {
-    Action.HIDE: actions.hide,
-    Action.SHOW_ONLY: actions.show_only,
+    Action.HIDE: lambda state, row=None: actions.hide(state, None if row is None else row.mask),
+    Action.SHOW_ONLY: lambda state, row=None: actions.show_only(state, None if row is None else row.mask),
     Action.SHOW_ALL: actions.show_all,
-    Action.HIDE_OBJECT: lambda state, row: actions.hide(state, row.mask),
-    Action.SHOW_OBJECT: lambda state, row: actions.show_only(state, row.mask),
     Action.SUGGESTED: actions.use_suggested_threshold,
     Action.REMOVE_WEAK: actions.remove_weak,
     Action.THRESHOLD: actions.set_threshold,
@@ -54,14 +52,14 @@ _CHANGES: dict[Action, Callable[..., State]] = {
     Action.SHOW_PROMPT: _show_prompt,
     Action.REFINED: _use_refined,
 }
-"""Actions that only change the state; those of sliders, choices and objects take a value."""
+"""Actions that only change the state. Those of sliders and choices take a value, those of objects a row."""
 _UNLOCKED = (Action.ASK, Action.SELECT_FLOATERS, Action.EXPLAIN, Action.GREET)
 """Actions that must not hold the lock, because they are slow or send other actions."""
 
 
 @dataclass(eq=False)
 class Session:
-    """What is kept of one user."""
+    """Questions and clicks of one user, kept while the viewer runs."""
 
     history: History[State] | None = None
     """None: there is no field yet."""
@@ -101,9 +99,8 @@ class Controller(ABC):
             Action.CLEAR: lambda *_: self._clear(),
             Action.SELECT_FLOATERS: lambda *_: self._run("Looking for floaters.", self._select_floaters),
             Action.EXPLAIN: lambda *_: self._explain(),
-            Action.GO_TO_OBJECT: self._go_to_object,
-            Action.EXPORT_OBJECT: lambda row, client: self._download(row.mask, row.name, client),
-            Action.DOWNLOAD: self._download_selection,
+            Action.GO_TO: self._move_camera,
+            Action.DOWNLOAD: self._download_object,
             Action.SAVE: lambda *_: self._save(),
         }
 
@@ -169,8 +166,8 @@ class Controller(ABC):
         """Carry out an action at the next click in the scene."""
 
     @abstractmethod
-    def _go_to_object(self, row: ObjectRow, client: Any) -> None:
-        """Move the camera to an object."""
+    def _move_camera(self, target: Any, client: Any) -> None:
+        """Move the camera of a browser to face an object."""
 
     @abstractmethod
     def _clear(self) -> None:
@@ -200,8 +197,11 @@ class Controller(ABC):
         with nullcontext() if action in _UNLOCKED else self._lock:
             self._handlers[action](value, client)
 
-    def _download_selection(self, value: Any, client: Any) -> None:
-        self._download(self.history.now.selection, self.history.now.name, client)
+    def _download_object(self, row: ObjectRow | None, client: Any) -> None:
+        """Download an object; None: the selection."""
+        state = self.history.now
+        mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
+        self._download(mask, name, client)
 
     def _change(self, action: Action, value: Any, client: Any) -> None:
         state = self.history.now
@@ -262,18 +262,23 @@ class Controller(ABC):
                 return
             prompts = encode_prompts(line, self._encode, vectors)
             prompts, query = build_query(space.field, prompts, self._encode, **settings)
-        with self._lock:
-            if self._turns.finish(token) and self.state is not None:
-                query = query if "threshold" in settings else carry_threshold(self.history.now, query)
-                self._do(actions.ask(self.history.now, prompts, query), answered=True)
+
+        def ask(state: State) -> State:
+            return actions.ask(state, prompts, query if "threshold" in settings else carry_threshold(state, query))
+
+        self._show_result(token, ask)
 
     def _select_floaters(self, token: RequestToken) -> None:
         floaters = self._find_floaters()
+        self._show_result(token, lambda state: actions.select_floaters(state, floaters), self.floaters_message)
+
+    def _show_result(self, token: RequestToken, result: Callable[[State], State], message: str = "") -> None:
+        """Show the result of a request on the state shown now, unless the request is stale."""
         with self._lock:
             if self._turns.is_current(token) and self.state is not None:
-                state = actions.select_floaters(self.history.now, floaters)
-                self._turns.finish(token)
-                self._do(state, self.floaters_message, answered=True)
+                state = result(self.state)  # any error of it is shown, because the request still runs
+                if self._turns.finish(token):
+                    self._do(state, message, answered=True)
 
     def _explain(self) -> None:
         """Show the training images behind the selection; the search for them holds no lock."""

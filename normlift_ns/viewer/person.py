@@ -7,7 +7,7 @@ import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any, get_args
@@ -20,9 +20,8 @@ from PIL import Image
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer
 from normlift_ns.rasterization.rasterize import render
-from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
+from normlift_ns.rendering.colors import clip_text
 from normlift_ns.session import actions
 from normlift_ns.session.actions import MAX_THRESHOLD, MIN_THRESHOLD, PromptDiagnostics, diagnose_prompts
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects, unoccluded_viewpoint
@@ -57,9 +56,9 @@ from normlift_ns.viewer.widgets import (
     ActionWidgets,
     Explanation,
     ObjectRows,
-    color_swatch,
     diagnostics_mdx,
     escape_mdx,
+    prompt_rows,
 )
 
 _FIELDS_OF_VIEW = (0.3, 1.9)
@@ -357,10 +356,6 @@ class Panel(ActionWidgets):
         if state.box is not None:
             self.centre.value, self.size.value = state.box.center, state.box.size
 
-    def say(self, state: State, message: str, busy: str, drawable: int) -> None:
-        """Shows what is selected, and a message."""
-        self.status.content = status(state, message, busy, drawable)
-
     def judge(self, histograms: str, found: Sequence[PromptDiagnostics]) -> None:
         """Shows histograms as MDX, and a button to go to the nearest match of what is probably not in the scene."""
         self.histograms.content = histograms
@@ -371,7 +366,7 @@ class Panel(ActionWidgets):
             label = f"Go to nearest: {clip_text(one.text, 20)}"
             place = self.histograms.order + (i + 1) / 100
             button = self._gui.add_button(label, color="gray", order=place)
-            button.on_click(lambda _, one=one: self._act(Action.GO_TO_NEAREST, one.nearest_position, None))
+            button.on_click(lambda _, one=one: self._act(Action.GO_TO, one.nearest_position, None))
             self._nearest.append(button)
 
     def box(self, name: str, state: State) -> SelectionBox | None:
@@ -406,25 +401,12 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
     why = "" if drawable == count else f" ({drawable:,} of them are drawn: others are too faint, hidden or left out)"
     lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}{why}")
     if state.answer is not None:
-        lines.append("\n".join(_rows(state, state.answer)))
+        counts = zip(state.answer.texts, state.answer.selected.sum(dim=0).tolist())
+        rows = prompt_rows(state.prompts, ["found"], {text: [f"{count:,}"] for text, count in counts}, max_rows=20)
+        lines.append("\n".join(rows))
     if state.warning:
         lines.append(escape_mdx(f"{state.warning} Below R = {WEAK_RELIABILITY:g} few views saw it, or they disagree."))
     return "\n\n".join([*lines, *filter(None, [legend(state)])])
-
-
-def _rows(state: State, answer: Answer) -> list[str]:
-    colours: Mapping[str, Any] = dict(zip(answer.texts, prompt_rgb_tuples(answer.texts)))
-    counts = dict(zip(answer.texts, answer.selected.sum(dim=0).tolist()))
-    lines = ["| | prompt | found |", "|---|---|---|"]
-    for prompt in state.prompts[:20]:
-        name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.text in counts and not prompt.error:
-            lines.append(f"| {color_swatch(colours[prompt.text])} | {name} | {counts[prompt.text]:,} |")
-        else:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} |")
-    if len(state.prompts) > 20:
-        lines.append(f"| | and {len(state.prompts) - 20} more | |")
-    return lines
 
 
 # One person before one page: what each widget does to their history, and what the page shows of it.
@@ -465,7 +447,6 @@ class Person(Controller):
             Action.GREET: lambda text, _: self._greet(text),
             Action.BOX: lambda name, _: self._do(actions.set_box(self.state, self._widgets.box(name, self.state))),
             Action.COLORS: lambda look, _: self._do(actions.set_color_mode(self.state, look)),
-            Action.GO_TO_NEAREST: self._go_to_nearest,
             Action.LINK: lambda *_: self._link(),
         }
         self._painter = Painter(page, run.records, lambda: self.state, self._drawn, self._rested, self._show_error)
@@ -576,14 +557,13 @@ class Person(Controller):
 
         self._deeds.submit(lambda: self._guard(hit))
 
-    def _go_to_object(self, row: ObjectRow, client: Any) -> None:
-        self._look_at(row)
-
-    def _go_to_nearest(self, place: tuple[float, float, float], client: Any) -> None:
-        self._look_at(LookAtTarget(place, _AROUND / self._shared.records.units.factor))
-
-    def _look_at(self, what: ObjectRow | LookAtTarget) -> None:
-        eye, gaussians = self._eye.view, self._shared.scene.gaussians
+    def _move_camera(self, target: ObjectRow | tuple[float, float, float], client: Any) -> None:
+        eye, gaussians, around = (
+            self._eye.view,
+            self._shared.scene.gaussians,
+            _AROUND / self._shared.records.units.factor,
+        )
+        what = LookAtTarget(target, around) if isinstance(target, tuple) else target
         place = unoccluded_viewpoint(what, gaussians, self.state.drawn, eye.position, eye.up, eye.fov)
         self._eye.look(place, what.center)
 
@@ -649,7 +629,8 @@ class Person(Controller):
         state = self.state
         drawn = (state.selection & state.drawn).cpu().numpy()[self._shared.records.rows]
         self._widgets.show_busy(self._reasons, can_ask=self._turns.busy == "")
-        self._widgets.say(state, self._message, self._turns.busy or self._reasons.busy, int(drawn.sum()))
+        busy = self._turns.busy or self._reasons.busy
+        self._widgets.status.content = status(state, self._message, busy, int(drawn.sum()))
 
     def _late(self) -> None:
         """Draws also where the page never told its token."""

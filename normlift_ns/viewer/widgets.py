@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from enum import Enum
 from threading import Lock
@@ -19,15 +19,16 @@ from torch import Tensor
 from normlift_ns.analysis.explain import RecordedVotes, ViewVote
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.query.engine import Histogram
-from normlift_ns.rendering.colors import clip_text
+from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
 from normlift_ns.session.actions import MAX_THRESHOLD, MIN_THRESHOLD, diagnose_prompts
 from normlift_ns.session.objects import ObjectList, ObjectRow
+from normlift_ns.session.prompts import Prompt
 from normlift_ns.session.state import RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import add_button_group
 
 
 class Action(Enum):
-    """What a user can do in a viewer. Values of buttons are their captions."""
+    """Action of a user in a viewer. Its value is the caption of its button, if it has one."""
 
     ASK = "Ask"
     CANCEL = "Cancel"
@@ -50,15 +51,11 @@ class Action(Enum):
     ADD = "Add"
     REMOVE = "Drop"
     EXPLAIN = "Why?"
-    GO_TO_OBJECT = "go to"
-    SHOW_OBJECT = "only"
-    HIDE_OBJECT = "hide"
-    EXPORT_OBJECT = "export"
+    GO_TO = "go to"
     DOWNLOAD = "Download selection"
     SAVE = "Save prompts in run"
     REPLACE = "Replace the saved prompts"
     COLORS = "colors"
-    GO_TO_NEAREST = "nearest"
     BOX = "box"
     LINK = "Link"
     GREET = "greet"
@@ -182,7 +179,12 @@ def color_swatch(color: Sequence[float]) -> str:
 
 
 MAX_OBJECT_ROWS = 8
-_OBJECT_ACTIONS = (Action.GO_TO_OBJECT, Action.SHOW_OBJECT, Action.HIDE_OBJECT, Action.EXPORT_OBJECT)
+_OBJECT_BUTTONS = {
+    "go to": Action.GO_TO,
+    "only": Action.SHOW_ONLY,
+    "hide": Action.HIDE,
+    "export": Action.DOWNLOAD,
+}
 
 
 class ObjectRows:
@@ -217,12 +219,34 @@ class ObjectRows:
     def _row(self, gui: Any, i: int, act: Act) -> tuple[Any, Any]:
         def pressed(caption: str, event: Any) -> None:
             if i < len(self._objects):
-                act(Action(caption), self._objects[i], event.client)
+                act(_OBJECT_BUTTONS[caption], self._objects[i], event.client)
 
         text = gui.add_markdown("")
-        buttons = add_button_group(gui, "", tuple(action.value for action in _OBJECT_ACTIONS), pressed)
+        buttons = add_button_group(gui, "", tuple(_OBJECT_BUTTONS), pressed)
         text.visible = buttons.visible = False
         return text, buttons
+
+
+def prompt_rows(
+    prompts: Sequence[Prompt], headings: Sequence[str], numbers: Mapping[str, Sequence[str]], *, max_rows: int
+) -> list[str]:
+    """Return the lines of a table with the color and the numbers of each prompt, or with its error.
+
+    Args:
+        headings: headings of the numbers.
+        numbers: numbers of the prompts that are asked, in their order.
+    """
+    colors = dict(zip(numbers, prompt_rgb_tuples(tuple(numbers))))
+    rows = [("", "prompt", *headings), ("---",) * (2 + len(headings))]
+    for prompt in prompts[:max_rows]:
+        name = escape_mdx(clip_text(prompt.text, 40))
+        if prompt.error or prompt.text not in numbers:
+            rows.append(("⚠", name, escape_mdx(clip_text(prompt.error, 120)), *[""] * (len(headings) - 1)))
+        else:
+            rows.append((color_swatch(colors[prompt.text]), name, *numbers[prompt.text]))
+    if len(prompts) > max_rows:
+        rows.append(("", f"and {len(prompts) - max_rows} more", *[""] * len(headings)))
+    return [f"| {' | '.join(row)} |" for row in rows]
 
 
 # Histograms and images as MDX, for the panels of both viewers.
