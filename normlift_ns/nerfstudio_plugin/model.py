@@ -104,6 +104,7 @@ class NormLiftModel(SplatfactoModel):
         self._field: SemanticField | None = None
         self._display: Display | None = None
         self.normlift = SearchPanel(self)
+        self.viewer_control = self.normlift.control  # for nerfstudio, which searches the attributes of modules
 
     @property
     def renders_on_cpu(self) -> bool:

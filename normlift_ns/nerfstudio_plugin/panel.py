@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from threading import Lock, RLock, Thread
-from typing import Any, cast
+from threading import Thread
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,73 +27,59 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.data.open_scene import open_scene
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError, describe_error
-from normlift_ns.exports import MIN_OPACITY_LOGIT, write_splat_ply
-from normlift_ns.io.atomic import safe_file_name
+from normlift_ns.exports import MIN_OPACITY_LOGIT
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query, load_query, save_query
+from normlift_ns.query.question import Query, load_query
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for
-from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors
+from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text
 from normlift_ns.rendering.figures import Display, make_display, output_names
 from normlift_ns.session import actions
-from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD, carry_threshold
+from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
 from normlift_ns.session.objects import ObjectRow, list_objects, unoccluded_viewpoint
-from normlift_ns.session.prompts import (
-    Prompt,
-    build_query,
-    click_name,
-    encode_prompts,
-    join_prompts,
-    merge_queries,
-    prompts_of_query,
-    split_prompts,
-)
+from normlift_ns.session.prompts import join_prompts, prompts_of_query, split_prompts
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
-from normlift_ns.viewer.adapter import handle_in_order, ignore_closed_clients, send_in_order
+from normlift_ns.viewer.adapter import KEYS_SCRIPT, handle_in_order, ignore_closed_clients, send_in_order
+from normlift_ns.viewer.controller import NO_FIELD_MESSAGE, Controller, Session, splat_bytes, store_query
 from normlift_ns.viewer.widgets import (
+    ALL_PROMPTS,
     MAX_OBJECT_ROWS,
-    OBJECT_ACTIONS,
+    Act,
+    Action,
+    ActionWidgets,
     Explanation,
     ObjectRows,
-    color_swatch,
     diagnostics_mdx,
     escape_mdx,
+    prompt_rows,
 )
 
 VISER_SCALE = 10.0
 """Units of the viser scene per scene unit: nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
-CLICK_MODES = {"More like this": "like", "Select": "select", "Add": "add", "Drop": "take away"}
-"""Effect of a click, by the caption of its button."""
 
 
 class ClickListener:
     """Listener for clicks on the scene, in at most one browser of a viewer.
 
     Args:
-        hit: called with the mode of the click, and with the origin and direction of its ray in scene units.
+        hit: called with the action of the click, and with the origin and direction of its ray in scene units.
     """
 
-    def __init__(self, hit: Callable[[str, Tensor, Tensor], None]) -> None:
+    def __init__(self, hit: Callable[[Action, Tensor, Tensor], None]) -> None:
         self._hit = hit
-        self._armed: tuple[str, Any] | None = None
-        self.directions: dict[str, np.ndarray] = {}
-        """Directions of the clicked Gaussians, by the names of their prompts."""
+        self._armed: tuple[Action, Any] | None = None
 
     @property
     def armed(self) -> bool:
         """True if a browser waits for a click."""
         return self._armed is not None
 
-    def arm(self, button: str, client: Any) -> None:
-        """Wait for a click in one browser.
-
-        Args:
-            button: caption of the button, a key of `CLICK_MODES`.
-        """
+    def arm(self, action: Action, client: Any) -> None:
+        """Wait for a click in one browser."""
         self.disarm()
         client.scene.on_pointer_event("click")(self._clicked)
-        self._armed = (CLICK_MODES[button], client)
+        self._armed = (action, client)
 
     def disarm(self) -> None:
         """Stop waiting for a click."""
@@ -109,19 +94,6 @@ class ClickListener:
         if waited:
             self._armed = None
         return waited
-
-    def add_direction(self, vector: np.ndarray, taken: Iterable[str]) -> str:
-        """Keep the direction of a clicked Gaussian.
-
-        Args:
-            taken: prompt names that must not be used again, in addition to those of `known`.
-        Returns:
-            Name of the new prompt.
-        """
-        names = {*self.directions, *taken}
-        name = next(name for n in range(1, len(names) + 2) if (name := click_name(n)) not in names)
-        self.directions[name] = vector
-        return name
 
     def _clicked(self, event: Any) -> None:
         armed = self._armed
@@ -176,26 +148,10 @@ def prompt_table(state: State) -> str:
         return ""
     counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
     peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
-    colors = prompt_colors(answer.texts).tolist()
-    rows = {text: (counts[i], peaks[i], colors[i]) for i, text in enumerate(answer.texts)}
-    lines = [
-        f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}",
-        "",
-        "| | prompt | selected | peak |",
-        "|---|---|---|---|",
-    ]
-    failed = [prompt for prompt in state.prompts if prompt.error]  # listed first, to be noticed
-    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.error)][:_MAX_TABLE_ROWS]
-    for prompt in listed:
-        name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.error or prompt.text not in rows:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} | |")
-            continue
-        count, peak, color = rows[prompt.text]
-        lines.append(f"| {color_swatch(color)} | {name} | {count:,} | {peak:.2f} |")
-    if len(state.prompts) > len(listed):
-        lines.append(f"| | and {len(state.prompts) - len(listed)} more | | |")
-    return "\n".join(lines)
+    numbers = {text: (f"{counts[i]:,}", f"{peaks[i]:.2f}") for i, text in enumerate(answer.texts)}
+    failed_first = sorted(state.prompts, key=lambda prompt: not prompt.error)  # to be noticed
+    rows = prompt_rows(failed_first, ("selected", "peak"), numbers, max_rows=_MAX_TABLE_ROWS)
+    return "\n".join([f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}", "", *rows])
 
 
 # Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
@@ -204,98 +160,60 @@ def prompt_table(state: State) -> str:
 # them, and hold the render lock while their callbacks run.
 
 
-ALL_PROMPTS = "all prompts"
 TAB_LABEL = "Search"
-_SCRIPT = """
-(() => {
-  if (window.normlift) return;
-  window.normlift = true;
-  const style = document.createElement("style");
-  style.textContent = `.mantine-Button-root[data-variant="outline"] { padding-inline: 2px; }
-    .mantine-Flex-root > div:has(label:empty) { display: none; }`;
-  document.head.append(style);
-  const press = (text) => {
-    const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
-    if (found && !found.disabled) found.click();
-  };
-  addEventListener("keydown", (event) => {
-    const row = event.target.closest ? event.target.closest("div:has(label)") : null;
-    const label = row && row.querySelector("label") ? row.querySelector("label").textContent : "";
-    const asks = event.target.tagName === "INPUT" && ["Prompts", "Negatives"].includes(label);
-    if (event.key === "Enter" && asks) setTimeout(() => press("Ask"), 150);
-    if (event.key === "Escape") press("Cancel");
-  });
-})();
-"""
-"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
 
 
-class PanelWidgets:
-    """The tab with its widgets, shared by all browsers.
+class PanelWidgets(ActionWidgets):
+    """The tab with its widgets, shared by all browsers."""
 
-    Args:
-        server: viser's server.
-        act: called with the name of the pressed or changed widget, its value, and the client of the browser.
-        lock: lock of the panel, held while a change is passed to `act`. No other thread can revert it meanwhile.
-    """
-
-    def __init__(self, server: Any, act: Callable[[str, Any, Any], None], lock: AbstractContextManager[Any]) -> None:
-        self._gui, self._act = server.gui, act
-        self._lock = lock
-        self._values: dict[str, Any] = {}
-        with add_first_tab(server.gui, TAB_LABEL, "SEARCH"):
-            self.prompts = self._gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
-            self.ask = self._button("Ask", hint="Or press Enter in the Prompts field.")
-            self.cancel = self._button("Cancel", hint="Stop the query or the pending click, as Escape does.")
+    def __init__(self, gui: Any, act: Act, lock: AbstractContextManager[Any]) -> None:
+        super().__init__(gui, act, lock)
+        with add_first_tab(gui, TAB_LABEL, "SEARCH"):
+            self.prompts = gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
+            self.ask = self._button(Action.ASK, hint="Or press Enter in the Prompts field.")
+            self.cancel = self._button(Action.CANCEL, hint="Stop the query or the pending click, as Escape does.")
             self.cancel.visible = False
-            self.status = self._gui.add_markdown("")
-            self.remove_weak = self._button("Leave out Gaussians with weak evidence")
+            self.status = gui.add_markdown("")
+            self.remove_weak = self._button(Action.REMOVE_WEAK)
             self.remove_weak.visible = False
-            self._group("History", ("Undo", "Redo", "Clear"))
-            self.threshold = self._slider(
-                "Threshold", MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5, "Relevancy above which Gaussians are selected."
-            )
+            self._group("History", (Action.UNDO, Action.REDO, Action.CLEAR))
+            numbers = (MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5)
+            self.threshold = self._slider(Action.THRESHOLD, numbers, "Relevancy above which Gaussians are selected.")
             self.reliability = self._slider(
-                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "Minimum reliability R of selected Gaussians."
+                Action.RELIABILITY, (0.0, 1.0, 0.01, 0.0), "Minimum reliability R of selected Gaussians."
             )
-            self._button("Suggested", hint="Use the threshold suggested by the histogram (dashed line).")
-            self._group("Selection", ("Hide", "Only", "All"))
-            self._button("Select likely floaters", hint="Gaussians that lie on no surface. Check, then hide them.")
-            self.prompt_table = self._gui.add_markdown("")
-            self.histograms = self._gui.add_markdown("")
-            self.rows = ObjectRows(self._gui, lambda action, row, event: act(action, row, event.client))
-            with self._gui.add_folder("Why"):
-                self.explain_button = self._button(
-                    "Why?", hint="Show the training images that voted for the selection."
-                )
-                self.reasons = self._gui.add_markdown("")
-            with self._gui.add_folder("Click in the scene"):
-                self._button("More like this", hint="Ask for everything similar to the Gaussian you click.")
-                self._group("Objects", ("Select", "Add", "Drop"))
-                self.steps = self._slider(
-                    "Grow", -MAX_GROW_STEPS, MAX_GROW_STEPS, 1, 0, "Grow or shrink the selection, from part to whole."
-                )
-            with self._gui.add_folder("Keep"):
-                self._button("Download selection", hint="Download the selected Gaussians as a PLY file.")
-                self._button("Save prompts in run", hint="Add them to the stored prompts; ns-render draws them.")
-                self.replace = self._button("Replace the saved prompts")
+            self._button(Action.SUGGESTED, hint="Use the threshold suggested by the histogram (dashed line).")
+            self._group("Selection", (Action.HIDE, Action.SHOW_ONLY, Action.SHOW_ALL))
+            self._button(Action.SELECT_FLOATERS, hint="Gaussians that lie on no surface. Check, then hide them.")
+            self.prompt_table = gui.add_markdown("")
+            self.histograms = gui.add_markdown("")
+            self.rows = ObjectRows(gui, act)
+            with gui.add_folder("Why"):
+                hint = "Show the training images that voted for the selection."
+                self.explain_button = self._button(Action.EXPLAIN, hint=hint)
+                self.reasons = gui.add_markdown("")
+            with gui.add_folder("Click in the scene"):
+                self._button(Action.LIKE, hint="Ask for everything similar to the Gaussian you click.")
+                self._group("Objects", (Action.SELECT, Action.ADD, Action.REMOVE))
+                numbers = (-MAX_GROW_STEPS, MAX_GROW_STEPS, 1, 0)
+                self.steps = self._slider(Action.GROW, numbers, "Grow or shrink the selection, from part to whole.")
+            with gui.add_folder("Keep"):
+                self._button(Action.DOWNLOAD, hint="Download the selected Gaussians as a PLY file.")
+                self._button(Action.SAVE, hint="Add them to the stored prompts; ns-render draws them.")
+                self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
-            with self._gui.add_folder("How it is asked and drawn", expand_by_default=False):
-                self.shown = self._input(
-                    "shown",
-                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt to show."),
-                )
-                self.colormap = self._input(
-                    "colormap", self._gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
-                )
+            with gui.add_folder("How it is asked and drawn", expand_by_default=False):
+                choice = gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt to show.")
+                self.shown = self._input(Action.SHOW_PROMPT, choice)
+                colors = gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
+                self._input(Action.COLORS, colors)
                 hint = "Prompts to compare with, separated by commas."
-                self.negatives = self._gui.add_text("Negatives", "", hint=hint)
+                self.negatives = gui.add_text("Negatives", "", hint=hint)
                 rules = ("auto", *RELEVANCY_RULES)
-                self.rule = self._gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
-                self.refined = self._input(
-                    "refined", self._gui.add_checkbox("Refined", True, hint="Use refined features.")
-                )
-        self._gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=_SCRIPT))
+                self.rule = gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
+                refined = gui.add_checkbox("Refined", True, hint="Use refined features.")
+                self.refined = self._input(Action.REFINED, refined)
+        gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=KEYS_SCRIPT))
 
     def reset_query_settings(self, negatives: str) -> None:
         """Reset the settings that apply to the next query.
@@ -303,63 +221,15 @@ class PanelWidgets:
         Args:
             negatives: default negative prompts.
         """
-        self._reset("Minimum reliability", self.reliability, 0.0)
-        self._reset("refined", self.refined, True)
+        self.reset_reliability()
+        self._reset(Action.REFINED, self.refined, True)
         self.rule.value, self.negatives.value = "auto", negatives
 
     def show_state(self, state: State) -> None:
         """Show a state in every widget except the text boxes."""
-        texts = () if state.answer is None else state.answer.texts
-        options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
-        if tuple(self.shown.options) != options:
-            self._values["shown"] = ALL_PROMPTS
-            self.shown.options = options
-            self._values["shown"] = self.shown.value  # viser keeps the choice if it is a new option
-        self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
+        super().show_state(state)
         if state.query is not None:
-            threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold))
-            self._set("Threshold", self.threshold, threshold)
-            self._set("Minimum reliability", self.reliability, state.query.min_reliability)
-            self._set("refined", self.refined, state.query.refined)
-        self._set("Grow", self.steps, state.grow_steps)
-        self.remove_weak.visible = state.warning != ""
-
-    def _button(self, label: str, *, hint: str | None = None) -> Any:
-        button = self._gui.add_button(label, hint=hint)
-        button.on_click(lambda event: self._act(label, None, event.client))
-        return button
-
-    def _group(self, label: str, options: tuple[str, ...]) -> None:
-        group = self._gui.add_button_group(label, options)
-        group._impl.is_button = True  # else viser 0.2.7 ignores a second press of the same button
-        group.on_click(lambda event: self._act(group.value, None, event.client))
-
-    def _slider(self, label: str, low: float, high: float, step: float, value: float, hint: str) -> Any:
-        return self._input(label, self._gui.add_slider(label, low, high, step, value, hint=hint))
-
-    def _input(self, name: str, widget: Any) -> Any:
-        """Pass the changes of a widget to `act`, except changes made by the program; return the widget."""
-        self._values[name] = widget.value
-
-        def changed(event: Any) -> None:
-            with self._lock:
-                if widget.value != self._values[name]:
-                    self._values[name] = widget.value
-                    self._act(name, widget.value, event.client)
-
-        widget.on_update(changed)
-        return widget
-
-    def _set(self, name: str, widget: Any, value: Any) -> None:
-        """Set a widget without calling `act`, unless it has a user's change that `act` has not received yet."""
-        if widget.value == self._values[name]:
-            self._reset(name, widget, value)
-
-    def _reset(self, name: str, widget: Any, value: Any) -> None:
-        """Set a widget without calling `act`, even if a user has just changed it."""
-        if widget.value != value:
-            self._values[name] = value
-            widget.value = value
+            self._set(Action.REFINED, self.refined, state.query.refined)
 
 
 def add_first_tab(gui: Any, label: str, icon: str) -> Any:
@@ -411,13 +281,8 @@ def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Boo
         camera.look_at = np.array(target.center) * VISER_SCALE
 
 
-# Controller of the panel in nerfstudio's viewer: applies the actions of the widgets to a history of states.
-#
 # All browsers share one panel, as they share nerfstudio's own. States are immutable, and so is the `Display` of a
 # state that the model gets. Other threads can therefore render images without waiting for this one.
-
-
-NO_FIELD_MESSAGE = "No semantics yet. They are lifted at the end of training."
 
 
 def rerender_clients(viewer: Any) -> None:
@@ -439,72 +304,38 @@ class _Control(ViewerControl):
     """Element through which nerfstudio passes its viewer to the panel."""
 
     def __init__(self, panel: SearchPanel) -> None:
-        self._panel = [panel]  # in a list: nerfstudio searches attributes for widgets
+        self._panel = panel
 
     def _setup(self, viewer: Any) -> None:
         super()._setup(viewer)
-        self._panel[0].install(viewer)
+        self._panel.install(viewer)
 
 
-_READING = "Reading the prompts. The first query also loads the text encoder, which takes a while."
-
-
-def _show_prompt(state: State, option: str) -> State:
-    """Let only the prompt of an option of the dropdown select."""
-    return actions.show_prompt(state, None if option == ALL_PROMPTS else int(option.split(":", maxsplit=1)[0]) - 1)
-
-
-def _use_refined(state: State, refined: bool) -> State:
-    question = None if state.query is None else replace(state.query, refined=refined)
-    return actions.update_query(state, question, "Refined features")
-
-
-_ACTIONS: dict[str, Callable[..., State]] = {
-    "Hide": actions.hide,
-    "Only": actions.show_only,
-    "All": actions.show_all,
-    "Suggested": actions.use_suggested_threshold,
-    "Leave out Gaussians with weak evidence": actions.remove_weak,
-    "Threshold": actions.set_threshold,
-    "Minimum reliability": actions.set_min_reliability,
-    "Grow": actions.resize,
-    "shown": _show_prompt,
-    "refined": _use_refined,
-}
-"""Actions on a state by the name of their widget; those of sliders and choices take its value."""
-_SLIDERS = ("Threshold", "Minimum reliability", "Grow")
-
-
-class SearchPanel(torch.nn.Module):
-    """The panel with its queries, clicks and history. A module, because nerfstudio searches only modules for a
-    `ViewerControl`.
+class SearchPanel(Controller):
+    """The panel in nerfstudio's viewer.
 
     Args:
         host: the `NormLiftModel`, whose module imports this one.
     """
 
+    reading_message = "Reading the prompts. The first query also loads the text encoder, which takes a while."
+    _widgets: PanelWidgets | None
+
     def __init__(self, host: Any) -> None:
-        super().__init__()
-        self._host = [host]  # in a list: the model is the parent of this module
+        super().__init__(Session(), explanation_of_run(None))
+        self._host = host
         self._viewer: Any = None
-        self._widgets: PanelWidgets | None = None
-        self._history: History[State] | None = None
         self._folder: Path | None = None
-        self._line, self._message, self._negatives = "", "", ""
+        self._negatives = ""
         self._colormap: Colormap = COLORMAPS[0]
         self._overlay_due = False
-        self._turns, self._detail_turns = RequestTokens(), RequestTokens()
-        self._lock, self._encoder_lock = RLock(), Lock()
+        self._detail_turns = RequestTokens()
         self._encoder: list[LazyTextEncoder] = []
         """The text encoder as the only item once a prompt has loaded it; empty before."""
         self._clicks = ClickListener(self._on_click)
-        self._reasons = explanation_of_run(None)
+        self._handlers[Action.COLORS] = lambda colormap, _: self._set_colormap(colormap)
+        self._handlers[Action.REPLACE] = lambda *_: self._save(replaces=True)
         self.control = _Control(self)
-
-    @property
-    def state(self) -> State | None:
-        """The state shown now; None without a field."""
-        return None if self._history is None else self._history.now
 
     @property
     def answer(self) -> Answer | None:
@@ -532,7 +363,7 @@ class SearchPanel(torch.nn.Module):
                 state = actions.ask(state, prompts_of_query(question), question)
                 self._negatives = join_prompts(question.negatives)
                 self._set_prompts(join_prompts(question.texts))
-            self._clicks.directions, self._message = {}, ""
+            self._session.clicks = {}
             self._reasons = explanation_of_run(folder, field)
             if self._widgets is not None:
                 self._widgets.negatives.value = self._negatives
@@ -541,218 +372,123 @@ class SearchPanel(torch.nn.Module):
     def close(self) -> None:
         """Drop the field, because the Gaussians are about to change."""
         with self._lock:
-            self._cancel()
+            self._discard()
             self._detail_turns.cancel()
-            self._history = None
+            self._session.history = None
             self._update_widgets()
 
-    def on_action(self, name: str, value: Any = None, client: Any = None) -> None:
-        """Carry out the action of a widget; the panel shows any error.
+    def _set_colormap(self, colormap: Colormap) -> None:
+        self._colormap = colormap
+        self._show(self.history)
 
-        Args:
-            name: name of the widget or caption of the button.
-            client: the browser in which it was pressed.
-        """
-        try:
-            if self.state is None:
-                raise InputError(NO_FIELD_MESSAGE)
-            if name == "Ask":
-                self._ask()
-            elif name == "Select likely floaters":
-                self._run("Looking for floaters.", self._select_floaters)
-            elif name == "Why?":
-                self._explain()
-            else:
-                with self._lock:
-                    self._act_quickly(name, value, client)
-        except Exception as error:  # no error may stop the viewer
-            self.show_message(describe_error(error)[0])
+    def _go_to(self, history: History[State]) -> None:
+        self._set_prompts(join_prompts([prompt.text for prompt in history.now.prompts]))
+        super()._go_to(history)
 
-    def _act_quickly(self, name: str, value: Any, client: Any) -> None:
-        """Carry out an action that takes no noticeable time."""
-        history = cast("History[State]", self._history)
-        state, self._message = history.now, ""
-        if name in _ACTIONS:
-            state = _ACTIONS[name](state) if value is None else _ACTIONS[name](state, value)
-            self._show(history.do(state, key=name if name in _SLIDERS else None))
-        elif name in ("Undo", "Redo"):
-            history = history.undo() if name == "Undo" else history.redo()
-            self._set_prompts(join_prompts([prompt.text for prompt in history.now.prompts]))
-            self._show(history)
-        elif name == "Clear":
-            self._clear(history)
-        elif name == "colormap":
-            self._colormap = value
-            self._show(history)
-        elif name in CLICK_MODES:
-            self._clicks.arm(name, client)
-            self.show_message("Click on the scene, or press Cancel or Escape to stop.")
-        elif name == "Cancel":
-            self._cancel()
-            self._update_widgets()
-        elif name in OBJECT_ACTIONS:
-            self._act_on_object(name, value, client)
-        elif name == "Download selection":
-            self._download(state.selection, state.name, client)
-        elif name in ("Save prompts in run", "Replace the saved prompts"):
-            self._save(state, replaces=name.startswith("Replace"))
-
-    def _clear(self, history: History[State]) -> None:
+    def _clear(self) -> None:
         """Remove the query and the selection, show everything, and reset the settings of queries."""
-        self._cancel()
+        self._discard()
         self._set_prompts("")
-        self._set_default_negatives(history.now.space.field)
+        self._set_default_negatives(self.history.now.space.field)
         if self._widgets is not None:
             self._widgets.reset_query_settings(self._negatives)
-        self._show(history.do(replace(actions.show_all(actions.clear(history.now)), action="Clear")))
+        self._do(replace(actions.show_all(actions.clear(self.history.now)), action="Clear"))
 
     def _set_default_negatives(self, field: SemanticField) -> None:
         with suppress(ValueError, OSError):  # a missing file of text embeddings is reported when it is needed
             self._negatives = join_prompts(default_rule(field).negatives)
 
-    def _cancel(self) -> None:
-        """Discard running work, and stop waiting for a click."""
-        self._turns.cancel()
+    def _discard(self) -> None:
+        super()._discard()
         self._clicks.disarm()
-        self._reasons.clear()
 
-    def _act_on_object(self, action: str, row: ObjectRow, client: Any) -> None:
-        if action == "go to":
-            move_camera(client, row, self._host[0].scene(), cast(State, self.state).drawn)
-        elif action == "export":
-            self._download(row.mask, row.name, client)
-        else:
-            history = cast("History[State]", self._history)
-            self._show(history.do((actions.show_only if action == "only" else actions.hide)(history.now, row.mask)))
+    def _move_camera(self, target: ObjectRow, client: Any) -> None:
+        move_camera(client, target, self._host.scene(), self.history.now.drawn)
 
-    def _download(self, mask: Tensor, stem: str, client: Any) -> None:
-        """Send Gaussians as a PLY file to a browser."""
+    def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:
         if not bool(mask.any()):
             raise InputError("Nothing is selected; there is nothing to download.")
-        splat, state = self._host[0].splat_parameters(), cast(State, self.state)
+        splat = self._host.splat_parameters()
         if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
             raise InputError("All selected Gaussians are invisible (opacity below 1/255): nothing to download.")
-        name = f"{safe_file_name(stem)}.ply"
-        with tempfile.TemporaryDirectory() as folder:
-            rows = write_splat_ply(Path(folder) / name, splat, state.space.field, state.answer, keep=mask)
-            client.send_file_download(name, (Path(folder) / name).read_bytes())
-        self.show_message(f"Sent {name} with {len(rows):,} Gaussians to the browser's downloads.")
+        file_name, content, count = splat_bytes(splat, self.history.now, mask, name)
+        client.send_file_download(file_name, content)
+        self.show_message(f"Sent {file_name} with {count:,} Gaussians to the browser's downloads.")
 
     def _ask(self) -> None:
-        """Ask the prompts in the text boxes."""
         if self._widgets is not None:
-            self._line, self._negatives = self._widgets.prompts.value, self._widgets.negatives.value
-        self._run(_READING, self._answer)
+            self._negatives = self._widgets.negatives.value
+        super()._ask()
 
     def _run(self, description: str, task: Callable[[RequestToken], None]) -> None:
-        """Run a slow task without holding a lock; the panel shows its description until it ends."""
-        token = self._turns.start(description)
         self._clicks.disarm()
-        self.show_message("")
-        message = ""
-        try:
-            task(token)
-        except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
-            message = describe_error(error)[0]
-        if self._turns.finish(token):
-            self.show_message(message)
+        super()._run(description, task)
 
-    def _answer(self, token: RequestToken) -> None:
-        result = self._encode_query(cast(State, self.state).space.field)
-        with self._lock:
-            if result is not None and self._turns.finish(token) and self._history is not None:
-                state, (prompts, question) = self._history.now, result
-                self._message = ""
-                self._show(
-                    self._history.do(actions.ask(state, prompts, carry_threshold(state, question))), answered=True
-                )
+    def _start(self, job: Callable[[], None], kind: Action) -> None:
+        job()
 
-    def _encode_query(self, field: SemanticField) -> tuple[tuple[Prompt, ...], Query] | None:
-        """Encode the prompts and build their query; None if the request is stale.
-
-        Raises:
-            ValueError, OSError: as `encode_prompts` and `session.prompts.build_query`.
-        """
-        line, negatives, widgets, vectors = self._line, self._negatives, self._widgets, dict(self._clicks.directions)
+    def _known_vectors(self) -> dict[str, Any]:
+        vectors = dict(self._session.clicks)
         with suppress(ValueError, OSError):  # a damaged file is reported when it is shown or replaced
             vectors |= {prompt.text: prompt.vector for prompt in prompts_of_query(self._stored_query())}
-        options: dict[str, Any] = {}
-        if widgets is not None:
-            choices = {"rule": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
-            options = {name: widget.value for name, widget in choices.items()}
+        return vectors
 
-        def encode(texts: Sequence[str]) -> Any:
-            if len(self._encoder) == 0:
-                cache = None if self._folder is None else text_cache_folder(self._folder.parent)
-                self._encoder.append(text_encoder_for(field, str(field.source.device), cache))
-            return self._encoder[0].rows(texts)
+    def _query_settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = {"negatives": split_prompts(self._negatives)}
+        if (widgets := self._widgets) is not None:
+            chosen = {"rule": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
+            settings |= {name: widget.value for name, widget in chosen.items()}
+        return settings
 
-        with self._encoder_lock:  # so that two threads do not both load the encoder
-            if self._turns.busy == "":
-                return None
-            prompts = encode_prompts(line, encode, vectors)
-            return build_query(field, prompts, encode, negatives=split_prompts(negatives), **options)
+    def _encode(self, texts: Sequence[str]) -> Any:
+        if len(self._encoder) == 0:
+            field = self.history.now.space.field
+            cache = None if self._folder is None else text_cache_folder(self._folder.parent)
+            self._encoder.append(text_encoder_for(field, str(field.source.device), cache))
+        return self._encoder[0].rows(texts)
 
     def _stored_query(self) -> Query | None:
         """Return the query stored in the run; None if it stores none."""
         return None if self._folder is None else load_query(self._folder)
 
-    def _select_floaters(self, token: RequestToken) -> None:
-        floaters = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
-        with self._lock:
-            if self._history is not None and self._turns.is_current(token):
-                state = actions.select_floaters(self._history.now, floaters)
-                self._turns.finish(token)
-                self._message = actions.FLOATERS_HINT
-                self._show(self._history.do(state), answered=True)
-
-    def _explain(self) -> None:
-        """Show the training images behind the selection; the search for them holds no lock."""
-        state, reasons = cast(State, self.state), self._reasons
-        token = reasons.start(state)
-        self.show_message("")
-        try:
-            reasons.compute(token, state)
-        finally:
-            with self._lock:
-                self._update_widgets()
+    def _find_floaters(self) -> Bool[Tensor, " n"]:
+        return find_floaters(self._host.scene(), self.history.now.space.field.scalars).mask
 
     def on_disconnect(self, client: Any) -> None:
         """Stop waiting for the click of a disconnected browser."""
         if self._clicks.on_disconnect(client):
             self.show_message("")
 
-    def _on_click(self, mode: str, origin: Tensor, direction: Tensor) -> None:
-        """Handle a click: ask for everything similar, or select, add or remove the object under it."""
-        try:
-            device = cast(State, self.state).space.means.device
-            with self._viewer.train_lock:  # a render in another thread may change which Gaussians are drawn
-                weights = self._host[0].ray_weights(origin.to(device), direction.to(device))
-            with self._lock:
-                history = cast("History[State]", self._history)
-                if mode != "like":
-                    self._message = ""
-                    self._show(history.do(actions.click(history.now, weights, cast(Any, mode))), answered=True)
-                    return
-                saved = self._stored_query()
-                vector = actions.picked_direction(history.now, weights)
-                self._set_prompts(self._clicks.add_direction(vector, () if saved is None else saved.texts))
-            self._ask()
-        except Exception as error:  # as in `act`
-            self.show_message(describe_error(error)[0])
+    def _wait_for_click(self, action: Action, value: Any, client: Any) -> None:
+        self._clicks.arm(action, client)
+        self.show_message("Click on the scene, or press Cancel or Escape to stop.")
 
-    def _save(self, state: State, *, replaces: bool) -> None:
-        """Store the prompts of a state in the run, in addition to those stored there or instead of them."""
+    def _on_click(self, action: Action, origin: Tensor, direction: Tensor) -> None:
+        """Handle a click: ask for everything similar, or select, add or remove the object under it."""
+
+        def click() -> None:
+            device = self.history.now.space.means.device
+            with self._viewer.train_lock:  # a render in another thread may change which Gaussians are drawn
+                weights = self._host.ray_weights(origin.to(device), direction.to(device))
+            if action is Action.LIKE:
+                stored = self._stored_query()
+                vector = actions.picked_direction(self.history.now, weights)
+                self._ask_click(vector, () if stored is None else stored.texts)
+                return
+            with self._lock:
+                self._click(action, weights)
+
+        self._guard(click)
+
+    def _save(self, *, replaces: bool = False) -> None:
+        """Store the prompts in the run, in addition to those stored there or instead of them."""
+        query = self.history.now.query
         try:
-            if state.query is None or self._folder is None:
-                raise InputError("No query yet; there is nothing to save.")
-            question = merge_queries(None if replaces else load_query(self._folder), state.query)
-            save_query(self._folder, question)
+            prompts = store_query(self._folder, query, replaces=replaces)
         except InputError:
-            self._offer_to_replace(state.query is not None)
+            self._offer_to_replace(query is not None)
             raise
         self._offer_to_replace(False)
-        prompts = "one prompt" if len(question.texts) == 1 else f"{len(question.texts)} prompts"
         self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
     def _offer_to_replace(self, visible: bool) -> None:
@@ -770,25 +506,18 @@ class SearchPanel(torch.nn.Module):
         handle_in_order(viewer.viser_server)
         send_in_order(viewer.viser_server)
         self._follow_outputs(viewer.control_panel)
-        self._widgets = PanelWidgets(viewer.viser_server, self.on_action, self._lock)
+        self._widgets = PanelWidgets(viewer.viser_server.gui, self.act, self._lock)
         viewer.viser_server.on_client_disconnect(disconnected)
         ignore_closed_clients(viewer.viser_server)
-        self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
+        self._widgets.prompts.value, self._widgets.negatives.value = self._session.line, self._negatives
         if self.state is not None:
             self._update_details(self.state)
         self._update_widgets()
 
-    def show_message(self, message: str) -> None:
-        """Show a message above the size of the selection."""
-        with self._lock:
-            self._message = message
-            self._update_widgets()
-
-    def _show(self, history: History[State], *, answered: bool = False) -> None:
+    def _show(self, history: History[State], message: str = "", *, answered: bool = False) -> None:
         """Show the current state of a history. The display is complete before the model gets it.
 
-        Args:
-            answered: whether the selection is new, so that the overlay replaces an rgb output.
+        A new selection replaces an rgb output by the overlay.
         """
         state = history.now
         drawn = None if state.hidden is None else state.drawn
@@ -801,12 +530,12 @@ class SearchPanel(torch.nn.Module):
             drawn=drawn,
             by_hand=not state.prompts_select,
         )
-        self._history = history
+        self._session.history, self._message = history, message
         self._reasons.update(state)
         if self._viewer is not None:
             self._select_output(display, answered=answered)
             self._update_details(state)
-        self._host[0].show(display)
+        self._host.show(display)
         self._update_widgets()
         if self._viewer is not None:
             rerender_clients(self._viewer)
@@ -837,28 +566,19 @@ class SearchPanel(torch.nn.Module):
 
         control_panel.update_output_options = updated
 
-    def _set_prompts(self, line: str) -> None:
-        """Replace the text in the prompt box, which otherwise only the user edits."""
-        self._line = line
-        if self._widgets is not None:
-            self._widgets.prompts.value = line
-
     def _update_widgets(self) -> None:
         """Show the state in the widgets."""
         widgets, state = self._widgets, self.state
         if widgets is None:
             return
-        widgets.ask.disabled = self._turns.busy != "" or state is None
+        widgets.show_busy(self._reasons, can_ask=self._turns.busy == "" and state is not None)
         busy = self._turns.busy or self._reasons.busy
         widgets.cancel.visible = busy != "" or self._clicks.armed
-        widgets.explain_button.disabled = self._reasons.busy != ""
-        if widgets.reasons.content != self._reasons.content:
-            widgets.reasons.content = self._reasons.content
         if state is None:
             widgets.status.content, widgets.prompt_table.content, widgets.histograms.content = NO_FIELD_MESSAGE, "", ""
             return
         widgets.show_state(state)
-        visible = visible_mask(self._host[0].splat_parameters().parameters["opacities"])
+        visible = visible_mask(self._host.splat_parameters().parameters["opacities"])
         widgets.status.content = status_mdx(state, self._message, busy, visible)
         widgets.prompt_table.content = prompt_table(state)
 

@@ -212,18 +212,38 @@ _MODIFIERS = (None, "shift", "alt")
 """Modifier keys with which a click is handled."""
 _MAX_HOLDUP = 0.5
 """Maximum number of seconds that a message waits for the one before it."""
-_SCRIPT = """
+KEYS_SCRIPT = """
 (() => {
+  if (window.normlift) return;
   const labelOf = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
-  const press = (text) => {
-    const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
-    if (found && !found.disabled) found.click();
-  };
   const rowOf = (text) => {
     let row = labelOf(text);
     while (row && !row.querySelector("input")) row = row.parentElement;
     return row;
   };
+  const press = (text) => {
+    const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
+    if (found && !found.disabled) found.click();
+  };
+  window.normlift = {rowOf, press};
+  const style = document.createElement("style");
+  style.textContent = `.mantine-Button-root[data-variant="outline"] { padding-inline: 2px; }
+    .mantine-Flex-root > div:has(label:empty) { display: none; }`;
+  document.head.append(style);
+  const asks = (event) => ["Prompts", "Negatives"].some((text) => {
+    const row = rowOf(text);
+    return row && row.querySelector("input") === event.target;
+  });
+  addEventListener("keydown", (event) => {
+    if (event.key === "Enter" && asks(event)) setTimeout(() => press("Ask"), 150);
+    if (event.key === "Escape") press("Cancel");
+  });
+})();
+"""
+"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
+_SCRIPT = """
+(() => {
+  const {rowOf, press} = window.normlift;
   const send = (held = "") => {
     const row = rowOf("SESSION");
     if (!row) return setTimeout(send, 50);
@@ -241,12 +261,10 @@ _SCRIPT = """
     box.dispatchEvent(new Event("input", {bubbles: true}));
   };
   send();
-  if (window.normlift) return;
-  window.normlift = true;
+  if (window.normlift.send) return;
+  window.normlift.send = send;
   const style = document.createElement("style");
-  style.textContent = `.mantine-Button-root[data-variant="outline"] { padding-inline: 2px; }
-    .mantine-Flex-root > div:has(label:empty) { display: none; }
-    .mantine-ActionIcon-root:has(.tabler-icon-share) { display: none; }`;
+  style.textContent = ".mantine-ActionIcon-root:has(.tabler-icon-share) { display: none; }";
   document.head.append(style);
   const typing = (event) => ["INPUT", "TEXTAREA"].includes(event.target.tagName);
   const actions = {Shift: "Add", Alt: "Take away"};
@@ -256,10 +274,6 @@ _SCRIPT = """
     setTimeout(() => { if (held === key) send(actions[key] || ""); }, wait);
   };
   addEventListener("keydown", (event) => {
-    const row = rowOf("Prompts");
-    const box = row && row.querySelector("input");
-    if (event.key === "Enter" && event.target === box) setTimeout(() => press("Ask"), 150);
-    if (event.key === "Escape") press("Cancel");
     if (typing(event) || event.repeat) return;
     if (event.key in actions) hold(event.key, 0);
     if (event.key === "Alt") event.preventDefault();
@@ -430,7 +444,7 @@ class BrowserPage:
 
     def listen(self) -> None:
         """Run the script that handles keys; it writes the token, link and held key into the box `SESSION_LABEL`."""
-        self._run(_SCRIPT)
+        self._run(KEYS_SCRIPT + _SCRIPT)
 
     def become(self, token: str) -> None:
         """Set the session token of the page."""

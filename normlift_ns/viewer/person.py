@@ -7,34 +7,29 @@ import secrets
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer
 from normlift_ns.rasterization.rasterize import render
-from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
+from normlift_ns.rendering.colors import clip_text
 from normlift_ns.session import actions
-from normlift_ns.session.actions import (
-    MAX_THRESHOLD,
-    MIN_THRESHOLD,
-    PromptDiagnostics,
-    carry_threshold,
-    diagnose_prompts,
-)
+from normlift_ns.session.actions import MAX_THRESHOLD, MIN_THRESHOLD, PromptDiagnostics, diagnose_prompts
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects, unoccluded_viewpoint
-from normlift_ns.session.prompts import build_query, click_name, encode_prompts, is_click, join_prompts
+from normlift_ns.session.prompts import is_click, join_prompts
 from normlift_ns.session.selection import SelectionBox
-from normlift_ns.session.state import History, JobQueue, RequestToken, RequestTokens, State
+from normlift_ns.session.state import History, JobQueue, RequestToken, State
 from normlift_ns.viewer.adapter import SESSION_LABEL, BrowserPage, add_button_group
+from normlift_ns.viewer.controller import Controller
 from normlift_ns.viewer.shared import (
     LOOKS,
     Link,
@@ -53,13 +48,17 @@ from normlift_ns.viewer.shared import (
     write_link,
 )
 from normlift_ns.viewer.widgets import (
+    ALL_PROMPTS,
     MAX_OBJECT_ROWS,
-    OBJECT_ACTIONS,
+    SLIDERS,
+    Act,
+    Action,
+    ActionWidgets,
     Explanation,
     ObjectRows,
-    color_swatch,
     diagnostics_mdx,
     escape_mdx,
+    prompt_rows,
 )
 
 _FIELDS_OF_VIEW = (0.3, 1.9)
@@ -291,131 +290,71 @@ class Painter:
 # The widgets of a page, and how they look for a state. They know no field, and what they do is `person.Person`'s.
 
 
-ALL = "all prompts"
-
-
-class Panel:
+class Panel(ActionWidgets):
     """The widgets of one page.
 
     Args:
         gui: viser's `GuiApi` of the page.
-        act: called with the name of what was pressed or changed, and its value, in a thread of its own.
+        act: called with what a person does; returns at once.
         readonly: without what writes to the disk of the server.
     """
 
-    def __init__(self, gui: Any, act: Callable[[str, Any], None], facts: str, *, readonly: bool) -> None:
-        self._gui, self._act = gui, act
-        self._values: dict[str, Any] = {}
+    def __init__(self, gui: Any, act: Act, facts: str, *, readonly: bool) -> None:
+        super().__init__(gui, act, nullcontext())
         self.session = gui.add_text(SESSION_LABEL, "")
-        self.session.on_update(lambda _: act("hello", self.session.value))
+        self.session.on_update(lambda event: act(Action.GREET, self.session.value, event.client))
         self.prompts = gui.add_text("Prompts", "", hint="What to look for, separated by commas. Enter asks.")
-        self.ask = self._button("Ask")
-        self.cancel = self._button("Cancel", "Escape. Ends a question that runs, and clicks that wait.", "gray")
+        self.ask = self._button(Action.ASK)
+        self.cancel = self._gray(Action.CANCEL, "Escape. Ends a question that runs, and clicks that wait.")
         self.status = gui.add_markdown("Type what to look for, then press Ask or Enter.")
-        self._group("History", ("Undo", "Redo", "Clear"))
-        self.shown = self._input(
-            "shown", gui.add_dropdown("Prompt", (ALL,), initial_value=ALL, hint="Whose selection counts.")
-        )
-        self.threshold = self._slider(
-            "threshold", "Threshold", MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5, "Relevancy above which to select."
-        )
-        self._button("Suggested", "The threshold that the histogram suggests; it is the dashed line in it.", "gray")
+        self._group("History", (Action.UNDO, Action.REDO, Action.CLEAR))
+        choice = gui.add_dropdown("Prompt", (ALL_PROMPTS,), initial_value=ALL_PROMPTS, hint="Whose selection counts.")
+        self.shown = self._input(Action.SHOW_PROMPT, choice)
+        numbers = (MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5)
+        self.threshold = self._slider(Action.THRESHOLD, numbers, "Relevancy above which to select.")
+        self._gray(Action.SUGGESTED, "The threshold that the histogram suggests; it is the dashed line in it.")
         self.histograms = gui.add_markdown("")
         self._nearest: list[Any] = []
-        self.sure = self._slider(
-            "min_reliability", "Reliability", 0.0, 1.0, 0.01, 0.0, "Minimum R of what is selected."
-        )
-        self.look = self._input("look", gui.add_dropdown("Draw", LOOKS, initial_value=LOOKS[0]))
+        numbers = (0.0, 1.0, 0.01, 0.0)
+        self.reliability = self._slider(Action.RELIABILITY, numbers, "Minimum R of what is selected.", "Reliability")
+        self.look = self._input(Action.COLORS, gui.add_dropdown("Draw", LOOKS, initial_value=LOOKS[0]))
         with gui.add_folder("Click in the scene"):
-            self._button("Select", "Selects the connected object that you click.", "gray")
-            self._button("Add", "Adds objects that you click. Or hold Shift and click.", "gray")
-            self._button("Take away", "Takes away objects that you click. Or hold Alt and click.", "gray")
-            self._button("More like this", "Asks for everything like what you click.", "gray")
-            self.steps = self._slider("resize", "Grow", -10, 10, 1, 0, "Grows or shrinks the selection, part to whole.")
+            self._gray(Action.SELECT, "Selects the connected object that you click.")
+            self._gray(Action.ADD, "Adds objects that you click. Or hold Shift and click.")
+            self._gray(Action.REMOVE, "Takes away objects that you click. Or hold Alt and click.", "Take away")
+            self._gray(Action.LIKE, "Asks for everything like what you click.")
+            self.steps = self._slider(Action.GROW, (-10, 10, 1, 0), "Grows or shrinks the selection, part to whole.")
         with gui.add_folder("Hide"):
-            self._group("Selection", ("Hide", "Only", "Unhide"))
-            self.poor = gui.add_button("Leave out what is poorly evidenced", visible=False)
-            self.poor.on_click(lambda _: act("leave out", None))
-            self._button("Select likely floaters", "Gaussians that belong to no surface. Look, then hide them.", "gray")
+            buttons = (Action.HIDE, Action.SHOW_ONLY, Action.SHOW_ALL)
+            self._group("Selection", buttons, ("Hide", "Only", "Unhide"))
+            self.remove_weak = self._button(Action.REMOVE_WEAK, "Leave out what is poorly evidenced")
+            self.remove_weak.visible = False
+            self._gray(Action.SELECT_FLOATERS, "Gaussians that belong to no surface. Look, then hide them.")
         with gui.add_folder("Why"):
-            self.why = self._button("Why?", "Shows the photographs that voted for the selection.", "gray")
+            self.explain_button = self._gray(Action.EXPLAIN, "Shows the photographs that voted for the selection.")
             self.reasons = gui.add_markdown("")
         with gui.add_folder("Box", expand_by_default=False):
-            self._group("Place", ("Around", "None"))
-            self._group("Keep", ("Inside", "Outside"))
+            for label, names in (("Place", ("Around", "None")), ("Keep", ("Inside", "Outside"))):
+                add_button_group(gui, label, names, lambda name, event: act(Action.BOX, name, event.client))
             self.centre = gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=0.01)
             self.size = gui.add_vector3("Size", (1.0, 1.0, 1.0), min=(0.0, 0.0, 0.0), step=0.01)
-        self.rows = ObjectRows(gui, lambda deed, row, _: act(deed, row))
+        self.rows = ObjectRows(gui, act)
         with gui.add_folder("Keep"):
-            self._button("Download selection", "A PLY file of the selected Gaussians.", "gray")
+            self._gray(Action.DOWNLOAD, "A PLY file of the selected Gaussians.")
             if not readonly:
-                self._button("Save prompts in run", "Beside those that the run stores already.", "gray")
-            self._button("Link", "Puts question and camera into the address of this page.", "gray")
+                self._gray(Action.SAVE, "Beside those that the run stores already.")
+            self._gray(Action.LINK, "Puts question and camera into the address of this page.")
         gui.add_markdown(escape_mdx(facts))
 
-    def _button(self, label: str, hint: str | None = None, color: Any = None) -> Any:
-        button = self._gui.add_button(label, hint=hint, color=color)
-        button.on_click(lambda _: self._act(label, None))
-        return button
+    def _gray(self, action: Action, hint: str, label: str = "") -> Any:
+        return self._button(action, label, hint=hint, color="gray")
 
-    def _group(self, label: str, options: Sequence[str]) -> None:
-        add_button_group(self._gui, label, options, lambda name, _: self._act(name, None))
-
-    def _slider(self, name: str, label: str, low: Any, high: Any, step: Any, value: Any, hint: str) -> Any:
-        return self._input(name, self._gui.add_slider(label, low, high, step, value, hint=hint))
-
-    def _input(self, name: str, widget: Any) -> Any:
-        """A widget whose changes are told, but for those that the program made."""
-        self._values[name] = widget.value
-
-        def changed(_: Any) -> None:
-            if widget.value != self._values[name]:
-                self._values[name] = widget.value
-                self._act(name, widget.value)
-
-        widget.on_update(changed)
-        return widget
-
-    def set(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling."""
-        if widget.value != value:
-            self._values[name] = value
-            widget.value = value
-
-    def forget(self) -> None:
-        """Sets back what the next question would take over."""
-        self.set("min_reliability", self.sure, 0.0)
-
-    def follow(self, state: State) -> None:
+    def show_state(self, state: State) -> None:
         """Shows a state in all widgets but the prompts, which belong to the person who types."""
-        texts = () if state.answer is None else state.answer.texts
-        options = (ALL, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
-        if tuple(self.shown.options) != options:
-            self._values["shown"] = ALL
-            self.shown.options = options
-        self.set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
-        if state.query is not None:
-            self.set("threshold", self.threshold, min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold)))
-            self.set("min_reliability", self.sure, state.query.min_reliability)
-        self.set("look", self.look, state.color_mode)
-        self.set("resize", self.steps, state.grow_steps)
+        super().show_state(state)
+        self._set(Action.COLORS, self.look, state.color_mode)
         if state.box is not None:
             self.centre.value, self.size.value = state.box.center, state.box.size
-        self.poor.visible = state.warning != ""
-
-    def place(self, value: str) -> int | None:
-        """The prompt that a choice of the dropdown names."""
-        return None if value == ALL else int(value.partition(":")[0]) - 1
-
-    def say(self, state: State, message: str, busy: str, drawable: int) -> None:
-        """Shows what is selected, and a message."""
-        self.status.content = status(state, message, busy, drawable)
-
-    def explain(self, reasons: str, *, busy: bool) -> None:
-        """Shows why something is selected, as `reasons.Reasons` has it."""
-        self.why.disabled = busy
-        if self.reasons.content != reasons:
-            self.reasons.content = reasons
 
     def judge(self, histograms: str, found: Sequence[PromptDiagnostics]) -> None:
         """Shows histograms as MDX, and a button to go to the nearest match of what is probably not in the scene."""
@@ -427,7 +366,7 @@ class Panel:
             label = f"Go to nearest: {clip_text(one.text, 20)}"
             place = self.histograms.order + (i + 1) / 100
             button = self._gui.add_button(label, color="gray", order=place)
-            button.on_click(lambda _, one=one: self._act("nearest", one.nearest_position))
+            button.on_click(lambda _, one=one: self._act(Action.GO_TO, one.nearest_position, None))
             self._nearest.append(button)
 
     def box(self, name: str, state: State) -> SelectionBox | None:
@@ -462,46 +401,20 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
     why = "" if drawable == count else f" ({drawable:,} of them are drawn: others are too faint, hidden or left out)"
     lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}{why}")
     if state.answer is not None:
-        lines.append("\n".join(_rows(state, state.answer)))
+        counts = zip(state.answer.texts, state.answer.selected.sum(dim=0).tolist())
+        rows = prompt_rows(state.prompts, ["found"], {text: [f"{count:,}"] for text, count in counts}, max_rows=20)
+        lines.append("\n".join(rows))
     if state.warning:
         lines.append(escape_mdx(f"{state.warning} Below R = {WEAK_RELIABILITY:g} few views saw it, or they disagree."))
     return "\n\n".join([*lines, *filter(None, [legend(state)])])
 
 
-def _rows(state: State, answer: Answer) -> list[str]:
-    colours: Mapping[str, Any] = dict(zip(answer.texts, prompt_rgb_tuples(answer.texts)))
-    counts = dict(zip(answer.texts, answer.selected.sum(dim=0).tolist()))
-    lines = ["| | prompt | found |", "|---|---|---|"]
-    for prompt in state.prompts[:20]:
-        name = escape_mdx(clip_text(prompt.text, 40))
-        if prompt.text in counts and not prompt.error:
-            lines.append(f"| {color_swatch(colours[prompt.text])} | {name} | {counts[prompt.text]:,} |")
-        else:
-            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.error, 120))} |")
-    if len(state.prompts) > 20:
-        lines.append(f"| | and {len(state.prompts) - 20} more | |")
-    return lines
-
-
 # One person before one page: what each widget does to their history, and what the page shows of it.
 
 
-LIKE = "More like this"
-_MODES = {"Select": "select", "Add": "add", "Take away": "take away", LIKE: "like"}
-_ONCE = ("Select", LIKE)
-_SLIDERS = {
-    "threshold": actions.set_threshold,
-    "min_reliability": actions.set_min_reliability,
-    "resize": actions.resize,
-}
-_DEEDS = {
-    "Hide": actions.hide,
-    "Only": actions.show_only,
-    "Unhide": actions.show_all,
-    "Suggested": actions.use_suggested_threshold,
-    "Clear": actions.clear,
-    "leave out": actions.remove_weak,
-}
+_ONCE = (Action.SELECT, Action.LIKE)
+_HELD = {"": None, "Add": Action.ADD, "Take away": Action.REMOVE}
+"""What the page says of a key that is held down."""
 _PATIENCE = 3.0
 """Seconds to wait for the page's greeting before the scene is drawn without."""
 _AROUND = 2.0
@@ -509,25 +422,36 @@ _AROUND = 2.0
 _BLIND = "This browser has no WebGL 2 to draw the scene with; the pictures come from the server, and are slower."
 
 
-class Person:
+class Person(Controller):
     """One page, with the memory of the person before it.
 
     Args:
         remember: the memory for a token and the number of a page, and the token that the page has from now on.
     """
 
+    reading_message = "Reading the prompts. The first time, the text encoder is loaded."
+    floaters_message = f"{actions.FLOATERS_HINT} Faint ones are drawn more opaque here."
+    _session: Memory
+    _widgets: Panel
+
     def __init__(self, run: Run, page: BrowserPage, remember: Callable[[str, int], tuple[Memory, str]]) -> None:
-        self._run, self._page, self._remember = run, page, remember
-        self._memory = Memory(History.of(State(run.space), lean=State.without_caches))
-        self._lock, self._turns, self._eye = threading.RLock(), RequestTokens(), Eye(page, run.records)
-        self._reasons = Explanation(run.opened_votes)
-        self._deeds, self._asking, self._explaining, self._resting = JobQueue(), JobQueue(), JobQueue(), JobQueue()
-        self._message, self._mode, self._greeted = "", "", False
-        self._held: str | None = None
-        told = (lambda: self.state, self._drawn, self._rested, lambda error: self._tell(describe_error(error)[0]))
-        self._painter = Painter(page, run.records, *told)
+        super().__init__(Memory(History.of(State(run.space), lean=State.without_caches)), Explanation(run.opened_votes))
+        self._shared, self._page, self._remember = run, page, remember
+        self._eye = Eye(page, run.records)
+        self._deeds, self._resting = JobQueue(), JobQueue()
+        self._slow = {Action.ASK: JobQueue(), Action.EXPLAIN: JobQueue()}
+        self._mode: Action | None = None
+        self._greeted = False
+        self._held: tuple[Action | None] | None = None
+        self._handlers |= {
+            Action.GREET: lambda text, _: self._greet(text),
+            Action.BOX: lambda name, _: self._do(actions.set_box(self.state, self._widgets.box(name, self.state))),
+            Action.COLORS: lambda look, _: self._do(actions.set_color_mode(self.state, look)),
+            Action.LINK: lambda *_: self._link(),
+        }
+        self._painter = Painter(page, run.records, lambda: self.state, self._drawn, self._rested, self._show_error)
         with page.together():
-            self._panel = Panel(page.gui, self._act, run.records.facts, readonly=run.readonly)
+            self._widgets = Panel(page.gui, self.act, run.records.facts, readonly=run.readonly)
         self._eye.begin(run.scene.train.cameras)
         page.listen()
         waiting = threading.Timer(_PATIENCE, self._late)
@@ -537,262 +461,176 @@ class Person:
     @property
     def state(self) -> State:
         """What is shown now."""
-        return self._memory.history.now
+        return self.history.now
 
     def leave(self) -> None:
         """The page is gone."""
         with suppress(AssertionError):  # viser's, where no camera ever came
-            self._memory.view = self._eye.view
-        self._memory.line, self._memory.page = self._panel.prompts.value, None
-        self._turns.cancel()
-        self._reasons.clear()
+            self._session.view = self._eye.view
+        self._session.line, self._session.page = self._widgets.prompts.value, None
+        self._discard()
         self._painter.end()
-        for worker in (self._deeds, self._asking, self._explaining, self._resting):
+        for worker in (self._deeds, self._resting, *self._slow.values()):
             worker.close()
 
-    def _act(self, name: str, value: Any) -> None:
+    def act(self, action: Action, value: Any = None, client: Any = None) -> None:
         """What a widget does, after what was pressed before; returns at once."""
-        if name == "Cancel":  # what waits is not wanted any more
+        if action is Action.CANCEL:  # what waits is not wanted any more
             self._deeds.clear()
-            self._turns.cancel()
-            self._reasons.clear()
-        key = name if name in _SLIDERS else ""
-        self._deeds.submit(lambda: self._told(lambda: self._deed(name, value)), key)
+            self._discard()
+        self._deeds.submit(partial(super().act, action, value, client), action.name if action in SLIDERS else "")
 
-    def _told(self, work: Callable[[], None]) -> None:
-        """Does something; whatever goes wrong is told in the panel."""
-        try:
-            work()
-        except Exception as error:  # whatever it is: nothing may stop the viewer
-            self._tell(describe_error(error)[0])
+    def _do(self, state: State, message: str = "", *, key: str | None = None, answered: bool = False) -> None:
+        super()._do(coloured(state) if answered else state, message, key=key, answered=answered)
 
-    def _deed(self, name: str, value: Any) -> None:
-        if name == "hello":
-            self._greet(value)
-        elif name == "Ask":
-            self._ask()
-        elif name == "Select likely floaters":
-            self._work("Looking for floaters.", self._select_floaters)
-        elif name == "Why?":
-            self._explain()
-        else:
-            with self._lock:
-                self._do(name, value)
+    def _cancel(self) -> None:
+        self._held = None
+        self._arm(None)
+        super()._cancel()
 
-    def _do(self, name: str, value: Any) -> None:
-        """What takes no time, and needs nothing but the state."""
-        now, history = self.state, self._memory.history
-        if name in _SLIDERS:
-            self._show(history.do(_SLIDERS[name](now, value), key=name))
-        elif name in _DEEDS:
-            self._show(history.do(_DEEDS[name](now)))
-            if name == "Clear":
-                self._panel.forget()
-        elif name in ("Undo", "Redo"):
-            self._show(history.undo() if name == "Undo" else history.redo())
-        elif name == "shown":
-            self._show(history.do(actions.show_prompt(now, self._panel.place(value))))
-        elif name == "look":
-            self._show(history.do(actions.set_color_mode(now, value)))
-        elif name in ("Around", "Inside", "Outside", "None"):
-            self._show(history.do(actions.set_box(now, self._panel.box(name, now))))
-        elif name in _MODES:
-            self._arm(name)
-        elif name == "nearest":
-            self._go_to(LookAtTarget(value, _AROUND / self._run.records.units.factor))
-        elif name in OBJECT_ACTIONS:
-            self._with_object(name, value)
-        elif name == "Cancel":
-            self._held = None
-            self._arm("")
-            self._panel.ask.disabled = False
-            self._tell("")
-        elif name == "Download selection":
-            self._download(now.selection, now.name)
-        elif name == "Save prompts in run":
-            self._tell(self._run.save(now.query))
-        elif name == "Link":
-            self._memory.link = write_link(link_of(now, self._memory.clicks, self._eye.view))
-            self._page.address(self._memory.link)
-            self._tell("The address of this page holds question and camera now; copy it.")
+    def _clear(self) -> None:
+        self._do(actions.clear(self.state))
+        self._widgets.reset_reliability()
 
-    def _ask(self) -> None:
-        """Asks what the box of prompts says."""
-        line = self._panel.prompts.value
-        what = "Reading the prompts. The first time, the text encoder is loaded."
-        self._work(what, lambda turn: self._answer(turn, line))
+    def _link(self) -> None:
+        self._session.link = write_link(link_of(self.state, self._session.clicks, self._eye.view))
+        self._page.address(self._session.link)
+        self.show_message("The address of this page holds question and camera now; copy it.")
 
-    def _work(self, what: str, work: Callable[[RequestToken], None]) -> None:
-        """Does what takes a while in a thread of its own, the last of what waits; the button to ask rests meanwhile."""
-        turn = self._turns.start(what)
-        self._panel.ask.disabled = True
-        self._tell("")
-        self._asking.submit(lambda: self._told(lambda: self._take(turn, work)), "the last")
+    def _start(self, job: Callable[[], None], kind: Action) -> None:
+        self._slow[kind].submit(job, "the last")
 
-    def _take(self, turn: RequestToken, work: Callable[[RequestToken], None]) -> None:
-        try:
-            if self._turns.is_current(turn):
-                work(turn)
-        finally:
-            if self._turns.finish(turn):  # it failed: an answer finishes its turn itself
-                self._say()
-            self._panel.ask.disabled = self._turns.busy != ""
+    def _finish(self, token: RequestToken, task: Callable[[RequestToken], None]) -> None:
+        super()._finish(token, task)
+        self._widgets.ask.disabled = self._turns.busy != ""
 
-    def _answer(self, turn: RequestToken, line: str, **how: Any) -> None:
-        """Shows the answer to a line of prompts, unless it comes too late. Texts are read without the lock."""
+    def _encode(self, texts: Sequence[str]) -> Any:
+        return self._shared.read(texts)
+
+    def _known_vectors(self) -> dict[str, Any]:
         with self._lock:
-            before, clicks, sure = self.state.query, dict(self._memory.clicks), self._panel.sure.value
-        prompts = encode_prompts(line, self._run.read, self._run.known(clicks))
-        how = {"min_reliability": min(1.0, max(0.0, sure)) if before is None else before.min_reliability, **how}
-        prompts, question = build_query(self._run.space.field, prompts, self._run.read, **how)
-        with self._lock:
-            if not self._turns.finish(turn):
-                return
-            self._memory.line = line
-            question = question if "threshold" in how else carry_threshold(self.state, question)
-            self._show(self._memory.history.do(coloured(actions.ask(self.state, prompts, question))))
+            clicks = dict(self._session.clicks)
+        return self._shared.known(clicks)
 
-    def _select_floaters(self, turn: RequestToken) -> None:
-        """Selects what likely floats, to look at and to hide."""
-        with self._run.reading:
-            found = self._run.floaters
-        with self._lock:
-            if self._turns.finish(turn):
-                state = coloured(actions.select_floaters(self.state, found))
-                self._show(
-                    self._memory.history.do(state), f"{actions.FLOATERS_HINT} Faint ones are drawn more opaque here."
-                )
+    def _query_settings(self) -> dict[str, Any]:
+        before, sure = self.state.query, self._widgets.reliability.value
+        return {"min_reliability": min(1.0, max(0.0, sure)) if before is None else before.min_reliability}
 
-    def _explain(self) -> None:
-        """Shows the photographs that voted for the selection."""
-        turn = self._reasons.start(state := self.state)
-        self._tell("")
+    def _find_floaters(self) -> Bool[torch.Tensor, " n"]:
+        with self._shared.reading:
+            return self._shared.floaters
 
-        def find() -> None:
-            try:
-                self._reasons.compute(turn, state)
-            finally:
-                self._say()
+    def _wait_for_click(self, action: Action, value: Any, client: Any) -> None:
+        self._arm(action)
 
-        self._explaining.submit(lambda: self._told(find), "the last")
+    def _arm(self, action: Action | None) -> None:
+        """What the next click on the scene does; None: nothing."""
+        self._mode = action
+        self._page.on_click(None if action is None else self._clicked)
+        if action is not None:
+            once = action in _ONCE
+            self.show_message("Click on an object." if once else "Click on objects. Cancel or Escape ends it.")
 
-    def _arm(self, name: str) -> None:
-        """What the next click on the scene does; an empty name: nothing."""
-        self._mode = name
-        self._page.on_click(self._clicked if name else None)
-        if name:
-            self._tell("Click on an object." if name in _ONCE else "Click on objects. Cancel or Escape ends it.")
-
-    def _hold(self, name: str) -> None:
+    def _hold(self, action: Action | None) -> None:
         """A key is held down that clicks go by, or let go: then they do what they did before."""
         with self._lock:
-            if name:
-                self._held = self._mode if self._held is None else self._held
-                self._arm(name)
+            if action is not None:
+                self._held = (self._mode,) if self._held is None else self._held
+                self._arm(action)
             elif self._held is not None:
-                mode, self._held = self._held, None
+                (mode,), self._held = self._held, None
                 self._arm(mode)
-                if not mode and self._message.startswith("Click on"):
-                    self._tell("")
+                if mode is None and self._message.startswith("Click on"):
+                    self.show_message("")
 
     def _clicked(self, origin: Sequence[float], direction: Sequence[float]) -> None:
         def hit() -> None:
-            weights = self._run.weights(origin, direction)
+            weights = self._shared.weights(origin, direction)
             with self._lock:
-                self._hit(self._mode, weights)
+                mode = self._mode
+                if mode in _ONCE:
+                    self._arm(None)
+                if mode is Action.LIKE:
+                    self._ask_click(actions.pick_gaussian(self.state, weights), self._shared.stored())
+                elif mode is not None:
+                    self._click(mode, weights, "" if mode in _ONCE else "Click on more objects, or Cancel.")
 
-        self._deeds.submit(lambda: self._told(hit))
+        self._deeds.submit(lambda: self._guard(hit))
 
-    def _hit(self, name: str, weights: torch.Tensor) -> None:
-        if name in _ONCE:
-            self._arm("")
-        if name == LIKE:
-            gaussian, text = actions.pick_gaussian(self.state, weights), click_name(1 + len(self._memory.clicks))
-            self._memory.clicks[text] = gaussian
-            self._panel.prompts.value = text
-            self._act("Ask", None)
-        elif name:
-            state = coloured(actions.click(self.state, weights, _MODES[name]))  # pyright: ignore[reportArgumentType]
-            self._show(self._memory.history.do(state), "" if name in _ONCE else "Click on more objects, or Cancel.")
-
-    def _with_object(self, deed: str, row: ObjectRow) -> None:
-        if deed == "go to":
-            self._go_to(row)
-        elif deed == "export":
-            self._download(row.mask, row.name)
-        else:
-            act = actions.show_only if deed == "only" else actions.hide
-            self._show(self._memory.history.do(act(self.state, row.mask)))
-
-    def _go_to(self, what: ObjectRow | LookAtTarget) -> None:
-        eye, gaussians = self._eye.view, self._run.scene.gaussians
+    def _move_camera(self, target: ObjectRow | tuple[float, float, float], client: Any) -> None:
+        eye, gaussians, around = (
+            self._eye.view,
+            self._shared.scene.gaussians,
+            _AROUND / self._shared.records.units.factor,
+        )
+        what = LookAtTarget(target, around) if isinstance(target, tuple) else target
         place = unoccluded_viewpoint(what, gaussians, self.state.drawn, eye.position, eye.up, eye.fov)
         self._eye.look(place, what.center)
 
-    def _download(self, mask: torch.Tensor, name: str) -> None:
-        file, content, message = self._run.exported(mask, name, self.state.answer)
+    def _download(self, mask: torch.Tensor, name: str, client: Any) -> None:
+        file, content, message = self._shared.exported(mask, name, self.state)
         self._page.download(file, content)
-        self._tell(message)
+        self.show_message(message)
+
+    def _save(self) -> None:
+        self.show_message(self._shared.save(self.state.query))
 
     def _greet(self, text: str) -> None:
         """The page has told its token and its link: what was lost with the connection comes back."""
         hello = read_hello(text)
         with self._lock:
             if self._greeted:
-                return self._hold(hello.held)
+                return self._hold(_HELD[hello.held])
             self._greeted = True
-            self._memory, token = self._remember(hello.token, self._page.number)
+            self._session, token = self._remember(hello.token, self._page.number)
             if token != hello.token:
                 self._page.become(token)
-            memory = self._memory
-            fresh = memory.view is None and len(memory.history.states) == 1
-            typed = self._panel.prompts.value  # before the server has read the greeting: it stays
+            memory = self._session
+            fresh = memory.view is None and len(self.history.states) == 1
+            typed = self._widgets.prompts.value  # before the server has read the greeting: it stays
             if memory.line and not typed:
-                self._panel.prompts.value = memory.line
+                self._set_prompts(memory.line)
             if memory.view is not None:
                 self._eye.go(memory.view)
             if not hello.webgl:
-                self._painter.stills = Stills(self._run, self._page, self._eye, lambda: self.state, self._tell)
+                shows = (self._page, self._eye, lambda: self.state, self.show_message)
+                self._painter.stills = Stills(self._shared, *shows)
             note = "" if hello.webgl else _BLIND
-            self._show(memory.history, note)
+            self._show(self.history, note)
         link = read_link(hello.link) if hello.link != memory.link else None
         memory.link = hello.link
         if link is not None:
             self._follow(link)
-        elif fresh and not typed and len(texts := list(self._run.stored())) > 0:
-            self._panel.prompts.value = join_prompts(texts)
-            self._tell(f"The run stores these prompts; press Ask. {note}".rstrip())
+        elif fresh and not typed and len(texts := list(self._shared.stored())) > 0:
+            self._widgets.prompts.value = join_prompts(texts)
+            self.show_message(f"The run stores these prompts; press Ask. {note}".rstrip())
 
     def _follow(self, link: Link) -> None:
         """Asks the question of a link, from its camera."""
-        self._memory.clicks.update({name: n for name, n in link.clicks.items() if is_click(name)})
+        self._session.clicks.update({name: n for name, n in link.clicks.items() if is_click(name)})
         if link.view is not None and link.view.looks:
             self._eye.go(link.view)
         if link.look in get_args(Look):
-            self._show(self._memory.history.do(actions.set_color_mode(self.state, link.look)))
+            self._do(actions.set_color_mode(self.state, link.look))
         if not link.prompts:
             return
-        self._panel.prompts.value = link.prompts
+        self._set_prompts(link.prompts)
         how = {"min_reliability": link.min_reliability}
         how |= {} if link.threshold is None else {"threshold": link.threshold}
-        self._work("Reading the prompts of the link.", lambda turn: self._answer(turn, link.prompts, **how))
+        self._run("Reading the prompts of the link.", partial(self._answer, line=link.prompts, **how))
 
-    def _show(self, history: History[State], message: str = "") -> None:
-        if history is not self._memory.history or message:  # else nothing is new, and what was told stays
+    def _show(self, history: History[State], message: str = "", *, answered: bool = False) -> None:
+        if history is not self.history or message:  # else nothing is new, and what was told stays
             self._message = message
-        self._memory.history = history
+        self._session.history = history
         self._painter.changed()
 
-    def _tell(self, message: str) -> None:
-        with self._lock:
-            self._message = message
-            self._say()
-
-    def _say(self) -> None:
+    def _update_widgets(self) -> None:
         state = self.state
-        drawn = (state.selection & state.drawn).cpu().numpy()[self._run.records.rows]
-        self._panel.say(state, self._message, self._turns.busy or self._reasons.busy, int(drawn.sum()))
-        self._panel.explain(self._reasons.content, busy=self._reasons.busy != "")
+        drawn = (state.selection & state.drawn).cpu().numpy()[self._shared.records.rows]
+        self._widgets.show_busy(self._reasons, can_ask=self._turns.busy == "")
+        busy = self._turns.busy or self._reasons.busy
+        self._widgets.status.content = status(state, self._message, busy, int(drawn.sum()))
 
     def _late(self) -> None:
         """Draws also where the page never told its token."""
@@ -804,17 +642,17 @@ class Person:
         with self._lock:
             if state is self.state:
                 self._reasons.update(state)
-                self._panel.follow(state)
-                self._say()
+                self._widgets.show_state(state)
+                self._update_widgets()
 
     def _rested(self, state: State) -> None:
         """Nothing has changed for a while: what takes longer follows, while the next state may be drawn already."""
 
         def follow() -> None:
-            self._panel.rows.show(list_objects(state, max_objects=MAX_OBJECT_ROWS))
-            self._panel.judge(diagnostics_mdx(state), diagnose_prompts(state))
+            self._widgets.rows.show(list_objects(state, max_objects=MAX_OBJECT_ROWS))
+            self._widgets.judge(diagnostics_mdx(state), diagnose_prompts(state))
 
-        self._resting.submit(lambda: self._told(follow), "the last")
+        self._resting.submit(lambda: self._guard(follow), "the last")
 
 
 # Everyone who looks: a page each, and what is kept for those who come back.

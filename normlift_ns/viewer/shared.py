@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
-import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,16 +23,15 @@ from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.exports import TrainedSplat, write_splat_ply
-from normlift_ns.io.atomic import safe_file_name
+from normlift_ns.exports import TrainedSplat
 from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query, load_query, save_query
+from normlift_ns.query.question import Query, load_query
 from normlift_ns.rasterization.rasterize import ray_weights
 from normlift_ns.rendering.colors import prompt_rgb_tuples
-from normlift_ns.session.prompts import join_prompts, merge_queries, prompts_of_query
+from normlift_ns.session.prompts import join_prompts, prompts_of_query
 from normlift_ns.session.selection import SelectionContext
-from normlift_ns.session.state import History, State
+from normlift_ns.session.state import State
+from normlift_ns.viewer.controller import Session, splat_bytes, store_query
 
 MOST_DRAWN = 1_000_000
 """Gaussians that a browser sorts and draws without stuttering; more cost memory of its tab."""
@@ -445,14 +443,10 @@ class Run:
         """
         if self.readonly:
             raise InputError("This page may only look; nothing is stored in the run.")
-        if question is None:
-            raise InputError("No query yet; there is nothing to save.")
-        whole = merge_queries(load_query(self.folder / FIELD_FOLDER), question)
-        save_query(self.folder / FIELD_FOLDER, whole)
-        stored = "one prompt" if len(whole.texts) == 1 else f"{len(whole.texts)} prompts"
+        stored = store_query(self.folder / FIELD_FOLDER, question)
         return f"The run stores {stored} now, for ns-render and ns-viewer to draw."
 
-    def exported(self, mask: Bool[torch.Tensor, " n"], name: str, answer: Answer | None) -> tuple[str, bytes, str]:
+    def exported(self, mask: Bool[torch.Tensor, " n"], name: str, state: State) -> tuple[str, bytes, str]:
         """Some Gaussians as a PLY file: its name, its content, and a message.
 
         Raises:
@@ -460,24 +454,16 @@ class Run:
         """
         if not bool(mask.any()):
             raise InputError("Nothing is selected; there is nothing to export.")
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"{safe_file_name(name)}.ply"
-            rows = write_splat_ply(path, TrainedSplat.of(self.scene), self.space.field, answer, keep=mask)
-            content = path.read_bytes()
-        faint = int(mask.sum()) - len(rows)
+        file, content, count = splat_bytes(TrainedSplat.of(self.scene), state, mask, name)
+        faint = int(mask.sum()) - count
         why = f" {faint:,} more are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
-        return path.name, content, f"{path.name} with {len(rows):,} Gaussians goes to your downloads.{why}"
+        return file, content, f"{file} with {count:,} Gaussians goes to your downloads.{why}"
 
 
 @dataclass(eq=False)
-class Memory:
-    """What is kept of a person when the connection is lost."""
+class Memory(Session):
+    """What is kept of a person when the connection is lost; a click by the Gaussian that was clicked."""
 
-    history: History[State]
-    line: str = ""
-    """What stands in the box of prompts."""
-    clicks: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Gaussians that were clicked, by the names of the prompts."""
     view: View | None = None
     link: str = ""
     """The last link that was followed or made here; it says nothing new."""

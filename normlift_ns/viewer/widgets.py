@@ -1,10 +1,12 @@
-"""Contents of panels as MDX: status, object rows, plots and explanations."""
+"""Actions of users, the widgets that send them, and contents of panels as MDX."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from enum import Enum
 from threading import Lock
 from typing import Any
 
@@ -17,11 +19,142 @@ from torch import Tensor
 from normlift_ns.analysis.explain import RecordedVotes, ViewVote
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.query.engine import Histogram
-from normlift_ns.rendering.colors import clip_text
-from normlift_ns.session.actions import diagnose_prompts
+from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
+from normlift_ns.session.actions import MAX_THRESHOLD, MIN_THRESHOLD, diagnose_prompts
 from normlift_ns.session.objects import ObjectList, ObjectRow
+from normlift_ns.session.prompts import Prompt
 from normlift_ns.session.state import RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import add_button_group
+
+
+class Action(Enum):
+    """Action of a user in a viewer. Its value is the caption of its button, if it has one."""
+
+    ASK = "Ask"
+    CANCEL = "Cancel"
+    UNDO = "Undo"
+    REDO = "Redo"
+    CLEAR = "Clear"
+    THRESHOLD = "Threshold"
+    SUGGESTED = "Suggested"
+    RELIABILITY = "Minimum reliability"
+    REFINED = "refined"
+    SHOW_PROMPT = "shown"
+    HIDE = "Hide"
+    SHOW_ONLY = "Only"
+    SHOW_ALL = "All"
+    GROW = "Grow"
+    REMOVE_WEAK = "Leave out Gaussians with weak evidence"
+    SELECT_FLOATERS = "Select likely floaters"
+    LIKE = "More like this"
+    SELECT = "Select"
+    ADD = "Add"
+    REMOVE = "Drop"
+    EXPLAIN = "Why?"
+    GO_TO = "go to"
+    DOWNLOAD = "Download selection"
+    SAVE = "Save prompts in run"
+    REPLACE = "Replace the saved prompts"
+    COLORS = "colors"
+    BOX = "box"
+    LINK = "Link"
+    GREET = "greet"
+
+
+Act = Callable[[Action, Any, Any], None]
+"""Called with an action, its value, and the browser that sent it."""
+SLIDERS = (Action.THRESHOLD, Action.RELIABILITY, Action.GROW)
+"""Actions of which successive ones are one step of the history."""
+ALL_PROMPTS = "all prompts"
+
+
+class ActionWidgets:
+    """Widgets that send actions. A viewer derives a class from it, which creates the widgets named here.
+
+    Args:
+        gui: viser's `GuiApi`.
+        act: called with the actions of the user.
+        lock: held while a change is passed to `act`. No other thread can revert it meanwhile.
+    """
+
+    prompts: Any
+    ask: Any
+    shown: Any
+    threshold: Any
+    reliability: Any
+    steps: Any
+    remove_weak: Any
+    explain_button: Any
+    reasons: Any
+
+    def __init__(self, gui: Any, act: Act, lock: AbstractContextManager[Any]) -> None:
+        self._gui, self._act, self._lock = gui, act, lock
+        self._values: dict[Action, Any] = {}
+
+    def show_state(self, state: State) -> None:
+        """Show a state in every widget except the text boxes."""
+        texts = () if state.answer is None else state.answer.texts
+        options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
+        if tuple(self.shown.options) != options:
+            self._values[Action.SHOW_PROMPT] = ALL_PROMPTS
+            self.shown.options = options
+            self._values[Action.SHOW_PROMPT] = self.shown.value  # viser keeps the choice if it is a new option
+        self._set(Action.SHOW_PROMPT, self.shown, options[0 if state.shown is None else state.shown + 1])
+        if state.query is not None:
+            threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold))
+            self._set(Action.THRESHOLD, self.threshold, threshold)
+            self._set(Action.RELIABILITY, self.reliability, state.query.min_reliability)
+        self._set(Action.GROW, self.steps, state.grow_steps)
+        self.remove_weak.visible = state.warning != ""
+
+    def show_busy(self, explanation: Explanation, *, can_ask: bool) -> None:
+        """Show an explanation, and disable the buttons of requests that cannot be made now."""
+        self.ask.disabled = not can_ask
+        self.explain_button.disabled = explanation.busy != ""
+        if self.reasons.content != explanation.content:
+            self.reasons.content = explanation.content
+
+    def reset_reliability(self) -> None:
+        """Reset the minimum reliability, which applies to the next query."""
+        self._reset(Action.RELIABILITY, self.reliability, 0.0)
+
+    def _button(self, action: Action, label: str = "", *, hint: str | None = None, color: Any = None) -> Any:
+        button = self._gui.add_button(label or action.value, hint=hint, color=color)
+        button.on_click(lambda event: self._act(action, None, event.client))
+        return button
+
+    def _group(self, label: str, buttons: Sequence[Action], captions: Sequence[str] = ()) -> None:
+        by_caption = dict(zip(captions or [action.value for action in buttons], buttons))
+        pressed = lambda caption, event: self._act(by_caption[caption], None, event.client)  # noqa: E731
+        add_button_group(self._gui, label, tuple(by_caption), pressed)
+
+    def _slider(self, action: Action, numbers: tuple[float, float, float, float], hint: str, label: str = "") -> Any:
+        """Add a slider with its lowest and highest value, step and initial value."""
+        return self._input(action, self._gui.add_slider(label or action.value, *numbers, hint=hint))
+
+    def _input(self, action: Action, widget: Any) -> Any:
+        """Pass the changes of a widget to `act`, except changes made by the program; return the widget."""
+        self._values[action] = widget.value
+
+        def changed(event: Any) -> None:
+            with self._lock:
+                if widget.value != self._values[action]:
+                    self._values[action] = widget.value
+                    self._act(action, widget.value, event.client)
+
+        widget.on_update(changed)
+        return widget
+
+    def _set(self, action: Action, widget: Any, value: Any) -> None:
+        """Set a widget without calling `act`, unless it has a user's change that `act` has not received yet."""
+        if widget.value == self._values[action]:
+            self._reset(action, widget, value)
+
+    def _reset(self, action: Action, widget: Any, value: Any) -> None:
+        """Set a widget without calling `act`, even if a user has just changed it."""
+        if widget.value != value:
+            self._values[action] = value
+            widget.value = value
 
 
 def escape_mdx(text: str) -> str:
@@ -46,7 +179,12 @@ def color_swatch(color: Sequence[float]) -> str:
 
 
 MAX_OBJECT_ROWS = 8
-OBJECT_ACTIONS = ("go to", "only", "hide", "export")
+_OBJECT_BUTTONS = {
+    "go to": Action.GO_TO,
+    "only": Action.SHOW_ONLY,
+    "hide": Action.HIDE,
+    "export": Action.DOWNLOAD,
+}
 
 
 class ObjectRows:
@@ -54,10 +192,10 @@ class ObjectRows:
 
     Args:
         gui: viser's `GuiApi`.
-        act: called with the action (one of `OBJECT_ACTIONS`), its object, and viser's event.
+        act: called with an action on an object; its value is the object.
     """
 
-    def __init__(self, gui: Any, act: Callable[[str, ObjectRow, Any], None]) -> None:
+    def __init__(self, gui: Any, act: Act) -> None:
         self._objects: tuple[ObjectRow, ...] = ()
         with gui.add_folder("Found objects"):
             self._summary = gui.add_markdown("Nothing is selected.")
@@ -78,15 +216,37 @@ class ObjectRows:
                 text.content = f"{color_swatch(row.color)} **{escape_mdx(clip_text(row.text, 40))}** {details}"
             text.visible = buttons.visible = i < len(self._objects)
 
-    def _row(self, gui: Any, i: int, act: Callable[[str, ObjectRow, Any], None]) -> tuple[Any, Any]:
-        def pressed(action: str, event: Any) -> None:
+    def _row(self, gui: Any, i: int, act: Act) -> tuple[Any, Any]:
+        def pressed(caption: str, event: Any) -> None:
             if i < len(self._objects):
-                act(action, self._objects[i], event)
+                act(_OBJECT_BUTTONS[caption], self._objects[i], event.client)
 
         text = gui.add_markdown("")
-        buttons = add_button_group(gui, "", OBJECT_ACTIONS, pressed)
+        buttons = add_button_group(gui, "", tuple(_OBJECT_BUTTONS), pressed)
         text.visible = buttons.visible = False
         return text, buttons
+
+
+def prompt_rows(
+    prompts: Sequence[Prompt], headings: Sequence[str], numbers: Mapping[str, Sequence[str]], *, max_rows: int
+) -> list[str]:
+    """Return the lines of a table with the color and the numbers of each prompt, or with its error.
+
+    Args:
+        headings: headings of the numbers.
+        numbers: numbers of the prompts that are asked, in their order.
+    """
+    colors = dict(zip(numbers, prompt_rgb_tuples(tuple(numbers))))
+    rows = [("", "prompt", *headings), ("---",) * (2 + len(headings))]
+    for prompt in prompts[:max_rows]:
+        name = escape_mdx(clip_text(prompt.text, 40))
+        if prompt.error or prompt.text not in numbers:
+            rows.append(("⚠", name, escape_mdx(clip_text(prompt.error, 120)), *[""] * (len(headings) - 1)))
+        else:
+            rows.append((color_swatch(colors[prompt.text]), name, *numbers[prompt.text]))
+    if len(prompts) > max_rows:
+        rows.append(("", f"and {len(prompts) - max_rows} more", *[""] * len(headings)))
+    return [f"| {' | '.join(row)} |" for row in rows]
 
 
 # Histograms and images as MDX, for the panels of both viewers.

@@ -34,6 +34,7 @@ from normlift_ns.session.objects import list_objects
 from normlift_ns.session.prompts import MAX_PROMPTS
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
+from normlift_ns.viewer.widgets import Action
 from tests.nerfstudio_plugin.conftest import set_up
 from tests.nerfstudio_plugin.stock_run import StockRun
 from tests.viewer.scenes import free_port, until
@@ -141,7 +142,7 @@ def adjust(panel: Any, *, refined: bool, reliability: float) -> None:
     """Sets widgets as a browser does, and waits until viser's threads have called what the panel does then."""
     widgets = panel._widgets
     widgets.refined.value, widgets.reliability.value = refined, reliability
-    until(lambda: (widgets._values["refined"], widgets._values["Minimum reliability"]) == (refined, reliability))
+    until(lambda: (widgets._values[Action.REFINED], widgets._values[Action.RELIABILITY]) == (refined, reliability))
     with widgets._lock:  # held while the panel acts
         pass
 
@@ -216,59 +217,59 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     ask(panel, "left")
     counts = []
     for threshold in (-0.2, 0.8, 0.99):
-        panel.on_action("Threshold", threshold)
+        panel.act(Action("Threshold"), threshold)
         counts.append(int(chosen(pipeline).sum()))
         assert panel.answer.question.threshold == widgets.threshold.value == threshold
         assert f"**{counts[-1]}** of 60" in said(panel)
     assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
-    panel.on_action("Undo")  # the drag of a slider is one step
+    panel.act(Action("Undo"))  # the drag of a slider is one step
     assert widgets.threshold.value == 0.5
-    panel.on_action("Redo")
+    panel.act(Action("Redo"))
     assert widgets.threshold.value == 0.99
-    panel.on_action("Threshold", 0.7)
+    panel.act(Action("Threshold"), 0.7)
     ask(panel, "right")
     assert panel.answer.question.threshold == 0.7  # stays for the same rule
     least = float(model.field.scalars.reliability.median())
-    panel.on_action("Minimum reliability", least)
+    panel.act(Action("Minimum reliability"), least)
     assert (model.field.scalars.reliability[chosen(pipeline)] >= least).all()
     ask(panel, "left")
     assert panel.answer.question.min_reliability == pytest.approx(least)
-    panel.on_action("Suggested")
+    panel.act(Action("Suggested"))
     assert widgets.threshold.value == pytest.approx(threshold_suggestion(panel.state), abs=1e-6)
-    panel.on_action("colormap", "magma")
+    panel.act(Action.COLORS, "magma")
     assert pipeline.model._display.colormap == "magma" == panel._colormap
 
-    panel.on_action("refined", False)
+    panel.act(Action("refined"), False)
     assert not panel.answer.question.refined
-    panel.on_action("Undo")
-    panel.on_action("Threshold", 0.5)
+    panel.act(Action("Undo"))
+    panel.act(Action("Threshold"), 0.5)
     whole = chosen(pipeline)
     assert widgets.refined.value and whole.any()
     widgets.steps.value = -4
     press(widgets.steps)  # viser calls what it calls for a button
     until(lambda: panel.state.grow_steps == -4)
     assert torch.equal(chosen(pipeline), panel.state.space.grow_or_shrink(whole, -4, refined=True))
-    panel.on_action("Undo")
+    panel.act(Action("Undo"))
     assert widgets.steps.value == 0
     before = outputs(pipeline)["accumulation"].sum()
-    panel.on_action("Hide")
+    panel.act(Action("Hide"))
     assert torch.equal(model._display.drawn, ~whole) and outputs(pipeline)["accumulation"].sum() < before
     assert f"{int(whole.sum())} Gaussians are hidden" in said(panel)
-    panel.on_action("All")
+    panel.act(Action("All"))
     assert model._display.drawn is None
-    panel.on_action("Only")
+    panel.act(Action("Only"))
     ask(panel, "up")
     assert torch.equal(model._display.drawn, whole)  # what is hidden stays hidden
-    panel.on_action("Undo")
+    panel.act(Action("Undo"))
     assert widgets.prompts.value == "left"
-    panel.on_action("All")
+    panel.act(Action("All"))
     ask(panel, "up")
     for name in ("Hide", "Only"):  # nothing is hidden, and no screen is blank
-        panel.on_action(name)
+        panel.act(Action(name))
         assert "Nothing is selected" in said(panel)
         assert model._display.drawn is None
     widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
-    panel.on_action("Threshold", 0.7)
+    panel.act(Action("Threshold"), 0.7)
     assert widgets.reliability.value == 0.25
     ask(panel, "left")
     press(widgets.reliability)
@@ -283,17 +284,17 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     ask(panel, "left, banana")
     question = panel.answer.question
     assert (question.min_reliability, question.rule, question.refined) == (1.0, "cosine", False)
-    panel.on_action("Minimum reliability", 0.0)
-    panel.on_action("Hide")
-    panel.on_action("More like this", client=(browser := Browser()))
-    panel.on_action("Clear")
+    panel.act(Action("Minimum reliability"), 0.0)
+    panel.act(Action("Hide"))
+    panel.act(Action("More like this"), client=(browser := Browser()))
+    panel.act(Action("Clear"))
     assert {name: getattr(widgets, name).value for name in settings} == before
     assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
     assert not chosen(pipeline).any()
-    panel.on_action("Suggested")
+    panel.act(Action("Suggested"))
     assert "threshold" in said(panel)
-    panel.on_action("Undo")
+    panel.act(Action("Undo"))
     assert panel.answer.texts == ("left",)
     ask(panel, "right")
     assert panel.answer.question.min_reliability == 0.0 and chosen(pipeline).any()
@@ -339,7 +340,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     count = int(rows.sum())
     assert "1 of them are never drawn" in said(panel)
     assert f"{count} of them are selected by several prompts" in said(panel)
-    panel.on_action("Download selection", client=(browser := Browser()))
+    panel.act(Action("Download selection"), client=(browser := Browser()))
     assert f" {count - 1} Gaussians" in said(panel)
     rows[first] = False
     vertices = PlyData.read(io.BytesIO(browser.files["left__left_again.ply"]))["vertex"]
@@ -348,7 +349,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     faint[:] = -9.0
     for prompts, message in (("left", "ever drawn"), ("up", "Nothing is selected")):
         ask(panel, prompts)
-        panel.on_action("Download selection", client=browser)
+        panel.act(Action("Download selection"), client=browser)
         assert message in said(panel) and len(browser.files) == 1
 
 
@@ -388,7 +389,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     press_row(groups[0], "hide", browser)
     assert torch.equal(pipeline.model._display.drawn, ~first.mask)
     assert len(listed(panel)) == len(list_objects(panel.state).objects) < len(objects)
-    panel.on_action("Undo")
+    panel.act(Action("Undo"))
     press_row(listed(panel)[0], "only", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
@@ -397,7 +398,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     press_row(groups[0], "hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
-    panel.on_action("Clear")
+    panel.act(Action("Clear"))
     listed(panel)
     assert panel._widgets.histograms.content == ""
 
@@ -484,7 +485,7 @@ def test_the_button_shows_that_it_works_and_the_picture_stays_live(pipeline: Any
     viewer.train_lock.release()
     assert torch.equal(chosen(pipeline), before)
     assert panel._widgets.ask.disabled and panel._widgets.cancel.visible
-    panel.on_action("Threshold", 0.6)  # the panel can be used, and still says what it waits for
+    panel.act(Action("Threshold"), 0.6)  # the panel can be used, and still says what it waits for
     assert panel.answer.texts == ("left",) and "Reading the prompts" in said(panel)
     assert panel._widgets.prompts.value == "right"  # what is typed is nobody else's
     encoder.go_on.set()
@@ -512,7 +513,7 @@ def test_a_stale_answer_is_dropped(pipeline: Any, slow: tuple[Slow, list[str]], 
         encoder.reading.clear()
         asking = in_thread(panel, "right")
         assert encoder.reading.wait(60)
-        panel.on_action(end)
+        panel.act(Action(end))
         assert not panel._widgets.ask.disabled
         encoder.go_on.set()
         asking.join(60)
@@ -528,7 +529,7 @@ def ray(pipeline: Any) -> SimpleNamespace:
 
 def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> None:
     browser, event, field = Browser(), ray(pipeline), pipeline.model.field
-    panel.on_action("More like this", client=browser)
+    panel.act(Action("More like this"), client=browser)
     weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
     met = weights.where(field.valid(), 0.0).argmax()
     browser._scene_pointer_cb(SimpleNamespace(ray_origin=None, ray_direction=None))  # not on the scene
@@ -537,19 +538,19 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
     assert torch.equal(clicked, (similar > 0.9) & field.valid())
-    panel.on_action("Save prompts in run")
+    panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
     assert panel.answer.question.threshold == 0.5  # not that of the click
     pipeline.model.attach(field, load_query(pipeline.model.config.semantics))  # as after a restart
-    assert panel._clicks.directions == {}
+    assert panel._session.clicks == {}
     ask(panel, "left")
     ask(panel, "like click 1")
     assert torch.equal(chosen(pipeline), clicked)
-    panel.on_action("More like this", client=browser)
+    panel.act(Action("More like this"), client=browser)
     browser._scene_pointer_cb(event)
     assert panel.answer.texts == ("like click 2",)  # the saved one is not replaced
-    panel.on_action("More like this", client=browser)
+    panel.act(Action("More like this"), client=browser)
     event.ray_direction = tuple(-x for x in event.ray_direction)
     browser._scene_pointer_cb(event)
     assert "nothing with semantics" in said(panel) and panel.answer.texts == ("like click 2",)
@@ -560,7 +561,7 @@ def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipelin
     weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
     for name, mode in (("Select", "select"), ("Drop", "take away"), ("Add", "add")):
         expected = actions.click(panel.state, weights, mode).selection  # type: ignore[arg-type]
-        panel.on_action(name, client=browser)
+        panel.act(Action(name), client=browser)
         browser._scene_pointer_cb(event)
         assert torch.equal(chosen(pipeline), expected), name
     assert expected.any()
@@ -571,11 +572,11 @@ def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any
     browser, other, event = Browser(1), Browser(2), ray(pipeline)
     for name, cancels in (("Cancel", True), ("Clear", True), ("Ask", True), ("Hide", False)):
         ask(panel, "left")
-        panel.on_action("More like this", client=browser)
+        panel.act(Action("More like this"), client=browser)
         assert panel._widgets.cancel.visible
         assert other._scene_pointer_cb is viewer.viser_server.scene._scene_pointer_cb is None
         armed = browser._scene_pointer_cb
-        panel.on_action(name, client=other)
+        panel.act(Action(name), client=other)
         assert (browser._scene_pointer_cb is None) == cancels
         assert panel._widgets.cancel.visible != cancels
         before = chosen(pipeline)
@@ -591,7 +592,7 @@ def test_a_browser_that_goes_while_another_one_presses_stops_nobody(panel: Any, 
     """viser tells that it is gone under the lock that `get_clients` takes, which every picture needs."""
     browser = Browser(3)
     ask(panel, "left")
-    panel.on_action("More like this", client=browser)
+    panel.act(Action("More like this"), client=browser)
     going = Thread(target=viewer.viser_server._client_disconnect_cb[-1], args=[browser], daemon=True)
     with panel._lock:  # which the other one has, who waits for the lock of viser
         going.start()
@@ -609,7 +610,7 @@ def test_a_browser_that_comes_or_goes_leaves_no_other_with_an_old_picture(panel:
     monkeypatch.setattr(viewer, "render_statemachines", {5: there})
     ask(panel, "left")
     drawn.clear()
-    panel.on_action("Hide")
+    panel.act(Action("Hide"))
     assert len(drawn) == 1 and there.state == "low_move"  # it draws again, whatever becomes of the action
 
 
@@ -621,13 +622,13 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
     for prompts, negatives in (("left", ""), ("right, left", ""), ("up", "left")):  # the last of another rule
         ask(panel, prompts, negatives)
         assert not replace.visible
-        panel.on_action("Save prompts in run")
+        panel.act(Action("Save prompts in run"))
     assert stored().texts == ("left", "right") and replace.visible
     press(replace)
     assert (stored().texts, stored().negatives, stored().rule) == (("up",), ("left",), "lerf")
     assert not replace.visible
-    panel.on_action("Clear")
-    panel.on_action("Save prompts in run")
+    panel.act(Action("Clear"))
+    panel.act(Action("Save prompts in run"))
     assert "No query yet" in said(panel)
 
 
@@ -638,7 +639,7 @@ def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
     assert panel._widgets.ask.disabled
     assert "No semantics yet" in said(panel)
     for name in ("Ask", "Hide", "Undo", "Clear", "Save prompts in run", "More like this"):
-        panel.on_action(name, client=Browser())
+        panel.act(Action(name), client=Browser())
         assert "No semantics yet" in said(panel), name
     pipeline.model.attach(field)
     assert not panel._widgets.ask.disabled

@@ -21,6 +21,7 @@ from normlift_ns.query.question import load_query
 from normlift_ns.viewer import person
 from normlift_ns.viewer.person import People
 from normlift_ns.viewer.shared import Run, View, read_link, write_link
+from normlift_ns.viewer.widgets import Action
 from tests.session.worlds import BLOCK, cubes, read, rows
 from tests.viewer.scenes import run_of, until
 from tests.viewer.test_reasons import FakeVotes
@@ -44,7 +45,7 @@ class Widget(contextlib.nullcontext):
     def value(self, value: Any) -> None:
         self._value = value
         for tell in self._told:
-            tell(None)
+            tell(SimpleNamespace(client=None))
 
     def on_update(self, tell: Callable[[Any], None]) -> None:
         self._told.append(tell)
@@ -365,7 +366,7 @@ def test_objects_and_nearest_matches_have_buttons(crowd, run):
     page.press("Selection", "Unhide")
     page.draws(4 * BLOCK)
 
-    panel, place = crowd._here[0]._panel, (1.0, 2.0, 3.0)
+    panel, place = crowd._here[0]._widgets, (1.0, 2.0, 3.0)
     panel.judge(
         "", [SimpleNamespace(text="zebra", nearest_position=place), SimpleNamespace(text="red", nearest_position=None)]
     )
@@ -487,7 +488,7 @@ def test_a_readonly_page_writes_nothing(crowd, run, monkeypatch):
     page = opened(crowd)
     assert not any(w.label == "Save prompts in run" for w in page.gui.made)
     page.asks("red", 2 * BLOCK)
-    crowd._here[0]._act("Save prompts in run", None)
+    crowd._here[0].act(Action.SAVE)
     page.says("may only look")
     assert load_query(run.folder / FIELD_FOLDER) is None
     page.press("Download selection")
