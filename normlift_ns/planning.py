@@ -1,4 +1,7 @@
-"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine."""
+"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine.
+
+`dry_run` is what `ns-normlift --dry-run` does; `ns-normlift-check` takes the same steps, with a finding for each.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns import pipeline
+from normlift_ns.api import LiftRequest, compare_with_images
 from normlift_ns.core.consensus import consensus
+from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
@@ -28,7 +33,7 @@ from normlift_ns.core.refine import clamp_k
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
-from normlift_ns.encoders.build import resolve_regions
+from normlift_ns.encoders.build import make_source, resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
@@ -43,6 +48,7 @@ from normlift_ns.evidence_collection import (
     sample_evenly,
     views_in_cache,
 )
+from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
 
@@ -640,3 +646,70 @@ def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
     return clock() - start, result
+
+
+# The dry run of a lift.
+
+
+class OpenedCapture(NamedTuple):
+    """An opened capture and the seconds that each stage has taken so far."""
+
+    scene: Scene
+    run_dir: Path
+    stage_seconds: dict[str, float]
+
+
+def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
+    """Open the capture to plan a lift of it.
+
+    Args:
+        start_time: start of the command by `time.perf_counter`.
+    """
+    import_time = perf_counter()
+    scene = request.open_scene()
+    run_dir = run_directory(Path(request.output_dir or scene.runs_dir), scene.name, request.timestamp)
+    return OpenedCapture(scene, run_dir, {"start": import_time - start_time, "open": perf_counter() - import_time})
+
+
+def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
+    """Return a warning if images and renders of three views differ; add the time to that of the stages."""
+    opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
+    start = perf_counter()
+    warning = compare_with_images(opened.scene, options, device)
+    opened.stage_seconds["check"] = perf_counter() - start
+    return warning
+
+
+def plan_opened(
+    opened: OpenedCapture, source: FeatureSource, options: LiftOptions, device: str, num_devices: int
+) -> Plan:
+    """Estimate the lift from a short measurement of the opened capture."""
+    scene, run_dir, seconds = opened
+    facts = measure_capture(scene, source, options, cache_folder(run_dir), device=device, before=seconds)
+    return make_plan(facts, num_devices=num_devices)
+
+
+def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
+    """Return what a lift needs, without lifting anything.
+
+    Args:
+        num_devices: number of processes that would share the work.
+        start_time: start of the command by `time.perf_counter`.
+    Raises:
+        ValueError, FileNotFoundError, MemoryError: as the lift itself; also if weights are not on this machine.
+    """
+    device, lift = choose_device(request.device), request.lift or LiftOptions()
+    init_cuda(device)
+    options = (request.source or SourceOptions()).looking_for(request.queries)
+    source = make_source(options, device)
+    missing = missing_weights(options, device)
+    if len(missing) > 0:
+        raise FileNotFoundError(
+            f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
+            "Download them first, or give local files with --encoder-pretrained and --sam-model."
+        )
+    opened = open_capture(request, start_time)
+    warning = compare_cameras(opened, lift, device) if request.check else None
+    if warning is not None:
+        request.say(f"Warning: {warning}")
+    return plan_opened(opened, source, lift, device, num_devices)

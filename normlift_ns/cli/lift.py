@@ -9,9 +9,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -37,9 +37,9 @@ from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_direct
 from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, check_number
 
 if TYPE_CHECKING:
+    from normlift_ns.api import LiftRequest
     from normlift_ns.core.scene import Scene
     from normlift_ns.distributed.communicator import TorchCommunicator
-    from normlift_ns.encoders.base import FeatureSource
     from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.planning import Plan
     from normlift_ns.progress import ProgressCallback
@@ -63,14 +63,6 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
         if started_by_us:
             sys.exit(1)
         raise
-
-
-class OpenedCapture(NamedTuple):
-    """An opened capture and the seconds that each stage has taken so far."""
-
-    scene: Scene
-    run_dir: Path
-    stage_seconds: dict[str, float]
 
 
 @dataclass
@@ -134,65 +126,29 @@ class NormLift(CheckedOptions):
         with join_processes(self.device) as team:
             return self._lift(team)
 
+    def request(self, **more: Any) -> LiftRequest:
+        """Return the request of the lift with these options.
+
+        Args:
+            more: Other fields of the request.
+        """
+        from normlift_ns.api import LiftRequest  # noqa: PLC0415 (--help should not wait for torch)
+
+        own = {item.name: getattr(self, item.name) for item in fields(LiftRequest) if hasattr(self, item.name)}
+        return LiftRequest(**own, **more)
+
     def _plan(self) -> None:
         """Print what the lift needs, without lifting anything."""
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (loads torch)
-        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
-        from normlift_ns.planning import missing_weights  # noqa: PLC0415
+        from normlift_ns.planning import dry_run  # noqa: PLC0415 (as above)
 
-        device = choose_device(self.device)
-        init_cuda(device)
-        options = self.source.looking_for(self.queries)
-        source = make_source(options, device)
-        missing = missing_weights(options, device)
-        if len(missing) > 0:
-            raise FileNotFoundError(
-                f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
-                "Download them first, or give local files with --encoder-pretrained and --sam-model."
-            )
-        opened = self.open_capture(start_time)
-        warning = self.compare_cameras(opened, device) if self.check else None
-        if warning is not None:
-            info(f"Warning: {warning}")
-        print_plan(self.make_plan(opened, source, device))
-
-    def open_capture(self, start_time: float) -> OpenedCapture:
-        """Open the capture to plan a lift of it.
-
-        Args:
-            start_time: Start of the command by `time.perf_counter`.
-        """
-        import_time = time.perf_counter()
-        scene = self.open_scene()
-        run_dir = run_directory(self.output_dir or scene.runs_dir, scene.name, self.timestamp)
-        seconds = {"start": import_time - start_time, "open": time.perf_counter() - import_time}
-        return OpenedCapture(scene, run_dir, seconds)
-
-    def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
-        """Return a warning if images and renders of three views differ; add the time to that of the stages."""
-        from normlift_ns.api import compare_with_images  # noqa: PLC0415 (as above)
-        from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
-
-        opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, self.lift, device=device)
-        start = time.perf_counter()
-        warning = compare_with_images(opened.scene, self.lift, device)
-        opened.stage_seconds["check"] = time.perf_counter() - start
-        return warning
-
-    def make_plan(self, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
-        """Estimate the lift from a short measurement of the opened capture."""
-        from normlift_ns.planning import make_plan, measure_capture  # noqa: PLC0415 (as above)
-
-        scene, run_dir, seconds = opened
-        facts = measure_capture(scene, source, self.lift, cache_folder(run_dir), device=device, before=seconds)
-        return make_plan(facts, num_devices=self.num_devices)
+        print_plan(dry_run(self.request(say=info), self.num_devices, start_time))
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
         info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import LiftRequest, run_lift  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
@@ -203,20 +159,8 @@ class NormLift(CheckedOptions):
             info_progress(text)
 
         with progress_bars() as report:
-            names = (
-                "open_scene",
-                "source",
-                "lift",
-                "queries",
-                "output_dir",
-                "timestamp",
-                "overwrite",
-                "check",
-                "device",
-            )
-            options: dict[str, Any] = {name: getattr(self, name) for name in names}
             export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
-            request = LiftRequest(**options, export=export, report=report, say=on_message)
+            request = self.request(export=export, report=report, say=on_message)
             if team is None:
                 run = run_lift(request)
             else:
