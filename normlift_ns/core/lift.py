@@ -13,7 +13,7 @@ Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -112,21 +112,10 @@ class Lifted:
             return self._directions(gaussians, dtype)
         result = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
         first = 0
-        for rows in gaussians.split(self._step):
+        for rows in gaussians.split(max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))):
             result[first : first + len(rows)] = self._directions(rows, dtype)
             first += len(rows)
         return result
-
-    def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
-        """Yield u_j with bounded memory, as (first Gaussian, block of consecutive Gaussians)."""
-        n, device = self.evidence.num_gaussians, self.features.device
-        for first in range(0, n, self._step):
-            rows = torch.arange(first, min(n, first + self._step), device=device)
-            yield first, self._directions(rows, self.features.dtype)
-
-    @property
-    def _step(self) -> int:
-        return max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))
 
     def _directions(self, gaussians: Tensor, dtype: torch.dtype) -> Tensor:
         rows, table = self.evidence.rows, self.features
