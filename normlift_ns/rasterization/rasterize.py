@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib import import_module
 from itertools import groupby, islice, zip_longest
 from typing import Any, NamedTuple, TypedDict, cast, get_args
 
@@ -45,36 +46,8 @@ def view_colors(
 # Table of the rasterization backends, and the choice of one for a job.
 
 
-def _torch() -> Backend:
-    from normlift_ns.rasterization import projection  # noqa: PLC0415 (load each backend at its first use)
-
-    return TileBackend(projection)
-
-
-def _numba() -> Backend:
-    from normlift_ns.rasterization import numba  # noqa: PLC0415 (importing numba takes a second)
-
-    return numba
-
-
-def _gsplat() -> Backend:
-    from normlift_ns.rasterization import gsplat  # noqa: PLC0415
-
-    return gsplat
-
-
-def _triton() -> Backend:
-    if not has_triton():
-        raise InputError(
-            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
-        )
-    from normlift_ns.rasterization import triton  # noqa: PLC0415
-
-    return triton
-
-
-BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
-"""Backends by name, from the most general to the fastest."""
+_MODULES = {"torch": "projection", "numba": "numba", "gsplat": "gsplat", "triton": "triton"}
+"""Modules of the backends by name, from the most general to the fastest. Each is loaded at its first use."""
 
 
 def choose_backend(name: str, job: RasterJob, *, pictures: bool) -> tuple[str, Backend]:
@@ -90,9 +63,14 @@ def choose_backend(name: str, job: RasterJob, *, pictures: bool) -> tuple[str, B
     """
     if name == "auto":
         name = _fastest(job)
-    if name not in BACKENDS:
+    if name not in _MODULES:
         raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
-    backend = BACKENDS[name]()
+    if name == "triton" and not has_triton():
+        raise InputError(
+            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
+        )
+    module: Any = import_module(f"normlift_ns.rasterization.{_MODULES[name]}")
+    backend: Backend = TileBackend(module) if name == "torch" else module
     backend.check(job, pictures=pictures)
     return name, backend
 
