@@ -40,10 +40,10 @@ from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import (
     RasterConfig,
     ViewBatch,
+    ViewObservations,
     cached_batch_evidence,
     chunk_views,
     observe_views,
-    region_levels,
 )
 from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
 from normlift_ns.rasterization.settings import RasterSettings
@@ -358,17 +358,13 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features
-        parts, tables, levels = [], [], []
-        for chunk in chunk_views(range(len(self.names))):
-            block, _ = self._observe(chunk)
-            parts.append(self._cached_evidence(block))
-            tables.extend(block.features)
-            levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
-        evidence, features = Evidence.merge(*parts), torch.cat(tables)
+        blocks = (self._observe(chunk)[0] for chunk in chunk_views(range(len(self.names))))
+        parts = (ViewObservations.of_block(block, self._cached_evidence(block)) for block in blocks)
+        evidence, features, level = ViewObservations.merge(parts)
         if self._option("consensus", bool, False):
             options = {"power": (float, 1.0), "sample": (int, 50), "least": (float, CHANCE_AGREEMENT)}
             kwargs = {name: self._option(f"consensus_{name}", *option) for name, option in options.items()}
-            features = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
+            features = consensus(evidence, features, level=level, **kwargs).features
         return evidence, features
 
     def _cached_evidence(self, block: ViewBatch) -> Evidence:
@@ -400,7 +396,12 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        return cached(restore_source(self.field.manifest), self.cache, compute=_is_quick)
+        """The source of the lift; a network might take minutes to compute results that are not cached."""
+
+        def is_quick(part: Any) -> bool:
+            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))
+
+        return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
 
     def _check_regions(self, view: int, block: ViewBatch) -> None:
         """Raise if an image no longer has the regions that voted."""
@@ -424,8 +425,3 @@ class RecordedVotes:
         if not isinstance(value, (int, float) if kind is float else kind):
             raise InputError(f"the run's manifest is damaged: its option {name} is {value!r:.40}; lift again")
         return value
-
-
-def _is_quick(part: Any) -> bool:
-    """Return whether regions or an encoder may compute results that are not cached; a network might take minutes."""
-    return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))

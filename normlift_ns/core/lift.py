@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32
@@ -129,20 +129,6 @@ class Lifted:
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
 
 
-class _Sums(NamedTuple):
-    """Sums per Gaussian, in float64 except for the last."""
-
-    total: Tensor
-    """||sum_v S_jv||"""
-    by_view: Tensor
-    """sum_v ||S_jv||"""
-    weight: Tensor
-    """W_j"""
-    weight_squared: Tensor
-    """sum_v W_jv ** 2"""
-    view_count: Tensor
-
-
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:
@@ -227,18 +213,16 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
 
-def _sums(evidence: Evidence, table: Tensor) -> _Sums:
+def _sums(evidence: Evidence, table: Tensor) -> tuple[Tensor, ...]:
+    """Return ||sum_v S_jv||, sum_v ||S_jv||, and the results of `_weights`, per Gaussian."""
     if _has_kernel(table):
         from normlift_ns.kernels.sparse import row_norms  # noqa: PLC0415 (needs triton)
 
         rows = evidence.rows
-        return _Sums(
-            *row_norms(
-                rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLATION_RATIO, MANY_ENTRIES
-            )
-        )
+        arrays = (rows.offsets, rows.column, rows.weight, evidence.region_view, table)
+        return row_norms(*arrays, CANCELLATION_RATIO, MANY_ENTRIES)
     total, by_view = _row_norms(evidence.rows, table), _sum_of_view_norms(evidence, table)
-    return _Sums(total, by_view, *_weights(evidence.view_weights()))
+    return total, by_view, *_weights(evidence.view_weights())
 
 
 def _weights(view_weights: SparseRows) -> tuple[Tensor, Tensor, Tensor]:

@@ -22,15 +22,13 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     sampled_consensus,
 )
-from normlift_ns.core.field import SemanticField, check_storage, choose_form
+from normlift_ns.core.field import SemanticField, choose_form
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.lowrank import (
     StoredDirections,
     StoredEvidence,
     arrange_directions,
     encode_directions,
-    sizes_and_bounds,
-    smallest_basis,
 )
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
@@ -211,19 +209,13 @@ def build_field_distributed(
         tolerance, storage: as in `SemanticField.build`.
         provenance: as in `SemanticField.build`; only that of process 0 is used.
     """
-    check_storage(storage, tolerance)
-    basis = smallest_basis(lifted, tolerance, portion.communicator)
-    forms = sizes_and_bounds(lifted, basis, portion)
-    form = choose_form(forms, storage, tolerance)
-    if form == "evidence":
-        store = _gather_evidence(lifted, portion)
-    else:
-        store = _gather_directions(lifted, basis.rows if form == "low_rank" and basis is not None else None, portion)
+    facts, basis = choose_form(lifted, storage, tolerance, portion)
+    is_evidence = facts["form"] == "evidence"
+    store = _gather_evidence(lifted, portion) if is_evidence else _gather_directions(lifted, basis, portion)
     scalars = lifted.scalars.map(portion.all_gather)
     sources = portion.all_gather(portion.indices.int() if source is None else source.int())
     if store is None:
         return None
-    facts = {"form": form, "tolerance": tolerance, "forms": forms}
     return SemanticField.assemble(scalars, sources, store, means, provenance=provenance, facts=facts)
 
 
