@@ -19,17 +19,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from normlift_ns.cli import common, preflight
-from normlift_ns.cli.common import (
-    CONSOLE,
-    TerminatedError,
-    info,
-    info_progress,
-    plain_text,
-    print_error,
-    run_command,
-    run_command_process,
-    split_output_flags,
-)
 from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
@@ -54,12 +43,12 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """
     started_by_us = LAUNCHED_VARIABLE in os.environ  # the process that started this one reports failures
     try:
-        with distributed_context(device, print_error) as team:
+        with distributed_context(device, common.print_error) as team:
             if team is not None and team.rank > 0:
-                CONSOLE.quiet = True
+                common.CONSOLE.quiet = True
                 warnings.simplefilter("ignore")
             yield team
-    except (KeyboardInterrupt, TerminatedError):
+    except (KeyboardInterrupt, common.TerminatedError):
         if started_by_us:
             sys.exit(1)
         raise
@@ -116,10 +105,13 @@ class NormLift(CheckedOptions):
         if self.num_devices > 1 and rank_and_world_size(os.environ) is None:
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
-                info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
+                common.info(
+                    f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster."
+                )
             words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
-            other = [*program, *split_output_flags(words)[0]]  # only the first process writes the log file
-            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], print_error)
+            # Only the first process writes the log file.
+            other = [*program, *common.split_output_flags(words)[0]]
+            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], common.print_error)
             if code > 0:
                 sys.exit(code)
             return None
@@ -140,14 +132,14 @@ class NormLift(CheckedOptions):
     def _plan(self) -> None:
         """Print what the lift needs, without lifting anything."""
         start_time = time.perf_counter()
-        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.planning import dry_run  # noqa: PLC0415 (as above)
 
-        print_plan(dry_run(self.request(say=info), self.num_devices, start_time))
+        print_plan(dry_run(self.request(say=common.info), self.num_devices, start_time))
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
-        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
 
@@ -156,7 +148,7 @@ class NormLift(CheckedOptions):
 
         def on_message(text: str) -> None:
             message_times.append(time.perf_counter())
-            info_progress(text)
+            common.info_progress(text)
 
         with progress_bars() as report:
             export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
@@ -171,8 +163,8 @@ class NormLift(CheckedOptions):
             return None
         before = {"start": import_time - start_time, "open": (message_times or [import_time])[0] - import_time}
         if not common.output_settings[-1].quiet:
-            CONSOLE.print(lift_summary(run, before, time.perf_counter() - start_time))
-        info(next_command(run.config, self.queries))
+            common.CONSOLE.print(lift_summary(run, before, time.perf_counter() - start_time))
+        common.info(next_command(run.config, self.queries))
         return run
 
     def check_early(self) -> None:
@@ -239,14 +231,14 @@ class NormLift(CheckedOptions):
 
         splat = self.load_ply or self.load_gsplat
         if splat is not None:
-            scene: Any = open_splat(splat, self.splat, say=info_progress)
+            scene: Any = open_splat(splat, self.splat, say=common.info_progress)
         else:
             scene = open_scene(cast(Path, self.load_config), data=self.data, load_step=self.load_step)
         if self.add_images is None:
             return scene
         count = len(scene.train)
         scene = add_extra_images(scene, self.add_images)
-        info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
+        common.info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
         return scene
 
 
@@ -260,14 +252,14 @@ def progress_bars() -> Iterator[ProgressCallback]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    live = CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
-    progress, tasks = Progress(*columns, console=CONSOLE), dict[str, TaskID]()
+    live = common.CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
+    progress, tasks = Progress(*columns, console=common.CONSOLE), dict[str, TaskID]()
 
     def report(stage: str, done: int, total: int) -> None:
         if stage not in tasks:
             tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
             if not live:
-                info_progress(f"{names.get(stage, stage)} …")
+                common.info_progress(f"{names.get(stage, stage)} …")
         progress.update(tasks[stage], completed=done, total=total)
 
     with progress if live else nullcontext():
@@ -283,11 +275,11 @@ def print_plan(plan: Plan) -> None:
         table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
     table.add_section()
     table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
-    CONSOLE.print(table)
+    common.CONSOLE.print(table)
     gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
     subject = f"{plan.num_devices} processes share the work. Each" if plan.num_devices > 1 else "The lift"
     space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
-    info(f"{subject} needs about {gpu}{space}.")
+    common.info(f"{subject} needs about {gpu}{space}.")
 
 
 def _views(count: int) -> str:
@@ -336,7 +328,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     error = f"cosine error at most {manifest['forms'][storage]['bound']:.1e}"
     table.add_row("stored as", f"{sizes.pop(storage)}, {error}")
     table.add_row("", "instead of " + ", ".join(sizes.values()))
-    table.add_row("run", plain_text(run.folder))
+    table.add_row("run", common.plain_text(run.folder))
     return Group(Text("Lifted", style="bold green"), table, Text("Search it with:"))
 
 
@@ -393,8 +385,8 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
 
 def entrypoint() -> None:
     """Run ns-normlift in a process that continues afterwards."""
-    run_command(NormLift)
+    common.run_command(NormLift)
 
 
 if __name__ == "__main__":
-    run_command_process(NormLift)
+    common.run_command_process(NormLift)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from normlift_ns import api, pipeline
+from normlift_ns.core import lowrank
 from normlift_ns.core.consensus import (
     Consensus,
     check_consensus_inputs,
@@ -24,12 +25,6 @@ from normlift_ns.core.consensus import (
 )
 from normlift_ns.core.field import SemanticField, choose_form
 from normlift_ns.core.lift import Lifted
-from normlift_ns.core.lowrank import (
-    StoredDirections,
-    StoredEvidence,
-    arrange_directions,
-    encode_directions,
-)
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
 from normlift_ns.core.refine import decay_width, refine_subset
@@ -219,18 +214,18 @@ def build_field_distributed(
     return SemanticField.assemble(scalars, sources, store, means, provenance=provenance, facts=facts)
 
 
-def _gather_evidence(lifted: Lifted, portion: Partition) -> StoredEvidence | None:
+def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEvidence | None:
     """Return E and F of all portions in process 0, and None in the others."""
     rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
     if rows is None or unlabeled is None:
         return None
-    return StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
+    return lowrank.StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
 
 
-def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> StoredDirections | None:
+def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> lowrank.StoredDirections | None:
     """Return the directions of all Gaussians with evidence in process 0, and None in the others."""
-    coordinates, rows = encode_directions(lifted, basis, portion.blocks())
+    coordinates, rows = lowrank.encode_directions(lifted, basis, portion.blocks())
     parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:
         return None
-    return arrange_directions(parts, gaussians, basis, len(portion.order))
+    return lowrank.arrange_directions(parts, gaussians, basis, len(portion.order))

@@ -46,32 +46,26 @@ def view_colors(
 # Table of the rasterization backends, and the choice of one for a job.
 
 
-_MODULES = {"torch": "projection", "numba": "numba", "gsplat": "gsplat", "triton": "triton"}
-"""Modules of the backends by name, from the most general to the fastest. Each is loaded at its first use."""
-
-
-def choose_backend(name: str, job: RasterJob, *, pictures: bool) -> tuple[str, Backend]:
+def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
     """Return a backend and its name; "auto" selects the fastest backend that can do the job.
 
     Args:
         name: Name of the backend, or "auto".
         job: Inputs of the call.
-        pictures: Whether to composite values; False: sum evidence.
 
     Raises:
         ValueError: If the name is unknown or the backend cannot do the job.
     """
     if name == "auto":
         name = _fastest(job)
-    if name not in _MODULES:
+    if name not in get_args(BackendName):
         raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
     if name == "triton" and not has_triton():
         raise InputError(
             'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
         )
-    module: Any = import_module(f"normlift_ns.rasterization.{_MODULES[name]}")
-    backend: Backend = TileBackend(module) if name == "torch" else module
-    backend.check(job, pictures=pictures)
+    backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
+    backend.check(job)
     return name, backend
 
 
@@ -154,7 +148,7 @@ def rasterize_evidence(
     if weight_power not in (0, 1, 2):
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, **options)
-    _, chosen = choose_backend(backend, job, pictures=False)
+    _, chosen = choose_backend(backend, job)
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -199,7 +193,7 @@ def resolve_backend(
         ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
     """
     job = _job(scene, "classic", settings, dtype, weight_power)
-    return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
+    return cast(BackendName, choose_backend(backend, job)[0])
 
 
 def render(
@@ -241,7 +235,7 @@ def render(
     if values.ndim != 2 or len(values) != len(scene):
         raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
-    _, chosen = choose_backend(backend, job, pictures=True)
+    _, chosen = choose_backend(backend, job)
     with torch.no_grad():
         return chosen.composite(job, camera, values)
 
