@@ -18,14 +18,8 @@ from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import alignment_warning, measure_alignment
+from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
-from normlift_ns.data.nerfstudio.config_classes import (
-    FullImageDatamanagerConfig,
-    NerfstudioDataParserConfig,
-    NormLiftModelConfig,
-    TrainerConfig,
-    VanillaPipelineConfig,
-)
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import (
     CHECKPOINT_DIR,
@@ -360,7 +354,7 @@ def write_run(
         if isinstance(source, SplatScene):
             save_splat(folder, source)
             transform, scale, checkpoint = torch.eye(4)[:3], 1.0, splatfacto_checkpoint(source)
-            config_in: Callable[[Path], TrainerConfig] = partial(splat_config, source)
+            config_in: Callable[[Path], config_classes.TrainerConfig] = partial(splat_config, source)
         else:
             if len(source.extra_frames) > 0:
                 write_transforms(folder / EXTRA_IMAGES_FILE, source.extra_frames, ())
@@ -388,14 +382,16 @@ def write_run(
     raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
 
 
-def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
+def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.TrainerConfig:
     config, location = deepcopy(source.config), source.location
     config.method_name = "normlift"
     config.output_dir = location.relative_to_root(run_dir.parents[2])
     config.timestamp = run_dir.name
     config.relative_model_dir = Path(CHECKPOINT_DIR)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    config.pipeline.model = NormLiftModelConfig(**{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)})
+    config.pipeline.model = config_classes.NormLiftModelConfig(
+        **{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
+    )
     if location.data_moved or config.output_dir.is_absolute():
         set_dataset(config, location.data)  # a relative path would not be found
     skip_seed_points(config)
@@ -404,7 +400,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     return config
 
 
-def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
+def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
     """Return the config of a run lifted from a PLY file or gsplat checkpoint, for which nerfstudio has written none.
 
     Stock nerfstudio loads the cameras in the run directory with it, without transforming them.
@@ -412,7 +408,7 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
     All paths except that of the field are absolute, because there is no training directory for relative paths.
     """
     cameras = run_dir / TRANSFORMS_FILE
-    dataparser = NerfstudioDataParserConfig(
+    dataparser = config_classes.NerfstudioDataParserConfig(
         data=cameras,
         downscale_factor=1,
         orientation_method="none",
@@ -421,25 +417,25 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
         eval_mode="all",
         load_3D_points=False,
     )
-    model = NormLiftModelConfig(
+    model = config_classes.NormLiftModelConfig(
         sh_degree=max(1, scene.splat.degree),
         background_color=scene.background_name,
         rasterize_mode=scene.rasterize_mode,
         semantics=Path(FIELD_FOLDER),
     )
-    datamanager = FullImageDatamanagerConfig(
+    datamanager = config_classes.FullImageDatamanagerConfig(
         data=cameras,
         dataparser=dataparser,
         cache_images="gpu",  # means the pipeline's device; "cpu" would pin memory, which needs CUDA
         cache_images_type="uint8",
     )
-    return TrainerConfig(
+    return config_classes.TrainerConfig(
         method_name="normlift",
         experiment_name=scene.name,
         output_dir=run_dir.parents[2],
         timestamp=run_dir.name,
         relative_model_dir=Path(CHECKPOINT_DIR),
         data=cameras,
-        pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model),
+        pipeline=config_classes.VanillaPipelineConfig(datamanager=datamanager, model=model),
         vis="viewer",
     )

@@ -6,7 +6,7 @@ import json
 import os
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64, UInt8
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from xxhash import xxh3_128
 
@@ -84,6 +84,18 @@ class ViewObservations(NamedTuple):
     features: Float[Tensor, "s d"]
     level: Int64[Tensor, " s"]
 
+    @staticmethod
+    def of_block(block: ViewBatch, evidence: Evidence) -> ViewObservations:
+        """Join the features of a block to the evidence of its regions."""
+        levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
+        return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
+
+    @staticmethod
+    def merge(parts: Iterable[ViewObservations]) -> ViewObservations:
+        """Join several groups of views, in this order."""
+        evidence, features, level = zip(*parts)
+        return ViewObservations(Evidence.merge(*evidence), torch.cat(features), torch.cat(level))
+
 
 @dataclass(frozen=True)
 class EvidenceCollection:
@@ -120,10 +132,8 @@ class EvidenceCollection:
         """
         parts = [self.collect_chunk(chunk, stages, wait_for_kernels) for chunk in chunk_views(self.views)]
         with stages("evidence", len(self.views)):
-            evidence = Evidence.merge(*(part.evidence for part in parts))
-            features = torch.cat([part.features for part in parts])
-            level = torch.cat([part.level for part in parts])
-        return ViewObservations(evidence, features.to(self.gaussians.means.device, self.config.dtype), level)
+            views = ViewObservations.merge(parts)
+        return views._replace(features=views.features.to(self.gaussians.means.device, self.config.dtype))
 
     def collect_chunk(
         self, chunk: Sequence[int], stages: StageTimer, wait_for_kernels: Callable[[], None]
@@ -140,12 +150,11 @@ class EvidenceCollection:
 
             divisor = self.options.lift_downscale
             block = observe_views(self.scene, chunk, source, render_settings=rendered, downscale=divisor, on_view=done)
-        levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
         with stages("evidence", len(self.views)) as step:
             wait_for_kernels()
             reuse, folder = self.options.reuse_evidence, self.cache / "evidence"
             evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, on_view=step)
-        return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
+        return ViewObservations.of_block(block, evidence)
 
 
 def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
@@ -331,7 +340,7 @@ def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
 
 
 def _downscaled(view: View, divisor: int) -> View:
-    """Downscale a view by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
+    """Downscale a view, and raise if hardly any pixels would be left."""
     camera = view.camera
     height, width = camera.height // divisor, camera.width // divisor
     if min(height, width) < _MIN_SIDE:
@@ -339,16 +348,7 @@ def _downscaled(view: View, divisor: int) -> View:
             f"lift_downscale {divisor:,} reduces {view.name} from {camera.width} x {camera.height} to {width} x "
             f"{height} pixels; give a factor that leaves at least {_MIN_SIDE} pixels on each side"
         )
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
-    mask = None if view.mask is None else _averaged(view.mask[:, :, None], height, width)[:, :, 0] > 0.999
-    image: UInt8[Tensor, "h w 3"] = _averaged(view.image, height, width).round().to(torch.uint8)
-    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
-    return view._replace(camera=smaller, image=image, mask=mask)
-
-
-def _averaged(image: Tensor, height: int, width: int) -> Tensor:
-    channels_first = image.permute(2, 0, 1)[None].float()
-    return torch.nn.functional.interpolate(channels_first, (height, width), mode="area")[0].permute(1, 2, 0)
+    return view.downscaled(height, width)
 
 
 def check_undistorted(source: FeatureSource, *views: View) -> None:

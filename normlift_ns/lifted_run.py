@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from normlift_ns import exports
 from normlift_ns.analysis.explain import RecordedVotes, Why
 from normlift_ns.analysis.objects import (
     Catalogue,
@@ -34,16 +35,6 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.exports import (
-    CloudTransfer,
-    LabelTransfer,
-    TrainedSplat,
-    answer_instances,
-    export_paths,
-    read_cloud,
-    transfer_labels,
-    write_splat_ply,
-)
 from normlift_ns.io.atomic import refuse_run_files
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -203,16 +194,16 @@ class LiftedRun:
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
         if answer is not None and not isinstance(answer, Answer):
             raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
-        refuse_run_files(*export_paths(path), instead="name")
+        refuse_run_files(*exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
-        for file, written in zip(export_paths(path), (True, True, answer is not None, objects is not None)):
+        for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        instances = None if answer is None else answer_instances(answer, reach=reach, min_size=min_size)
+        instances = None if answer is None else exports.answer_instances(answer, reach=reach, min_size=min_size)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
-        return write_splat_ply(
+        return exports.write_splat_ply(
             path,
-            TrainedSplat.of(self.scene),
+            exports.TrainedSplat.of(self.scene),
             self.field,
             answer,
             keep=keep,
@@ -261,7 +252,7 @@ class LiftedRun:
         transfer_distance: float = MAX_TRANSFER_DISTANCE,
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
-    ) -> LabelTransfer:
+    ) -> exports.LabelTransfer:
         """Label a point cloud or mesh from the nearest Gaussians, and write it to a new PLY file.
 
         Each point gets the relevancies, class_id and instance_id of its Gaussian.
@@ -294,10 +285,10 @@ class LiftedRun:
                 f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
-        points = read_cloud(check_path("cloud", cloud))
-        rule = CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
-        return transfer_labels(
-            self.scene, self.field, answer, answer_instances(answer), rule, path, overwrite=overwrite
+        points = exports.read_cloud(check_path("cloud", cloud))
+        rule = exports.CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
+        return exports.transfer_labels(
+            self.scene, self.field, answer, exports.answer_instances(answer), rule, path, overwrite=overwrite
         )
 
     @cached_property
@@ -377,7 +368,7 @@ class LiftedRun:
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
         """Return the classes and objects of a part."""
         if isinstance(part, Answer):
-            return answer_instances(part)
+            return exports.answer_instances(part)
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
         return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 

@@ -51,56 +51,26 @@ def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
 
 
 _POSITIVE = OptionRange(_MIN_DIVISOR, _MAX_FLOAT, f"positive, at least {_MIN_DIVISOR:g}")
-_NOT_NEGATIVE = OptionRange(0.0, _MAX_FLOAT, "not negative")
-_FRACTION = OptionRange(0.0, 1.0, "in 0..1")
-_FINITE = OptionRange(-_MAX_FLOAT, _MAX_FLOAT, "finite")
-
-OPTION_RANGES: dict[str, OptionRange] = {
-    # the vote
-    "k": _at_least(1),
-    "num_devices": _at_least(1, 4096),
-    "sigma_d": _POSITIVE,
-    "tau": OptionRange(-1.0, 1.0, "in -1..1"),
-    "gamma": _POSITIVE,
-    "delta": _NOT_NEGATIVE,
-    "prior": _NOT_NEGATIVE,
-    # the lift
-    "max_views": _at_least(1),
-    "lift_downscale": _at_least(1),
-    "beta": _NOT_NEGATIVE,
-    "consensus_power": _NOT_NEGATIVE,
-    "consensus_sample": _at_least(1),
-    "consensus_least": _FRACTION,
-    "tolerance": OptionRange(1e-9, _MAX_FLOAT, "positive, at least 1e-09"),
-    "load_step": _at_least(0),
-    # 2D features
-    "region_count": _at_least(1, 2**20),
-    "regions_background": OptionRange(-_MAX_INT, _MAX_INT, "a 32-bit integer"),
-    "test_every": _at_least(2),
-    # queries
-    "threshold": _FINITE,
-    "min_reliability": _FRACTION,
-    "segment_views": _at_least(1),
-    # objects
-    "reach": _POSITIVE,
-    "min_size": _at_least(1),
-    "floater_limit": _FINITE,
-    "metres_per_unit": _POSITIVE,
-    "transfer_distance": _POSITIVE,
-    # evaluation
-    "min_opacity": _FRACTION,
-    "margin": _FINITE,
-    "purity": _FRACTION,
-    "min_weight": _NOT_NEGATIVE,
-    # the viewer
-    "port": OptionRange(1, 65535, "a port number, 1..65535"),
-    "most_drawn": _at_least(1, 10**7),
-    # batches
-    "patience": OptionRange(1.0, 86400.0, "in 1..86400"),
-    # the demo
-    "num_gaussians": _at_least(2000, 10**8),
-    "views": _at_least(3, 10**5),
+_OPTIONS_BY_RANGE = {
+    _at_least(0): ("load_step",),
+    _at_least(1): ("k", "max_views", "lift_downscale", "consensus_sample", "segment_views", "min_size"),
+    _at_least(1, 4096): ("num_devices",),
+    _at_least(1, 2**20): ("region_count",),
+    _at_least(1, 10**7): ("most_drawn",),
+    _at_least(2): ("test_every",),
+    _at_least(3, 10**5): ("views",),
+    _at_least(2000, 10**8): ("num_gaussians",),
+    OptionRange(0.0, 1.0, "in 0..1"): ("consensus_least", "min_reliability", "min_opacity", "purity"),
+    OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
+    OptionRange(0.0, _MAX_FLOAT, "not negative"): ("delta", "prior", "beta", "consensus_power", "min_weight"),
+    _POSITIVE: ("sigma_d", "gamma", "reach", "metres_per_unit", "transfer_distance"),
+    OptionRange(1e-9, _MAX_FLOAT, "positive, at least 1e-09"): ("tolerance",),
+    OptionRange(-_MAX_FLOAT, _MAX_FLOAT, "finite"): ("threshold", "floater_limit", "margin"),
+    OptionRange(-_MAX_INT, _MAX_INT, "a 32-bit integer"): ("regions_background",),
+    OptionRange(1, 65535, "a port number, 1..65535"): ("port",),
+    OptionRange(1.0, 86400.0, "in 1..86400"): ("patience",),
 }
+OPTION_RANGES = {name: limits for limits, names in _OPTIONS_BY_RANGE.items() for name in names}
 """Range of every numeric option, by name. No range contains nan or infinity."""
 
 _show_flags: ContextVar[bool] = ContextVar("flags", default=False)

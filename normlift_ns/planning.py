@@ -1,4 +1,7 @@
-"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine."""
+"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine.
+
+`dry_run` is what `ns-normlift --dry-run` does; `ns-normlift-check` takes the same steps, with a finding for each.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns import pipeline
+from normlift_ns import evidence_collection, pipeline
+from normlift_ns.api import LiftRequest, compare_with_images
 from normlift_ns.core.consensus import consensus
+from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
@@ -28,21 +33,12 @@ from normlift_ns.core.refine import clamp_k
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
-from normlift_ns.encoders.build import resolve_regions
+from normlift_ns.encoders.build import make_source, resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
 from normlift_ns.encoders.weights import find_local_sam
-from normlift_ns.evidence_collection import (
-    EvidenceCollection,
-    ViewBatch,
-    ViewObservations,
-    batch_evidence,
-    evidence_keys,
-    observe_views,
-    sample_evenly,
-    views_in_cache,
-)
+from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
 
@@ -277,7 +273,7 @@ def measure_core(
         rows = rows.to(gaussians.means.device)
         means, sample = gaussians.means[rows], replace(evidence.select_gaussians(rows), num_excluded=0)
         level = torch.zeros(len(table), dtype=torch.int64)
-        observed = ViewObservations(Evidence.merge(*[sample] * times), table, level)
+        observed = evidence_collection.ViewObservations(Evidence.merge(*[sample] * times), table, level)
         stages = StageTimer(lambda stage, done, total: None, clock)
         agreed, copied = table, None
         if options.consensus:
@@ -490,7 +486,7 @@ _MAX_LOOKUPS = 16
 class _Observed(NamedTuple):
     """Some views, and the seconds that it took to observe them."""
 
-    block: ViewBatch
+    block: evidence_collection.ViewBatch
     seconds: float
 
 
@@ -531,24 +527,24 @@ def measure_capture(
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
         kwargs = {"render_settings": rendered, "downscale": options.lift_downscale, "on_view": lambda view: None}
-        seconds, block = timed(lambda: observe_views(scene, indices, source, **kwargs))
+        seconds, block = timed(lambda: evidence_collection.observe_views(scene, indices, source, **kwargs))
         return _Observed(block, seconds)
 
-    chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
+    chosen = [used[i] for i in evidence_collection.sample_evenly(len(used), _MAX_LOOKUPS)]
     observe_cached = partial(observe, source=cached(source, cache, compute=lambda part: False))
-    known: dict[int, ViewBatch] = {}
+    known: dict[int, evidence_collection.ViewBatch] = {}
     for index in chosen if options.reuse_evidence else ():
         with suppress(NotCachedError):
             known[index] = observe_cached([index]).block
     new = [index for index in chosen if index not in known]
     batch = segmentation_workers(source)
-    encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
+    encoded = [new[i] for i in evidence_collection.sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
     observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
     cached_s = _per_view(observe_cached(list(known))) if len(known) > 0 else None
     block = _joined([observed.block, *known.values()], _MAX_VIEWS)
 
     def rasterize(folder: Path) -> Evidence:
-        return batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
+        return evidence_collection.batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:  # rasterized, read, and written once more
         folder, file = Path(name), Path(name) / "again.safetensors"
@@ -601,7 +597,7 @@ def _observe_loaded(
 ) -> tuple[_Observed, float]:
     """Observe views. Return them, with the seconds that it takes once networks are loaded, and the loading time."""
     if len(indices) == 0:
-        return _Observed(ViewBatch([], [], [], []), 0.0), 0.0
+        return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])
     if len(indices) == 1:
         return first, 0.0
@@ -611,13 +607,15 @@ def _observe_loaded(
     return _Observed(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
 
 
-def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
+def _joined(blocks: Sequence[evidence_collection.ViewBatch], most: int | None = None) -> evidence_collection.ViewBatch:
     """Join the views of all blocks, up to `most` views."""
-    parts = zip(ViewBatch([], [], [], []), *blocks)
-    return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
+    parts = zip(evidence_collection.ViewBatch([], [], [], []), *blocks)
+    return evidence_collection.ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
-def _evidence_cached(collection: EvidenceCollection, groups: Sequence[tuple[ViewBatch, int]]) -> float:
+def _evidence_cached(
+    collection: evidence_collection.EvidenceCollection, groups: Sequence[tuple[evidence_collection.ViewBatch, int]]
+) -> float:
     """Return the share of views whose evidence is cached.
 
     Args:
@@ -627,8 +625,8 @@ def _evidence_cached(collection: EvidenceCollection, groups: Sequence[tuple[View
         return 0.0
     share = 0.0
     for block, views in groups:
-        keys = evidence_keys(collection.gaussians, block, collection.config)
-        hits = views_in_cache(collection.cache / "evidence", keys)
+        keys = evidence_collection.evidence_keys(collection.gaussians, block, collection.config)
+        hits = evidence_collection.views_in_cache(collection.cache / "evidence", keys)
         share += sum(hits) / max(1, len(hits)) * views / sum(count for _, count in groups)
     return share
 
@@ -640,3 +638,70 @@ def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
     return clock() - start, result
+
+
+# The dry run of a lift.
+
+
+class OpenedCapture(NamedTuple):
+    """An opened capture and the seconds that each stage has taken so far."""
+
+    scene: Scene
+    run_dir: Path
+    stage_seconds: dict[str, float]
+
+
+def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
+    """Open the capture to plan a lift of it.
+
+    Args:
+        start_time: start of the command by `time.perf_counter`.
+    """
+    import_time = perf_counter()
+    scene = request.open_scene()
+    run_dir = run_directory(Path(request.output_dir or scene.runs_dir), scene.name, request.timestamp)
+    return OpenedCapture(scene, run_dir, {"start": import_time - start_time, "open": perf_counter() - import_time})
+
+
+def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
+    """Return a warning if images and renders of three views differ; add the time to that of the stages."""
+    opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
+    start = perf_counter()
+    warning = compare_with_images(opened.scene, options, device)
+    opened.stage_seconds["check"] = perf_counter() - start
+    return warning
+
+
+def plan_opened(
+    opened: OpenedCapture, source: FeatureSource, options: LiftOptions, device: str, num_devices: int
+) -> Plan:
+    """Estimate the lift from a short measurement of the opened capture."""
+    scene, run_dir, seconds = opened
+    facts = measure_capture(scene, source, options, cache_folder(run_dir), device=device, before=seconds)
+    return make_plan(facts, num_devices=num_devices)
+
+
+def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
+    """Return what a lift needs, without lifting anything.
+
+    Args:
+        num_devices: number of processes that would share the work.
+        start_time: start of the command by `time.perf_counter`.
+    Raises:
+        ValueError, FileNotFoundError, MemoryError: as the lift itself; also if weights are not on this machine.
+    """
+    device, lift = choose_device(request.device), request.lift or LiftOptions()
+    init_cuda(device)
+    options = (request.source or SourceOptions()).looking_for(request.queries)
+    source = make_source(options, device)
+    missing = missing_weights(options, device)
+    if len(missing) > 0:
+        raise FileNotFoundError(
+            f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
+            "Download them first, or give local files with --encoder-pretrained and --sam-model."
+        )
+    opened = open_capture(request, start_time)
+    warning = compare_cameras(opened, lift, device) if request.check else None
+    if warning is not None:
+        request.say(f"Warning: {warning}")
+    return plan_opened(opened, source, lift, device, num_devices)

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from normlift_ns import evidence_collection
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
@@ -37,14 +38,6 @@ from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import REMEDY, cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import (
-    RasterConfig,
-    ViewBatch,
-    cached_batch_evidence,
-    chunk_views,
-    observe_views,
-    region_levels,
-)
 from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.sam import SamMasks
@@ -358,28 +351,26 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features
-        parts, tables, levels = [], [], []
-        for chunk in chunk_views(range(len(self.names))):
-            block, _ = self._observe(chunk)
-            parts.append(self._cached_evidence(block))
-            tables.extend(block.features)
-            levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
-        evidence, features = Evidence.merge(*parts), torch.cat(tables)
+        blocks = (self._observe(chunk)[0] for chunk in evidence_collection.chunk_views(range(len(self.names))))
+        parts = (evidence_collection.ViewObservations.of_block(block, self._cached_evidence(block)) for block in blocks)
+        evidence, features, level = evidence_collection.ViewObservations.merge(parts)
         if self._option("consensus", bool, False):
             options = {"power": (float, 1.0), "sample": (int, 50), "least": (float, CHANCE_AGREEMENT)}
             kwargs = {name: self._option(f"consensus_{name}", *option) for name, option in options.items()}
-            features = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
+            features = consensus(evidence, features, level=level, **kwargs).features
         return evidence, features
 
-    def _cached_evidence(self, block: ViewBatch) -> Evidence:
-        config = RasterConfig(
+    def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:
+        config = evidence_collection.RasterConfig(
             gsplat_version=str(self.field.manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])),
             backend=self.field.manifest.get("backend", "auto"),
             dtype=torch.float64 if self._option("precision", str, "standard") == "double" else torch.float32,
             rasterize_mode=self.scene.rasterize_mode,
             weight_power=self._option("weight_power", int, 1),
         )
-        evidence = cached_batch_evidence(self.scene.gaussians, block, self.cache / "evidence", config)
+        evidence = evidence_collection.cached_batch_evidence(
+            self.scene.gaussians, block, self.cache / "evidence", config
+        )
         if evidence is None:
             raise InputError(
                 f"{self.cache / 'evidence'} no longer holds the evidence of the lift, and the run stores directions "
@@ -387,7 +378,7 @@ class RecordedVotes:
             )
         return evidence
 
-    def _observe(self, views: Sequence[int]) -> tuple[ViewBatch, list[Tensor]]:
+    def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
         """Return labels, regions and features of some images of the lift, and the images at its resolution."""
         index_of = {name: index for index, name in enumerate(self.scene.train.names)}
         indices, images = [index_of[self.names[view]] for view in views], []
@@ -396,13 +387,18 @@ class RecordedVotes:
         settings = RasterSettings.recorded(self.field.manifest) if rendered else None
         kwargs: dict[str, Any] = {"render_settings": settings, "downscale": self._option("lift_downscale", int, 1)}
         kwargs |= {"on_view": lambda view: images.append(view.image)}
-        return observe_views(self.scene, indices, self._source, **kwargs), images
+        return evidence_collection.observe_views(self.scene, indices, self._source, **kwargs), images
 
     @cached_property
     def _source(self) -> FeatureSource:
-        return cached(restore_source(self.field.manifest), self.cache, compute=_is_quick)
+        """The source of the lift; a network might take minutes to compute results that are not cached."""
 
-    def _check_regions(self, view: int, block: ViewBatch) -> None:
+        def is_quick(part: Any) -> bool:
+            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))
+
+        return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
+
+    def _check_regions(self, view: int, block: evidence_collection.ViewBatch) -> None:
         """Raise if an image no longer has the regions that voted."""
         if not isinstance(self.field.store, StoredEvidence):
             return  # cached evidence was looked up by the content of the regions
@@ -424,8 +420,3 @@ class RecordedVotes:
         if not isinstance(value, (int, float) if kind is float else kind):
             raise InputError(f"the run's manifest is damaged: its option {name} is {value!r:.40}; lift again")
         return value
-
-
-def _is_quick(part: Any) -> bool:
-    """Return whether regions or an encoder may compute results that are not cached; a network might take minutes."""
-    return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))

@@ -516,7 +516,13 @@ def write_catalogue(
         OSError: a file cannot be written.
     """
     files = tuple(folder / name for name in CATALOG_FILES)
-    document = {**catalogue_to_json(catalog), **(question or {})}
+    document = {
+        "unit": catalog.unit,
+        "metres_per_unit": catalog.meters_per_unit,
+        "in_smaller_parts": catalog.num_in_small_components,
+        "objects": [asdict(item, dict_factory=_plain) for item in catalog.objects],
+        **(question or {}),
+    }
     with atomic_files(*files, overwrite=overwrite) as drafts:
         drafts[0].write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", "utf8")
         with drafts[1].open("w", newline="", encoding="utf8") as file:
@@ -526,16 +532,6 @@ def write_catalogue(
         write_box_mesh(drafts[2], catalog.objects, [item.capture.box for item in catalog.objects])
         write_box_mesh(drafts[3], catalog.objects, [item.scene.box for item in catalog.objects])
     return files
-
-
-def catalogue_to_json(catalog: Catalogue) -> dict[str, Any]:
-    """Return a catalog as plain Python types."""
-    return {
-        "unit": catalog.unit,
-        "metres_per_unit": catalog.meters_per_unit,
-        "in_smaller_parts": catalog.num_in_small_components,
-        "objects": [asdict(item, dict_factory=_plain) for item in catalog.objects],
-    }
 
 
 def _plain(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -69,11 +70,11 @@ class NormLiftCheck(NormLift):
             return rows, None
         init_cuda(device)
         rows.append(planning.diagnose_device(device))
-        options = self.source.looking_for(self.queries)
+        options, request = self.source.looking_for(self.queries), self.request()
         source = _try(rows, "2D features", lambda: make_source(options, device))
         missing = [] if source is None else planning.missing_weights(options, device)
         rows += [] if source is None else [planning.diagnose_weights(missing)]
-        opened = _try(rows, "capture", lambda: self.open_capture(start_time))
+        opened = _try(rows, "capture", lambda: planning.open_capture(request, start_time))
         if opened is None:
             return rows, None
         scene = opened.scene
@@ -82,11 +83,12 @@ class NormLiftCheck(NormLift):
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
         if self.check:
-            compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(self.compare_cameras(opened, device)))
+            compare = partial(planning.compare_cameras, opened, self.lift, device)
+            compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(compare()))
             rows += [] if compared is None else [compared]
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
-        plan = _try(rows, "plan", lambda: self.make_plan(opened, source, device))
+        plan = _try(rows, "plan", lambda: planning.plan_opened(opened, source, self.lift, device, self.num_devices))
         if plan is not None:
             rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]
         return rows, plan

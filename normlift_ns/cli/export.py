@@ -10,30 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
-from normlift_ns.cli import preflight
-from normlift_ns.cli.common import (
-    CONSOLE,
-    format_number,
-    info,
-    info_opening,
-    plain_text,
-    run_command,
-    run_command_process,
-)
+from normlift_ns import options
+from normlift_ns.cli import common, preflight
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_existing
 from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.options import (
-    FLOATER_THRESHOLD,
-    LABEL_ARRAY_FILES,
-    MAX_TRANSFER_DISTANCE,
-    OBJECT_MAX_GAP,
-    OBJECT_MIN_GAUSSIANS,
-    AskOptions,
-    CheckedOptions,
-    check_device,
-    check_prompt_list,
-)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -46,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class NormLiftExport(CheckedOptions):
+class NormLiftExport(options.CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
 
     load_config: Path
@@ -58,7 +39,7 @@ class NormLiftExport(CheckedOptions):
     part: Literal["scene", "selection", "rest", "clean"] = "scene"
     """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
     likely floaters, which are Gaussians floating in front of the cameras."""
-    ask: AskOptions = field(default_factory=AskOptions)
+    ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
     """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
     class_id and instance_id values, and <name>_objects.json the objects."""
@@ -74,18 +55,18 @@ class NormLiftExport(CheckedOptions):
     transfer: Path | None = None
     """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
     relevancies of the nearest visible Gaussian; 0 if none is near enough."""
-    transfer_distance: float = MAX_TRANSFER_DISTANCE
+    transfer_distance: float = options.MAX_TRANSFER_DISTANCE
     """Largest distance from a point to the center of its Gaussian for --transfer, > 0; larger values label more points.
     In units of the median distance from a Gaussian to the nearest one at another position."""
     transfer_coordinates: Literal["capture", "scene"] = "capture"
     """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
     them. scene: the Gaussians' coordinates, as in exported files."""
-    reach: float = OBJECT_MAX_GAP
+    reach: float = options.OBJECT_MAX_GAP
     """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
     more objects."""
-    min_size: int = OBJECT_MIN_GAUSSIANS
+    min_size: int = options.OBJECT_MIN_GAUSSIANS
     """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
-    floater_limit: float = FLOATER_THRESHOLD
+    floater_limit: float = options.FLOATER_THRESHOLD
     """Score above which a Gaussian counts as a floater for --part clean; larger values leave out fewer Gaussians."""
     overwrite: bool = False
     """Replace existing files of the same names."""
@@ -96,12 +77,12 @@ class NormLiftExport(CheckedOptions):
 
     def main(self) -> Path:
         """Write the files and return the path of the PLY file."""
-        check_device(self.device)
-        check_prompt_list("text", self.text)
+        options.check_device(self.device)
+        options.check_prompt_list("text", self.text)
         preflight.check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
         outputs = self._outputs()
         self._check_outputs(outputs)
-        info_opening(self.load_config)
+        common.info_opening(self.load_config)
         from normlift_ns.exports import EXPORTERS, read_cloud  # noqa: PLC0415
         from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
@@ -113,9 +94,9 @@ class NormLiftExport(CheckedOptions):
         job = self._job(run, cloud)
         for kind, path in outputs.items():
             for line in EXPORTERS.load(kind).write(job, path):
-                info(line)
+                common.info(line)
         if job.objects is not None:
-            CONSOLE.print(_objects_table(job.objects["queries"]))
+            common.CONSOLE.print(_objects_table(job.objects["queries"]))
         return outputs["ply"]
 
     def _job(self, run: LiftedRun, cloud: PlyData | None) -> ExportJob:
@@ -145,7 +126,7 @@ class NormLiftExport(CheckedOptions):
 
         if self.part == "clean":
             floaters = run.floaters(self.floater_limit).mask
-            info(f"{int(floaters.sum()):,} likely floaters are left out")
+            common.info(f"{int(floaters.sum()):,} likely floaters are left out")
             return ~floaters
         if answer is None or self.part == "scene":
             return torch.ones(len(run.field), dtype=torch.bool)
@@ -183,7 +164,7 @@ class NormLiftExport(CheckedOptions):
         preflight.check_new_files(*named, overwrite=self.overwrite, flags="--output-dir or --output-filename")
         preflight.check_new_files(cloud, overwrite=self.overwrite, flags="--output-dir")
         if self.arrays_dir is not None:
-            arrays = (self.arrays_dir / name for name in LABEL_ARRAY_FILES)
+            arrays = (self.arrays_dir / name for name in options.LABEL_ARRAY_FILES)
             preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
@@ -211,18 +192,18 @@ def _objects_table(queries: list[dict[str, Any]]) -> Table:
         for i, item in enumerate(entry["objects"]):
             box = item["box"]
             sizes = [high - low for low, high in zip(box["min"], box["max"])]
-            numbers = map(format_number, (item["centroid"], sizes, item["mean_reliability"]))
-            text = plain_text(entry["text"] if i == 0 else "")
+            numbers = map(common.format_number, (item["centroid"], sizes, item["mean_reliability"]))
+            text = common.plain_text(entry["text"] if i == 0 else "")
             table.add_row(text, str(item["instance_id"]), f"{item['size']:,}", *numbers)
-        text = plain_text("" if entry["objects"] else entry["text"])
+        text = common.plain_text("" if entry["objects"] else entry["text"])
         table.add_row(text, "smaller", f"{entry['in_smaller_parts']:,}")
     return table
 
 
 def entrypoint() -> None:
     """Run ns-normlift-export in a process that continues afterwards."""
-    run_command(NormLiftExport)
+    common.run_command(NormLiftExport)
 
 
 if __name__ == "__main__":
-    run_command_process(NormLiftExport)
+    common.run_command_process(NormLiftExport)

@@ -9,9 +9,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -19,17 +19,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from normlift_ns.cli import common, preflight
-from normlift_ns.cli.common import (
-    CONSOLE,
-    TerminatedError,
-    info,
-    info_progress,
-    plain_text,
-    print_error,
-    run_command,
-    run_command_process,
-    split_output_flags,
-)
 from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
@@ -37,9 +26,9 @@ from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_direct
 from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, check_number
 
 if TYPE_CHECKING:
+    from normlift_ns.api import LiftRequest
     from normlift_ns.core.scene import Scene
     from normlift_ns.distributed.communicator import TorchCommunicator
-    from normlift_ns.encoders.base import FeatureSource
     from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.planning import Plan
     from normlift_ns.progress import ProgressCallback
@@ -54,23 +43,15 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """
     started_by_us = LAUNCHED_VARIABLE in os.environ  # the process that started this one reports failures
     try:
-        with distributed_context(device, print_error) as team:
+        with distributed_context(device, common.print_error) as team:
             if team is not None and team.rank > 0:
-                CONSOLE.quiet = True
+                common.CONSOLE.quiet = True
                 warnings.simplefilter("ignore")
             yield team
-    except (KeyboardInterrupt, TerminatedError):
+    except (KeyboardInterrupt, common.TerminatedError):
         if started_by_us:
             sys.exit(1)
         raise
-
-
-class OpenedCapture(NamedTuple):
-    """An opened capture and the seconds that each stage has taken so far."""
-
-    scene: Scene
-    run_dir: Path
-    stage_seconds: dict[str, float]
 
 
 @dataclass
@@ -124,75 +105,42 @@ class NormLift(CheckedOptions):
         if self.num_devices > 1 and rank_and_world_size(os.environ) is None:
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
-                info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
+                common.info(
+                    f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster."
+                )
             words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
-            other = [*program, *split_output_flags(words)[0]]  # only the first process writes the log file
-            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], print_error)
+            # Only the first process writes the log file.
+            other = [*program, *common.split_output_flags(words)[0]]
+            code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], common.print_error)
             if code > 0:
                 sys.exit(code)
             return None
         with join_processes(self.device) as team:
             return self._lift(team)
 
+    def request(self, **more: Any) -> LiftRequest:
+        """Return the request of the lift with these options.
+
+        Args:
+            more: Other fields of the request.
+        """
+        from normlift_ns.api import LiftRequest  # noqa: PLC0415 (--help should not wait for torch)
+
+        own = {item.name: getattr(self, item.name) for item in fields(LiftRequest) if hasattr(self, item.name)}
+        return LiftRequest(**own, **more)
+
     def _plan(self) -> None:
         """Print what the lift needs, without lifting anything."""
         start_time = time.perf_counter()
-        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (loads torch)
-        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
-        from normlift_ns.planning import missing_weights  # noqa: PLC0415
+        common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        from normlift_ns.planning import dry_run  # noqa: PLC0415 (as above)
 
-        device = choose_device(self.device)
-        init_cuda(device)
-        options = self.source.looking_for(self.queries)
-        source = make_source(options, device)
-        missing = missing_weights(options, device)
-        if len(missing) > 0:
-            raise FileNotFoundError(
-                f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
-                "Download them first, or give local files with --encoder-pretrained and --sam-model."
-            )
-        opened = self.open_capture(start_time)
-        warning = self.compare_cameras(opened, device) if self.check else None
-        if warning is not None:
-            info(f"Warning: {warning}")
-        print_plan(self.make_plan(opened, source, device))
-
-    def open_capture(self, start_time: float) -> OpenedCapture:
-        """Open the capture to plan a lift of it.
-
-        Args:
-            start_time: Start of the command by `time.perf_counter`.
-        """
-        import_time = time.perf_counter()
-        scene = self.open_scene()
-        run_dir = run_directory(self.output_dir or scene.runs_dir, scene.name, self.timestamp)
-        seconds = {"start": import_time - start_time, "open": time.perf_counter() - import_time}
-        return OpenedCapture(scene, run_dir, seconds)
-
-    def compare_cameras(self, opened: OpenedCapture, device: str) -> str | None:
-        """Return a warning if images and renders of three views differ; add the time to that of the stages."""
-        from normlift_ns.api import compare_with_images  # noqa: PLC0415 (as above)
-        from normlift_ns.planning import time_kernel_loading  # noqa: PLC0415
-
-        opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, self.lift, device=device)
-        start = time.perf_counter()
-        warning = compare_with_images(opened.scene, self.lift, device)
-        opened.stage_seconds["check"] = time.perf_counter() - start
-        return warning
-
-    def make_plan(self, opened: OpenedCapture, source: FeatureSource, device: str) -> Plan:
-        """Estimate the lift from a short measurement of the opened capture."""
-        from normlift_ns.planning import make_plan, measure_capture  # noqa: PLC0415 (as above)
-
-        scene, run_dir, seconds = opened
-        facts = measure_capture(scene, source, self.lift, cache_folder(run_dir), device=device, before=seconds)
-        return make_plan(facts, num_devices=self.num_devices)
+        print_plan(dry_run(self.request(say=common.info), self.num_devices, start_time))
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
         start_time = time.perf_counter()
-        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import LiftRequest, run_lift  # noqa: PLC0415 (--help should not wait for torch)
+        common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
@@ -200,23 +148,11 @@ class NormLift(CheckedOptions):
 
         def on_message(text: str) -> None:
             message_times.append(time.perf_counter())
-            info_progress(text)
+            common.info_progress(text)
 
         with progress_bars() as report:
-            names = (
-                "open_scene",
-                "source",
-                "lift",
-                "queries",
-                "output_dir",
-                "timestamp",
-                "overwrite",
-                "check",
-                "device",
-            )
-            options: dict[str, Any] = {name: getattr(self, name) for name in names}
             export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
-            request = LiftRequest(**options, export=export, report=report, say=on_message)
+            request = self.request(export=export, report=report, say=on_message)
             if team is None:
                 run = run_lift(request)
             else:
@@ -227,8 +163,8 @@ class NormLift(CheckedOptions):
             return None
         before = {"start": import_time - start_time, "open": (message_times or [import_time])[0] - import_time}
         if not common.output_settings[-1].quiet:
-            CONSOLE.print(lift_summary(run, before, time.perf_counter() - start_time))
-        info(next_command(run.config, self.queries))
+            common.CONSOLE.print(lift_summary(run, before, time.perf_counter() - start_time))
+        common.info(next_command(run.config, self.queries))
         return run
 
     def check_early(self) -> None:
@@ -295,14 +231,14 @@ class NormLift(CheckedOptions):
 
         splat = self.load_ply or self.load_gsplat
         if splat is not None:
-            scene: Any = open_splat(splat, self.splat, say=info_progress)
+            scene: Any = open_splat(splat, self.splat, say=common.info_progress)
         else:
             scene = open_scene(cast(Path, self.load_config), data=self.data, load_step=self.load_step)
         if self.add_images is None:
             return scene
         count = len(scene.train)
         scene = add_extra_images(scene, self.add_images)
-        info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
+        common.info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
         return scene
 
 
@@ -316,14 +252,14 @@ def progress_bars() -> Iterator[ProgressCallback]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    live = CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
-    progress, tasks = Progress(*columns, console=CONSOLE), dict[str, TaskID]()
+    live = common.CONSOLE.is_terminal and common.output_settings[-1] == common.OutputSettings()
+    progress, tasks = Progress(*columns, console=common.CONSOLE), dict[str, TaskID]()
 
     def report(stage: str, done: int, total: int) -> None:
         if stage not in tasks:
             tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
             if not live:
-                info_progress(f"{names.get(stage, stage)} …")
+                common.info_progress(f"{names.get(stage, stage)} …")
         progress.update(tasks[stage], completed=done, total=total)
 
     with progress if live else nullcontext():
@@ -339,11 +275,11 @@ def print_plan(plan: Plan) -> None:
         table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
     table.add_section()
     table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
-    CONSOLE.print(table)
+    common.CONSOLE.print(table)
     gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
     subject = f"{plan.num_devices} processes share the work. Each" if plan.num_devices > 1 else "The lift"
     space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
-    info(f"{subject} needs about {gpu}{space}.")
+    common.info(f"{subject} needs about {gpu}{space}.")
 
 
 def _views(count: int) -> str:
@@ -392,7 +328,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     error = f"cosine error at most {manifest['forms'][storage]['bound']:.1e}"
     table.add_row("stored as", f"{sizes.pop(storage)}, {error}")
     table.add_row("", "instead of " + ", ".join(sizes.values()))
-    table.add_row("run", plain_text(run.folder))
+    table.add_row("run", common.plain_text(run.folder))
     return Group(Text("Lifted", style="bold green"), table, Text("Search it with:"))
 
 
@@ -449,8 +385,8 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
 
 def entrypoint() -> None:
     """Run ns-normlift in a process that continues afterwards."""
-    run_command(NormLift)
+    common.run_command(NormLift)
 
 
 if __name__ == "__main__":
-    run_command_process(NormLift)
+    common.run_command_process(NormLift)

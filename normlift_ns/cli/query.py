@@ -15,16 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from rich.table import Table
 
-from normlift_ns.cli.common import (
-    CONSOLE,
-    format_number,
-    info,
-    info_opening,
-    plain_text,
-    print_error,
-    run_command,
-    run_command_process,
-)
+from normlift_ns.cli import common
 from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
@@ -98,7 +89,7 @@ class NormLiftQuery(CheckedOptions):
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows."""
         self._check()
-        info_opening(self.load_config)
+        common.info_opening(self.load_config)
         run = self._open()
         if self.stdin:
             answer_lines(run, self.ask.rules())
@@ -135,7 +126,7 @@ class NormLiftQuery(CheckedOptions):
             if print_table is not None:
                 print_table()
         if len(written) > 0:
-            info("Written: " + ", ".join(map(str, written)))
+            common.info("Written: " + ", ".join(map(str, written)))
         return rows
 
     def _open(self) -> QuickRun:
@@ -208,7 +199,7 @@ class NormLiftQuery(CheckedOptions):
         check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
         run, question = self._run, result.question
         count = len(run.scene.train)
-        info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
+        common.info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
         cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
         segmented = query_sam3(
             run.scene, cached.find, question.texts,
@@ -317,7 +308,7 @@ def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> 
 
     file = _history_file() if keep_history else None
     session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
-    info(f"{len(run.field.arrays['source']):,} Gaussians. Type one prompt per line; Ctrl-D quits.")
+    common.info(f"{len(run.field.arrays['source']):,} Gaussians. Type one prompt per line; Ctrl-D quits.")
     while True:
         try:
             text = session.prompt("> ").strip()
@@ -330,7 +321,7 @@ def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> 
         try:
             answer = run.ask([text], **rules)
         except (InputError, OSError, MemoryError) as error:
-            print_error(str(error))
+            common.print_error(str(error))
         else:
             print_answer(answer.to_json(), answer.question)
 
@@ -396,12 +387,12 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
     """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
     rule = f"{question.rule} > {question.threshold:.4g}"
-    CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=CONSOLE.width < 100))
+    common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
         if row["stands_out"] is False:
             top, limit = row["histogram"]["top"], row["histogram"]["limit"]
-            position = "" if row["nearest"] is None else f" at {format_number(row['nearest'])}"
-            info(
+            position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
+            common.info(
                 f"{row['text']}: probably not in this scene. The nearest match{position} has relevancy {top:.3f}; "
                 f"objects in a scene usually reach at least {limit:.3g}."
             )
@@ -428,11 +419,11 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
     result.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
-        *cells, suggested = (format_number(row[name]) for name in names)
+        *cells, suggested = (common.format_number(row[name]) for name in names)
         bins = row["histogram"]
         bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
-        histogram = () if narrow else (plain_text(bars),)
-        result.add_row(plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
+        histogram = () if narrow else (common.plain_text(bars),)
+        result.add_row(common.plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
     return result
 
 
@@ -445,10 +436,10 @@ _MAX_ROWS = 40
 
 def print_catalog(catalog: Catalogue) -> None:
     """Print a table of the largest objects, in capture coordinates."""
-    table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
+    table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if common.CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
-    narrow = CONSOLE.width < 70
+    narrow = common.CONSOLE.width < 70
     vectors = ("centroid", "box", *(() if narrow else ("extent",)))
     for name in ("Gaussians", *vectors, "R", "views"):
         width = 8 if name in vectors else None  # keeps each number on one line
@@ -461,13 +452,15 @@ def print_catalog(catalog: Catalogue) -> None:
         rows = (geometry.centroid, geometry.box.size, geometry.extent)[: len(vectors)]
         numbers = (" ".join(f"{x:.3g}" for x in row) for row in rows)
         cells = (f"{item.gaussians:,}", *numbers, f"{item.reliability:.3f}", str(item.views))
-        best = () if narrow else (plain_text(" ".join(Path(name).stem for name in item.best_views)),)
-        table.add_row(str(item.id), plain_text(item.text), *cells, *best)
-    CONSOLE.print(table)
+        best = () if narrow else (common.plain_text(" ".join(Path(name).stem for name in item.best_views)),)
+        table.add_row(str(item.id), common.plain_text(item.text), *cells, *best)
+    common.CONSOLE.print(table)
     if len(catalog.objects) > _MAX_ROWS:
-        info(f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
+        common.info(
+            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all."
+        )
     if catalog.num_in_small_components > 0:
-        info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
+        common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
 
 
 # ns-normlift-query --why: the images that voted for a selection.
@@ -519,11 +512,11 @@ def save_vote_images(
 
 def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
     """Print a table of images, and a sentence per prompt about their agreement."""
-    result = explanation_table(names, texts, reasons, narrow=CONSOLE.width < 120)
+    result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
-        CONSOLE.print(result)
+        common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        info(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
+        common.info(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
 
 
 def explanation_table(
@@ -543,7 +536,7 @@ def explanation_table(
             for vote in votes:
                 shares = (f"{vote.share:.1%}", f"{vote.agreement:.3f}", f"{vote.disagreement:.0%}")
                 numbers = shares if narrow else (f"{vote.weight:,.0f}", *shares, str(len(vote.regions)))
-                result.add_row(plain_text(label), kind, plain_text(names[vote.view]), *numbers)
+                result.add_row(common.plain_text(label), kind, common.plain_text(names[vote.view]), *numbers)
                 label = ""
     return result
 
@@ -564,16 +557,18 @@ def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> No
         table.add_column(name, justify="left" if name == "text" else "right")
     for text, row in zip(texts, rows):
         names = ("centroid", "extent", "peak", "agreement", "mean_reliability")
-        numbers = (format_number(row[name]) for name in names)
+        numbers = (common.format_number(row[name]) for name in names)
         views = f"{len(row['found_in'])} of {len(row['views'])} views, {len(row['agree'])} agree"
-        table.add_row(plain_text(text), f"{row['fraction']:.2%}", *numbers, views, format_number(row["iou"]))
-    CONSOLE.print(table)
+        table.add_row(
+            common.plain_text(text), f"{row['fraction']:.2%}", *numbers, views, common.format_number(row["iou"])
+        )
+    common.CONSOLE.print(table)
 
 
 def entrypoint() -> None:
     """Run ns-normlift-query in a process that continues afterwards."""
-    run_command(NormLiftQuery)
+    common.run_command(NormLiftQuery)
 
 
 if __name__ == "__main__":
-    run_command_process(NormLiftQuery)
+    common.run_command_process(NormLiftQuery)

@@ -37,7 +37,7 @@ from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Scalars, check_tensors, check_unit_rows
 from normlift_ns.core.partition import Partition
-from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
+from normlift_ns.core.sparse import SparseRows, row_offsets, run_starts, segment_sum
 from normlift_ns.errors import InputError
 
 MIN_OVERLAP = 0.1
@@ -278,7 +278,7 @@ def region_overlaps(
     keep = (iou >= MIN_OVERLAP).nonzero().squeeze(1)
     keep = keep[(row[keep] * size + column[keep]).argsort()]
     row, column, iou, inside = row[keep], column[keep], iou[keep], inside[keep].clamp(max=1)
-    starts = _run_starts(row * views + view[column])
+    starts = run_starts(row * views + view[column])
     best = torch.segment_reduce(iou, "max", offsets=torch.cat([starts, starts.new_tensor([len(row)])]), initial=0.0)
     overlap = (best * in_regions[row[starts], view[column[starts]]]).sum()
     possible = in_regions.sum(dtype=torch.float64) - in_regions.gather(1, view[:, None]).sum(dtype=torch.float64)
@@ -301,13 +301,6 @@ def _largest_share(rows: SparseRows, share: Float64[Tensor, " s"]) -> Float64[Te
 
         return row_max(rows.offsets, rows.column, share)
     return torch.segment_reduce(share[rows.column.long()], "max", offsets=rows.offsets, initial=0.0)
-
-
-def _run_starts(key: Int64[Tensor, " m"]) -> Int64[Tensor, " g"]:
-    """Return the indices at which runs of equal keys begin."""
-    first = torch.ones_like(key, dtype=torch.bool)
-    first[1:] = key[1:] != key[:-1]
-    return first.nonzero().squeeze(1)
 
 
 def _shares(
@@ -353,7 +346,7 @@ def _group_by_view(
         The group of every entry, and the row, view and weight of every group.
     """
     row, column_view = rows.row_index(), view[rows.column.long()]
-    starts = _run_starts(row * views + column_view)
+    starts = run_starts(row * views + column_view)
     ends = torch.cat([starts, starts.new_tensor([len(row)])])
     group_of_entry = torch.repeat_interleave(torch.arange(len(starts), device=row.device), ends.diff())
     return group_of_entry, row[starts], column_view[starts], segment_sum(rows.weight, ends)
@@ -384,34 +377,20 @@ def _inner_products(
     row, weight = shares.row_index()[order].int(), shares.weight[order]
     by_region = SparseRows(row_offsets(shares.column, len(view)), row, weight)  # the transpose
     if can_use_triton(view):
+        from normlift_ns.kernels.sparse import multiply_rows  # noqa: PLC0415 (needs triton)
+
         step = max(1, _MAX_DENSE // max(1, len(view)))
         for first in range(0, len(view), step):
             last = min(len(view), first + step)
-            yield _dense_block(by_region, shares, visible, labeled, view, views, first, last)
+            area, in_regions = (multiply_rows(by_region, x, views, first, last) for x in (visible, labeled))
+            inner = multiply_rows(by_region, shares, len(view), first, last)
+            near = (inner >= (MIN_OVERLAP * area)[:, view]) & (inner > 0) & (view[first:last, None] != view)
+            row, column = near.nonzero(as_tuple=True)
+            yield area, in_regions, row + first, column, inner[row, column].double()
     else:
         by_region, shares, visible = (x.to("cpu") for x in (by_region, shares, visible))
         for block in _sparse_blocks(by_region, shares, visible, view.cpu(), views):
             yield tuple(x.to(view.device) for x in block)  # pyright: ignore[reportReturnType]
-
-
-def _dense_block(
-    by_region: SparseRows,
-    shares: SparseRows,
-    visible: SparseRows,
-    labeled: SparseRows,
-    view: Tensor,
-    views: int,
-    first: int,
-    last: int,
-) -> _Block:
-    from normlift_ns.kernels.sparse import multiply_rows  # noqa: PLC0415 (needs triton)
-
-    area, in_regions = (multiply_rows(by_region, x, views, first, last) for x in (visible, labeled))
-    inner = multiply_rows(by_region, shares, len(view), first, last)
-    row, column = ((inner >= (MIN_OVERLAP * area)[:, view]) & (inner > 0) & (view[first:last, None] != view)).nonzero(
-        as_tuple=True
-    )
-    return area, in_regions, row + first, column, inner[row, column].double()
 
 
 def _sparse_blocks(

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
+from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
+from normlift_ns.core.sparse import SparseRows, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
@@ -231,31 +231,6 @@ class Evidence:
         unlabeled = SparseRows.append_columns([part.unlabeled for part in parts], views)
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
-
-    def prune(self, *, relative: float) -> tuple[Evidence, Float64[Tensor, " n"]]:
-        """Drop entries below `relative` times the largest entry of their Gaussian, and bound the effect on f_j.
-
-        Let d_j be the dropped share of W_j. For any table of unit features, f_j and ||f_j|| change by at most 2 d_j,
-        because f' - f = d_j f' - dropped / W_j. The direction changes by at most 4 d_j / (||f_j|| + ||f'_j||).
-        Unlabeled weight stays.
-
-        Args:
-            relative: threshold in 0..1; the largest entry of a Gaussian always stays.
-        Returns:
-            The smaller evidence, and the bound 2 d_j on |f_j - f'_j| for every Gaussian.
-        Raises:
-            ValueError: if `relative` is outside 0..1.
-        """
-        if not 0 <= relative <= 1:
-            raise InputError(f"relative must be in 0..1, got {relative}")
-        weight, row = self.rows.weight, self.rows.row_index()
-        largest = weight.new_zeros(self.num_gaussians).scatter_reduce_(0, row, weight, "amax", include_self=False)
-        keep = weight >= relative * largest[row]
-        total = self.rows.row_sums()
-        dropped = segment_sum(torch.where(keep, 0.0, weight.double()), self.rows.offsets)
-        bound = torch.where(total > 0, 2 * dropped / total, 0.0)
-        rows = SparseRows(row_offsets(row[keep], self.num_gaussians), self.rows.column[keep], weight[keep])
-        return replace(self, rows=rows), bound
 
     def to(self, device: torch.device | str) -> Evidence:
         """Return a copy on another device."""

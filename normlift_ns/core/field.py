@@ -6,15 +6,15 @@ By default, a field uses the smallest storage that meets the requested tolerance
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
@@ -26,7 +26,7 @@ from normlift_ns.core.lowrank import (
     smallest_basis,
     store_directions,
 )
-from normlift_ns.core.partition import spatial_order
+from normlift_ns.core.partition import Partition, spatial_order
 from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
@@ -101,17 +101,12 @@ class SemanticField:
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
                 f"{None if source is None else len(source)}"
             )
-        check_storage(storage, tolerance)
-        basis = smallest_basis(lifted, tolerance)
-        forms = sizes_and_bounds(lifted, basis)
-        form = choose_form(forms, storage, tolerance)
-        if form == "evidence":
+        facts, basis = choose_form(lifted, storage, tolerance)
+        if facts["form"] == "evidence":
             store = StoredEvidence(lifted.evidence, lifted.features.float())
         else:
-            rows = basis.rows if form == "low_rank" and basis is not None else None
-            store = store_directions(lifted, rows, spatial_order(means))
+            store = store_directions(lifted, basis, spatial_order(means))
         source = torch.arange(n, device=means.device) if source is None else source
-        facts = {"form": form, "tolerance": tolerance, "forms": forms}
         return SemanticField.assemble(lifted.scalars, source, store, means, provenance=provenance or {}, facts=facts)
 
     @staticmethod
@@ -139,7 +134,8 @@ class SemanticField:
             "means_fingerprint": fingerprint(means),
             **facts,
         }
-        return SemanticField(scalars.map(_to_single), source.int(), store, manifest, means.detach().float())
+        scalars = scalars.map(lambda x: x.float() if x.dtype == torch.float64 else x)
+        return SemanticField(scalars, source.int(), store, manifest, means.detach().float())
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
@@ -215,7 +211,10 @@ class SemanticField:
             )
         # a folder without a manifest is incomplete and may be overwritten
         (folder / MANIFEST_FILE).unlink(missing_ok=True)
-        digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
+        stored = {"features": self.store.features} if isinstance(self.store, StoredEvidence) else vars(self.store)
+        named = {"source": self.source, "means": self.means, **vars(self.scalars), **stored}
+        tensors = {name: tensor for name, tensor in named.items() if tensor is not None}
+        digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, tensors, overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
         else:
@@ -249,53 +248,39 @@ class SemanticField:
         return SemanticField(scalars, tensors["source"], store, manifest, tensors.get("means"))
 
 
-def check_storage(storage: str, tolerance: float) -> None:
-    """Raise ValueError if the storage is unknown or the tolerance is not positive."""
+def choose_form(
+    lifted: Lifted, storage: str, tolerance: float, portion: Partition | None = None
+) -> tuple[dict[str, Any], Float64[Tensor, "r d"] | None]:
+    """Choose the storage form: the requested one, or for "auto" the smallest whose bound is within the tolerance.
+
+    Args:
+        portion: Gaussians of the lift, if several processes share them.
+    Returns:
+        The choice and all forms, for the manifest, and the basis of "low_rank".
+    Raises:
+        ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
+    """
     if not tolerance > 0:
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
         raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
-
-
-def choose_form(forms: Mapping[str, Mapping[str, Any]], storage: str, tolerance: float) -> str:
-    """Return the storage form: the requested one, or for "auto" the smallest whose bound is within the tolerance.
-
-    Raises:
-        ValueError: if no rank meets the tolerance of "low_rank".
-    """
+    basis = smallest_basis(lifted, tolerance, None if portion is None else portion.communicator)
+    forms = sizes_and_bounds(lifted, basis, portion)
     if storage == "auto":
         allowed = (name for name, form in forms.items() if form["bound"] <= tolerance)
-        return min(allowed, key=lambda name: forms[name]["bytes"])
-    if storage not in forms:
+        storage = min(allowed, key=lambda name: forms[name]["bytes"])
+    elif storage not in forms:
         raise InputError(
             f"no basis keeps every Gaussian within tolerance {tolerance}; raise the tolerance, or use storage "
             "float16 or evidence"
         )
-    return storage
+    rows = basis.rows if storage == "low_rank" and basis is not None else None
+    return {"form": storage, "tolerance": tolerance, "forms": forms}, rows
 
 
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:
     """Return the BLAKE2 hash of the float32 bytes of the means, which identifies a set of Gaussians."""
     return hashlib.blake2b(means.detach().float().contiguous().cpu().numpy().tobytes(), digest_size=16).hexdigest()
-
-
-def _to_single(values: Tensor) -> Tensor:
-    return values.float() if values.dtype == torch.float64 else values
-
-
-def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
-    yield "source", semantic_field.source
-    if semantic_field.means is not None:
-        yield "means", semantic_field.means
-    for f in fields(Scalars):
-        yield f.name, getattr(semantic_field.scalars, f.name)
-    store = semantic_field.store
-    if isinstance(store, StoredEvidence):
-        yield "features", store.features
-    else:
-        yield "coordinates", store.coordinates
-        if store.basis is not None:
-            yield "basis", store.basis
 
 
 def _check_belongs(

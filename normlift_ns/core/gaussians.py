@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -159,6 +159,10 @@ class Camera:
             )
         if self.width < 1 or self.height < 1:
             raise InputError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")
+
+    def camera_to_world(self) -> Float64[Tensor, "4 4"]:
+        """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
+        return self.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
 
     def downscaled(self, factor: float) -> Camera:
         """Return the camera with its size multiplied by at most 1.

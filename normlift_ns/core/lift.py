@@ -13,9 +13,9 @@ Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32
@@ -112,21 +112,10 @@ class Lifted:
             return self._directions(gaussians, dtype)
         result = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
         first = 0
-        for rows in gaussians.split(self._step):
+        for rows in gaussians.split(max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))):
             result[first : first + len(rows)] = self._directions(rows, dtype)
             first += len(rows)
         return result
-
-    def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
-        """Yield u_j with bounded memory, as (first Gaussian, block of consecutive Gaussians)."""
-        n, device = self.evidence.num_gaussians, self.features.device
-        for first in range(0, n, self._step):
-            rows = torch.arange(first, min(n, first + self._step), device=device)
-            yield first, self._directions(rows, self.features.dtype)
-
-    @property
-    def _step(self) -> int:
-        return max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))
 
     def _directions(self, gaussians: Tensor, dtype: torch.dtype) -> Tensor:
         rows, table = self.evidence.rows, self.features
@@ -138,20 +127,6 @@ class Lifted:
         sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
         length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
-
-
-class _Sums(NamedTuple):
-    """Sums per Gaussian, in float64 except for the last."""
-
-    total: Tensor
-    """||sum_v S_jv||"""
-    by_view: Tensor
-    """sum_v ||S_jv||"""
-    weight: Tensor
-    """W_j"""
-    weight_squared: Tensor
-    """sum_v W_jv ** 2"""
-    view_count: Tensor
 
 
 def lift(
@@ -238,18 +213,16 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
 
-def _sums(evidence: Evidence, table: Tensor) -> _Sums:
+def _sums(evidence: Evidence, table: Tensor) -> tuple[Tensor, ...]:
+    """Return ||sum_v S_jv||, sum_v ||S_jv||, and the results of `_weights`, per Gaussian."""
     if _has_kernel(table):
         from normlift_ns.kernels.sparse import row_norms  # noqa: PLC0415 (needs triton)
 
         rows = evidence.rows
-        return _Sums(
-            *row_norms(
-                rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLATION_RATIO, MANY_ENTRIES
-            )
-        )
+        arrays = (rows.offsets, rows.column, rows.weight, evidence.region_view, table)
+        return row_norms(*arrays, CANCELLATION_RATIO, MANY_ENTRIES)
     total, by_view = _row_norms(evidence.rows, table), _sum_of_view_norms(evidence, table)
-    return _Sums(total, by_view, *_weights(evidence.view_weights()))
+    return total, by_view, *_weights(evidence.view_weights())
 
 
 def _weights(view_weights: SparseRows) -> tuple[Tensor, Tensor, Tensor]:

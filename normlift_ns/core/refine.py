@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
@@ -171,7 +172,13 @@ def refine_subset(
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
         if on_gpu and rows.dtype != torch.float64 and config.k <= _MAX_KERNEL_NEIGHBORS:
-            _vote_on_gpu(inputs, voters, rows, row_of, source, decay)
+            from normlift_ns.kernels.vote import vote as vote_on_gpu  # noqa: PLC0415 (needs triton)
+
+            scores = reliability.float().contiguous()
+            arrays = (voters, neighbors.index, neighbors.distance, rows.contiguous(), row_of, scores, source)
+            numbers: Any = {name: getattr(config.numbers, name) for name in ("tau", "gamma", "delta")}
+            evidence = None if own is None else own.float().contiguous()
+            vote_on_gpu(*arrays, own=evidence, prior=config.prior, width=decay, **numbers)
         else:
             _vote(inputs, voters, rows, row_of, source)
 
@@ -231,29 +238,6 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
         best, choice = score[:, 1:].max(dim=1)
         wins = best > score[:, 0] + margin
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
-
-
-def _vote_on_gpu(
-    inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tensor, source: Tensor, width: float
-) -> None:
-    from normlift_ns.kernels.vote import vote  # noqa: PLC0415 (needs triton)
-
-    config, own = inputs.config, inputs.own
-    vote(
-        voters,
-        inputs.neighbors.index,
-        inputs.neighbors.distance,
-        directions.contiguous(),
-        row_of,
-        inputs.reliability.float().contiguous(),
-        source,
-        own=None if own is None else own.float().contiguous(),
-        prior=config.prior,
-        tau=config.numbers.tau,
-        gamma=config.numbers.gamma,
-        width=width,
-        delta=config.numbers.delta,
-    )
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:

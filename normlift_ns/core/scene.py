@@ -38,6 +38,19 @@ class View(NamedTuple):
     original: tuple[int, int] | None = None
     """Width and height of the image before it was undistorted; None: it was not undistorted."""
 
+    def downscaled(self, height: int, width: int) -> View:
+        """Downscale by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
+        camera = self.camera
+        scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
+
+        def averaged(image: Tensor) -> Tensor:
+            channels = image.permute(2, 0, 1)[None].float()
+            return torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)
+
+        mask = None if self.mask is None else averaged(self.mask[:, :, None])[:, :, 0] > 0.999
+        smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
+        return self._replace(camera=smaller, image=averaged(self.image).round().to(torch.uint8), mask=mask)
+
 
 @runtime_checkable
 class Views(Protocol):

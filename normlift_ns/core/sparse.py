@@ -240,13 +240,18 @@ def sum_equal_keys(
     """
     key, order = key.sort(stable=True)
     weight = weight[order]
-    starts = torch.ones_like(key, dtype=torch.bool)
-    starts[1:] = key[1:] != key[:-1]
-    first = starts.nonzero().squeeze(1)
+    first = run_starts(key)
     if first.numel() == key.numel():
         return key, weight
     summed = segment_sum(weight, torch.cat([first, first.new_tensor([key.numel()])]))
     return key[first], summed.to(weight.dtype)
+
+
+def run_starts(key: Int[Tensor, " m"]) -> Int64[Tensor, " g"]:
+    """Return the indices at which runs of equal keys begin."""
+    first = torch.ones_like(key, dtype=torch.bool)
+    first[1:] = key[1:] != key[:-1]
+    return first.nonzero().squeeze(1)
 
 
 def row_offsets(row: Int[Tensor, " nnz"], num_rows: int) -> Int64[Tensor, " rows_plus_1"]:

@@ -148,15 +148,7 @@ def _shrink(view: View) -> _SmallView:
     camera = view.camera
     divisor = max(1.0, max(camera.width, camera.height) / _MAX_RENDER_SIDE)
     width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
-    channels = view.image.permute(2, 0, 1)[None].float()
-    image = torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)
-    mask = view.mask
-    if mask is not None:
-        coverage = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
-        mask = coverage > 0.999
-    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
-    return View(smaller, image.round().to(torch.uint8), mask, view.name), divisor
+    return view.downscaled(height, width), divisor
 
 
 def _mean_psnr(render: Callable[[_SmallView, float], Tensor], views: Sequence[_SmallView], factor: float) -> float:

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from normlift_ns.core.gaussians import Camera
+from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import WorldTransform, transform_frames
 from normlift_ns.data.open_scene import AnyScene, SplatScene, with_frames
-from normlift_ns.data.open_splat import read_camera_file
 from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions

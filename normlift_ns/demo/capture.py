@@ -79,7 +79,7 @@ def write_capture(
         "train_filenames": paths[:views],
         "val_filenames": paths[views:],
         "test_filenames": paths[views:],
-        "frames": [{"file_path": p, "transform_matrix": _opengl_pose(c).tolist()} for p, c in zip(paths, cameras)],
+        "frames": [{"file_path": p, "transform_matrix": c.camera_to_world().tolist()} for p, c in zip(paths, cameras)],
     }
     labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
     for name, content in (("transforms.json", transforms), ("labels.json", labels)):
@@ -113,11 +113,6 @@ def _look_at(
     focal = width / 2 / math.tan(math.radians(_FIELD_OF_VIEW) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(K, pose.float(), width, height)
-
-
-def _opengl_pose(camera: Camera) -> Float[Tensor, "4 4"]:
-    """Return camera to world with x right, y up, z backward."""
-    return camera.world_to_camera.double().inverse() * torch.tensor([1, -1, -1, 1], dtype=torch.float64)
 
 
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:

@@ -16,22 +16,15 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from normlift_ns import api, pipeline
+from normlift_ns.core import lowrank
 from normlift_ns.core.consensus import (
     Consensus,
     check_consensus_inputs,
     sample_gaussians,
     sampled_consensus,
 )
-from normlift_ns.core.field import SemanticField, check_storage, choose_form
+from normlift_ns.core.field import SemanticField, choose_form
 from normlift_ns.core.lift import Lifted
-from normlift_ns.core.lowrank import (
-    StoredDirections,
-    StoredEvidence,
-    arrange_directions,
-    encode_directions,
-    sizes_and_bounds,
-    smallest_basis,
-)
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
 from normlift_ns.core.refine import decay_width, refine_subset
@@ -211,34 +204,28 @@ def build_field_distributed(
         tolerance, storage: as in `SemanticField.build`.
         provenance: as in `SemanticField.build`; only that of process 0 is used.
     """
-    check_storage(storage, tolerance)
-    basis = smallest_basis(lifted, tolerance, portion.communicator)
-    forms = sizes_and_bounds(lifted, basis, portion)
-    form = choose_form(forms, storage, tolerance)
-    if form == "evidence":
-        store = _gather_evidence(lifted, portion)
-    else:
-        store = _gather_directions(lifted, basis.rows if form == "low_rank" and basis is not None else None, portion)
+    facts, basis = choose_form(lifted, storage, tolerance, portion)
+    is_evidence = facts["form"] == "evidence"
+    store = _gather_evidence(lifted, portion) if is_evidence else _gather_directions(lifted, basis, portion)
     scalars = lifted.scalars.map(portion.all_gather)
     sources = portion.all_gather(portion.indices.int() if source is None else source.int())
     if store is None:
         return None
-    facts = {"form": form, "tolerance": tolerance, "forms": forms}
     return SemanticField.assemble(scalars, sources, store, means, provenance=provenance, facts=facts)
 
 
-def _gather_evidence(lifted: Lifted, portion: Partition) -> StoredEvidence | None:
+def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEvidence | None:
     """Return E and F of all portions in process 0, and None in the others."""
     rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
     if rows is None or unlabeled is None:
         return None
-    return StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
+    return lowrank.StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
 
 
-def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> StoredDirections | None:
+def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> lowrank.StoredDirections | None:
     """Return the directions of all Gaussians with evidence in process 0, and None in the others."""
-    coordinates, rows = encode_directions(lifted, basis, portion.blocks())
+    coordinates, rows = lowrank.encode_directions(lifted, basis, portion.blocks())
     parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:
         return None
-    return arrange_directions(parts, gaussians, basis, len(portion.order))
+    return lowrank.arrange_directions(parts, gaussians, basis, len(portion.order))

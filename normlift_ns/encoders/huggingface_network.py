@@ -25,15 +25,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import linear
 
+from normlift_ns.encoders import huggingface
 from normlift_ns.encoders.crops import NetworkEncoder
-from normlift_ns.encoders.huggingface import (
-    TOKENIZER_FILE,
-    ModelFamily,
-    ModelFolder,
-    check_model_name,
-    fetch_model,
-    read_model_folder,
-)
 from normlift_ns.encoders.weights import third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
@@ -50,7 +43,7 @@ class HuggingFaceNetwork:
 
     model: Any
     tokenizer: Any
-    folder: ModelFolder
+    folder: huggingface.ModelFolder
     mean: Float[Tensor, "3 1 1"]
     std: Float[Tensor, "3 1 1"]
 
@@ -100,7 +93,7 @@ class HuggingFaceNetwork:
         vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
         if largest >= vocab_size:
             raise InputError(
-                f"{TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has "
+                f"{huggingface.TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has "
                 f"{vocab_size} tokens"
             )
         inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
@@ -168,7 +161,9 @@ def _pooled_output(output: Any) -> Tensor:
     return output if isinstance(output, Tensor) else output.pooler_output
 
 
-def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: str) -> HuggingFaceNetwork:
+def load_huggingface_network(
+    folder: huggingface.ModelFolder, family: huggingface.ModelFamily, device: str
+) -> HuggingFaceNetwork:
     """Load the network of a model folder.
 
     Raises:
@@ -188,7 +183,7 @@ def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: s
     return HuggingFaceNetwork(model, tokenizer, folder, mean, std)
 
 
-def _build_model(folder: ModelFolder) -> Any:
+def _build_model(folder: huggingface.ModelFolder) -> Any:
     """Build the model from the checked sizes and load its weights in float32."""
     transformers = importlib.import_module("transformers")
     name = _CLASSES[folder.model_type]
@@ -214,13 +209,13 @@ def _build_model(folder: ModelFolder) -> Any:
     return model
 
 
-def _load_tokenizer(folder: ModelFolder, config: Any) -> Any:
+def _load_tokenizer(folder: huggingface.ModelFolder, config: Any) -> Any:
     """Load the tokenizer; it pads texts to the length used in training, and truncates longer ones."""
-    tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / TOKENIZER_FILE))
+    tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / huggingface.TOKENIZER_FILE))
     length, tokens = cast(int, config.max_position_embeddings), folder.tokens
     pad_id = tokenizer.token_to_id(tokens.pad_token)
     if pad_id is None:
-        raise InputError(f"{TOKENIZER_FILE} does not contain the padding token {tokens.pad_token!r:.40}")
+        raise InputError(f"{huggingface.TOKENIZER_FILE} does not contain the padding token {tokens.pad_token!r:.40}")
     tokenizer.enable_truncation(length)
     tokenizer.enable_padding(direction=tokens.padding_side, pad_id=pad_id, pad_token=tokens.pad_token, length=length)
     return tokenizer
@@ -235,7 +230,7 @@ class HuggingFaceEncoder(NetworkEncoder):
         FileNotFoundError: If the folder does not exist.
     """
 
-    family: ModelFamily
+    family: huggingface.ModelFamily
     model: str
     """Folder, or name on the hub."""
     fill: CropFill = "black"
@@ -243,7 +238,7 @@ class HuggingFaceEncoder(NetworkEncoder):
     template: str = "{}"
 
     def _check_names(self) -> None:
-        check_model_name(self.model, self.family)
+        huggingface.check_model_name(self.model, self.family)
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
@@ -267,5 +262,5 @@ class HuggingFaceEncoder(NetworkEncoder):
         return text
 
     @cached_property
-    def _folder(self) -> ModelFolder:
-        return read_model_folder(fetch_model(self.model, self.family), self.family)
+    def _folder(self) -> huggingface.ModelFolder:
+        return huggingface.read_model_folder(huggingface.fetch_model(self.model, self.family), self.family)

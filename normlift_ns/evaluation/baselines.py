@@ -12,11 +12,11 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from normlift_ns.core.consensus import consensus, with_original_reliability
+from normlift_ns.core.consensus import consensus
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -29,13 +29,14 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.protocols import EvaluatedRun, Rasterize, rasterizer
 from normlift_ns.evidence_collection import (
     ViewBatch,
+    ViewObservations,
     cells_to_regions,
     chunk_views,
     observe_views,
-    region_levels,
     sample_evenly,
 )
 from normlift_ns.options import LiftOptions
+from normlift_ns.pipeline import consensus_options, lift_features
 from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
 
@@ -63,7 +64,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     Raises:
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
-    evidence, features, _ = _evidence_again(lifted, device, _CELL_EVIDENCE[name])
+    evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
     scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.map(Tensor.cpu)
     own, manifest = torch.arange(evidence.num_gaussians, dtype=torch.int32), {"dimension": features.shape[1]}
@@ -83,38 +84,34 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     Raises:
         ValueError, FileNotFoundError: as `lifted_batches`.
     """
-    manifest, defaults = lifted.field.manifest, LiftOptions()
+    manifest = lifted.field.manifest
     options = manifest.get("options", {})
     if options.get("consensus", False) == enabled:
         return lifted
-    cells = partial(_plain, power=options.get("weight_power", 1))
-    evidence, features, level = _evidence_again(lifted, device, cells)
-    lift_kwargs = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
-    result = lift(evidence, features, **lift_kwargs)
+    views = _observe_again(lifted, device, partial(_plain, power=options.get("weight_power", 1)))
+    names = ("beta", "unlabeled", "consensus_power", "consensus_sample", "consensus_least")
+    given: dict[str, Any] = {name: options[name] for name in names if options.get(name) is not None}
+    relift, table = LiftOptions(consensus=enabled, **given), views.features
     if enabled:
-        kwargs = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
-        kwargs = {key: value for key, value in kwargs.items() if value is not None}
-        table = consensus(evidence, features, level=level, **kwargs).features
-        after = lift(evidence, table, **lift_kwargs)
-        result = replace(after, scalars=with_original_reliability(after.scalars, result.scalars))
-    own = torch.arange(evidence.num_gaussians, dtype=torch.int32)
-    store = StoredEvidence(evidence.to("cpu"), result.features.cpu())
+        table = consensus(views.evidence, table, level=views.level, **consensus_options(relift)).features
+    result, _ = lift_features(views, table, relift)
+    own = torch.arange(views.evidence.num_gaussians, dtype=torch.int32)
+    store = StoredEvidence(views.evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": enabled}}
     return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
 
 
-def _evidence_again(
+def _observe_again(
     lifted: EvaluatedRun, device: str, cells: Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]
-) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
+) -> ViewObservations:
     """Return evidence, features and levels of the regions of the lift, from the evidence of the cells."""
     gaussians = lifted.scene.gaussians.to(device)
     rasterize = rasterizer(lifted.scene, lifted.settings, gaussians)
-    parts, tables, levels = [], [], []
-    for block in lifted_batches(lifted, device):
-        parts.append(cells_to_regions(cells(rasterize, gaussians, block), block))
-        tables += block.features
-        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
-    return Evidence.merge(*parts), torch.cat(tables).to(device), torch.cat(levels)
+    views = ViewObservations.merge(
+        ViewObservations.of_block(block, cells_to_regions(cells(rasterize, gaussians, block), block))
+        for block in lifted_batches(lifted, device)
+    )
+    return views._replace(features=views.features.to(device))
 
 
 def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None = None) -> Iterator[ViewBatch]:

@@ -432,13 +432,9 @@ class Pose:
 
     def to_json(self) -> dict[str, Any]:
         """Return the pose as JSON types."""
-        pose = self.camera_to_world()
+        pose = self.camera.camera_to_world()
         numbers = {name: getattr(self, name) for name in ("field_of_view", "gain", "regions", "shown")}
         return {"position": pose[:3, 3].tolist(), "camera_to_world": pose.tolist(), **numbers}
-
-    def camera_to_world(self) -> Float64[Tensor, "4 4"]:
-        """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
-        return self.camera.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -612,7 +608,7 @@ def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
     width, height = (poses[0].camera.width, poses[0].camera.height)
     cameras = [
         {
-            "camera_to_world": pose.camera_to_world().flatten().tolist(),
+            "camera_to_world": pose.camera.camera_to_world().flatten().tolist(),
             "fov": pose.field_of_view,
             "aspect": width / height,
         }

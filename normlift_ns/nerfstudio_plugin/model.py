@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -75,12 +75,6 @@ class NormLiftModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
     """Folder of the semantic field (normlift/ in a lifted run), relative to config.yml. None: plain splatfacto."""
-
-    @staticmethod
-    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
-        """Return the same config with a semantic field; every other value is copied."""
-        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
-        return NormLiftModelConfig(**values, semantics=semantics)
 
 
 class NormLiftModel(SplatfactoModel):

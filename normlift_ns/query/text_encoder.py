@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from normlift_ns.encoders.registry import (
-    EncoderKind,
     absolute_paths,
     encoder_kind,
     find_encoder_kind,
@@ -120,11 +119,11 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
         return kind.texts(options, device, cache, recorded)
-    return _cached_texts(kind, options, device, cache, recorded)
+    return _cached_texts(options, device, cache, recorded)
 
 
 def _cached_texts(
-    kind: EncoderKind, options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
+    options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
     """Return a cached text encoder, which loads the network for new prompts and checks that it is that of the lift."""
 

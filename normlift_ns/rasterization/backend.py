@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int32
@@ -14,14 +14,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.errors import InputError
-from normlift_ns.rasterization.projection import (
-    PreparedGaussians,
-    ProjectedGaussians,
-    TileLists,
-    assign_tiles,
-    prepare_gaussians,
-    project,
-)
+from normlift_ns.rasterization import projection
 from normlift_ns.rasterization.settings import RasterSettings
 
 
@@ -38,14 +31,14 @@ class RasterJob:
     """Exponent p of the evidence, the sums of A_ij ** p."""
 
     @cached_property
-    def prepared(self) -> PreparedGaussians:
+    def prepared(self) -> projection.PreparedGaussians:
         """The drawable Gaussians, prepared for any camera."""
-        return prepare_gaussians(self.scene, self.dtype)
+        return projection.prepare_gaussians(self.scene, self.dtype)
 
-    def project(self, camera: Camera) -> tuple[ProjectedGaussians, TileLists]:
+    def project(self, camera: Camera) -> tuple[projection.ProjectedGaussians, projection.TileLists]:
         """Project the Gaussians into a camera and list them by tile."""
-        projected = project(self.prepared, camera, self.settings, self.antialiased)
-        return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
+        projected = projection.project(self.prepared, camera, self.settings, self.antialiased)
+        return projected, projection.assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
 
 
 def check_gpu(backend: str, job: RasterJob) -> None:
@@ -70,13 +63,8 @@ class RasterBatch(NamedTuple):
 class Backend(Protocol):
     """Rasterization backend, implemented by the modules `numba`, `gsplat` and `triton` of this package."""
 
-    def check(self, job: RasterJob, *, pictures: bool) -> None:
-        """Raise ValueError, with an alternative, if the backend cannot do the job.
-
-        Args:
-            job: Inputs of the call.
-            pictures: Whether to composite values; False: sum evidence.
-        """
+    def check(self, job: RasterJob) -> None:
+        """Raise ValueError, with an alternative, if the backend cannot do the job."""
         ...
 
     def in_flight(self, job: RasterJob, camera: Camera) -> int:
@@ -94,14 +82,10 @@ class Backend(Protocol):
         ...
 
 
-@dataclass(frozen=True)
 class TileBackend:
-    """Backend that uses projected Gaussians and tile lists, one view at a time, in any precision."""
+    """Backend of plain torch: projected Gaussians and tile lists, one view at a time, in any precision."""
 
-    kernels: Any
-    """Module with `view_evidence` and `composite`."""
-
-    def check(self, job: RasterJob, *, pictures: bool) -> None:
+    def check(self, job: RasterJob) -> None:
         """Accept every job on any device."""
 
     def in_flight(self, job: RasterJob, camera: Camera) -> int:
@@ -110,11 +94,11 @@ class TileBackend:
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)
         (camera,), (labels,), (count,) = batch
-        return self.kernels.view_evidence(*job.project(camera), labels, count, job.weight_power, job.settings)
+        return projection.view_evidence(*job.project(camera), labels, count, job.weight_power, job.settings)
 
     def composite(  # noqa: D102 (as in the protocol)
         self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
         projected, tiles = job.project(camera)
         visible_values = values[projected.gaussian].to(projected.opacities.dtype)
-        return self.kernels.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)
+        return projection.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)

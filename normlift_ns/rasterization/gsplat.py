@@ -116,7 +116,7 @@ def _project_enormous(
             opacities[view, index] = projected.opacities[overflows]
 
 
-def check(job: RasterJob, *, pictures: bool = False) -> None:
+def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not float32 on a GPU, or needs constants that gsplat was not compiled with."""
     check_gpu("gsplat", job)
     compiled = installed_settings()

@@ -23,7 +23,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 _Triple = tuple[Any, Any, Any]
 
 
-def check(job: RasterJob, *, pictures: bool) -> None:
+def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not on the CPU."""
     device = job.scene.means.device
     if device.type != "cpu":

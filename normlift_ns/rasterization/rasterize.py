@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib import import_module
 from itertools import groupby, islice, zip_longest
 from typing import Any, NamedTuple, TypedDict, cast, get_args
 
@@ -45,55 +46,26 @@ def view_colors(
 # Table of the rasterization backends, and the choice of one for a job.
 
 
-def _torch() -> Backend:
-    from normlift_ns.rasterization import projection  # noqa: PLC0415 (load each backend at its first use)
-
-    return TileBackend(projection)
-
-
-def _numba() -> Backend:
-    from normlift_ns.rasterization import numba  # noqa: PLC0415 (importing numba takes a second)
-
-    return numba
-
-
-def _gsplat() -> Backend:
-    from normlift_ns.rasterization import gsplat  # noqa: PLC0415
-
-    return gsplat
-
-
-def _triton() -> Backend:
-    if not has_triton():
-        raise InputError(
-            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
-        )
-    from normlift_ns.rasterization import triton  # noqa: PLC0415
-
-    return triton
-
-
-BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
-"""Backends by name, from the most general to the fastest."""
-
-
-def choose_backend(name: str, job: RasterJob, *, pictures: bool) -> tuple[str, Backend]:
+def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
     """Return a backend and its name; "auto" selects the fastest backend that can do the job.
 
     Args:
         name: Name of the backend, or "auto".
         job: Inputs of the call.
-        pictures: Whether to composite values; False: sum evidence.
 
     Raises:
         ValueError: If the name is unknown or the backend cannot do the job.
     """
     if name == "auto":
         name = _fastest(job)
-    if name not in BACKENDS:
+    if name not in get_args(BackendName):
         raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
-    backend = BACKENDS[name]()
-    backend.check(job, pictures=pictures)
+    if name == "triton" and not has_triton():
+        raise InputError(
+            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
+        )
+    backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
+    backend.check(job)
     return name, backend
 
 
@@ -176,7 +148,7 @@ def rasterize_evidence(
     if weight_power not in (0, 1, 2):
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, **options)
-    _, chosen = choose_backend(backend, job, pictures=False)
+    _, chosen = choose_backend(backend, job)
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -221,7 +193,7 @@ def resolve_backend(
         ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
     """
     job = _job(scene, "classic", settings, dtype, weight_power)
-    return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
+    return cast(BackendName, choose_backend(backend, job)[0])
 
 
 def render(
@@ -263,7 +235,7 @@ def render(
     if values.ndim != 2 or len(values) != len(scene):
         raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
-    _, chosen = choose_backend(backend, job, pictures=True)
+    _, chosen = choose_backend(backend, job)
     with torch.no_grad():
         return chosen.composite(job, camera, values)
 

@@ -34,7 +34,7 @@ _SHORT = 2**15
 """Largest number of cells in a batch that int16 can index, which takes half the time of int32 to sort."""
 
 
-def check(job: RasterJob, *, pictures: bool = False) -> None:
+def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not float32 on a GPU, or tiles cannot be divided into cells."""
     size = job.settings.tile_size
     check_gpu("triton", job)

@@ -26,19 +26,7 @@ from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer, Finding
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.rendering.colors import (
-    COLORMAPS,
-    MAX_OVERLAY_OPACITY,
-    RELIABILITY_COLORMAP,
-    Colormap,
-    add_color_bar,
-    add_prompt_legend,
-    apply_colormap,
-    clip_text,
-    colormap_rgb,
-    load_font,
-    prompt_colors,
-)
+from normlift_ns.rendering import colors
 
 _MIN_SPAN = 0.05
 """Smallest difference between the relevancies at the ends of a color scale."""
@@ -61,7 +49,7 @@ class Display:
     """Relevancies at the two ends of the overlay's colors."""
     map_scale: tuple[float, float]
     """Relevancies at the two ends of the colors in maps of the whole scene."""
-    colormap: Colormap
+    colormap: colors.Colormap
     """Colormap of the overlay."""
     texts: tuple[str, ...]
     """The prompts."""
@@ -91,7 +79,7 @@ def make_display(
     answer: Answer | None = None,
     *,
     shown: int | None = None,
-    colormap: Colormap = COLORMAPS[0],
+    colormap: colors.Colormap = colors.COLORMAPS[0],
     selection: Bool[Tensor, " n"] | None = None,
     drawn: Bool[Tensor, " n"] | None = None,
     by_hand: bool = False,
@@ -119,7 +107,7 @@ def make_display(
     columns = (shown_relevancy, selected, selected_by_any, scalars.reliability, scalars.n_eff)
     values = torch.cat([relevancy.float(), torch.stack([c.float() for c in columns], dim=1)], dim=1)
     texts = () if answer is None else answer.texts
-    return Display(values, scale, whole, colormap, texts, prompt_colors(texts).to(values), shown, drawn, by_hand)
+    return Display(values, scale, whole, colormap, texts, colors.prompt_colors(texts).to(values), shown, drawn, by_hand)
 
 
 def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float, float]:
@@ -177,18 +165,18 @@ def render_outputs(
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
     _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
     opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
-    overlaid, segmented = _over_gray(rgb, prompt_colors([""])[0].to(rgb), opacity), _gray(rgb)
+    overlaid, segmented = _over_gray(rgb, colors.prompt_colors([""])[0].to(rgb), opacity), _gray(rgb)
     outputs = {f"relevancy_{i}": image[:, :, i : i + 1] for i in range(count)}
     if count > 0:
         segmented = segmentation(rgb, pixel[:, :, :count].argmax(dim=2), selected_by_any, display.palette)
-        segmented = add_prompt_legend(segmented, display.texts, display.palette)
+        segmented = colors.add_prompt_legend(segmented, display.texts, display.palette)
     if count > 0 and not display.by_hand:
         overlaid = overlay(display, rgb, pixel[:, :, count], selected)
-        overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
+        overlaid = colors.add_color_bar(overlaid, display.colormap, display.scale, display.title)
     if named_by_text:
         maps = (relevancy_map(display, rgb, pixel[:, :, i], alpha) for i in range(count))
         named = zip(output_names(display.texts), display.texts, maps)
-        outputs = {name: add_color_bar(x, display.colormap, display.map_scale, text) for name, text, x in named}
+        outputs = {name: colors.add_color_bar(x, display.colormap, display.map_scale, text) for name, text, x in named}
     return {
         **outputs,
         "reliability": reliability_map(rgb, reliability, alpha),
@@ -208,7 +196,7 @@ def overlay(
     Args:
         share: selected fraction of each pixel, 0..1.
     """
-    color, opacity = apply_colormap(relevancy, display.scale, colormap_rgb(display.colormap).to(rgb))
+    color, opacity = colors.apply_colormap(relevancy, display.scale, colors.colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
 
 
@@ -216,8 +204,8 @@ def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
-    colors = colormap_rgb(display.colormap).to(rgb)
-    color, opacity = apply_colormap(relevancy, display.map_scale, colors, min_opacity=0.0)
+    ramp = colors.colormap_rgb(display.colormap).to(rgb)
+    color, opacity = colors.apply_colormap(relevancy, display.map_scale, ramp, min_opacity=0.0)
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
 
 
@@ -246,9 +234,9 @@ def reliability_map(
         reliability: composited R.
     """
     pixel = pixel_relevancy(reliability, alpha)[:, :, 0]
-    color = colormap_rgb(RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
-    image = _over_gray(rgb, color, MAX_OVERLAY_OPACITY * alpha.clamp(0, 1)[:, :, None])
-    return add_color_bar(image, RELIABILITY_COLORMAP, (0.0, 1.0), "reliability R (high is good)")
+    color = colors.colormap_rgb(colors.RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
+    image = _over_gray(rgb, color, colors.MAX_OVERLAY_OPACITY * alpha.clamp(0, 1)[:, :, None])
+    return colors.add_color_bar(image, colors.RELIABILITY_COLORMAP, (0.0, 1.0), "reliability R (high is good)")
 
 
 def _over_gray(rgb: Tensor, color: Tensor, opacity: Tensor) -> Tensor:
@@ -276,7 +264,7 @@ _BACKGROUND, _TEXT_COLOR, _CAPTION_COLOR = (255, 255, 255), (20, 20, 20), (95, 9
 class FigureStyle:
     """Settings that all figures of an answer share."""
 
-    colormap: Colormap
+    colormap: colors.Colormap
     scale: tuple[float, float]
     """Relevancies at the ends of the color bar."""
     threshold: float
@@ -297,7 +285,7 @@ class FigureHeader:
     @property
     def title(self) -> str:
         """The prompt, and a note if it is probably not in the scene."""
-        return clip_text(self.text, 60) + self.absent * "   ·   probably not in this scene"
+        return colors.clip_text(self.text, 60) + self.absent * "   ·   probably not in this scene"
 
     @staticmethod
     def of(finding: Finding) -> FigureHeader:
@@ -338,7 +326,7 @@ def view_figure(
         captions.insert(0, "training image")
     share = float(selected.float().mean())
     summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
-    return _page(sheet, [f"{header.title}   ·   {clip_text(view, 40)}", summary], panels, captions, 2)
+    return _page(sheet, [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary], panels, captions, 2)
 
 
 def contact_sheet(
@@ -382,14 +370,19 @@ def _page(
     page = Image.new("RGB", (inner + 2 * _MARGIN, bottom + 3 * line), _BACKGROUND)
     draw = ImageDraw.Draw(page)
     for i, title in enumerate(titles):
-        typeface, color = load_font(_FONT_SIZE if i == 0 else _FONT_SIZE - 2), _TEXT_COLOR if i == 0 else _CAPTION_COLOR
+        typeface, color = (
+            colors.load_font(_FONT_SIZE if i == 0 else _FONT_SIZE - 2),
+            _TEXT_COLOR if i == 0 else _CAPTION_COLOR,
+        )
         fitting = next(n for n in range(len(title), -1, -1) if typeface.getlength(title[:n]) <= inner)
         draw.text((_MARGIN, _MARGIN // 2 + i * line), title[:fitting], fill=color, font=typeface)
     for i, (panel, caption) in enumerate(zip(panels, captions)):
         x, y = _MARGIN + (i % columns) * (width + _MARGIN), top + (i // columns) * (height + line + _MARGIN)
         page.paste(panel, (x, y + line))
         most = max(4, int(width / (0.6 * (_FONT_SIZE - 4))))
-        draw.text((x, y + 4), clip_text(caption, most), fill=_CAPTION_COLOR, font=load_font(_FONT_SIZE - 4))
+        draw.text(
+            (x, y + 4), colors.clip_text(caption, most), fill=_CAPTION_COLOR, font=colors.load_font(_FONT_SIZE - 4)
+        )
     _draw_color_bar(draw, page, sheet, (_MARGIN, bottom, inner))
     return page
 
@@ -402,9 +395,9 @@ def _draw_color_bar(
     Args:
         position: x, y and width in pixels.
     """
-    (x, y, width), typeface = position, load_font(_FONT_SIZE - 4)
+    (x, y, width), typeface = position, colors.load_font(_FONT_SIZE - 4)
     (low, high), height = sheet.scale, _FONT_SIZE
-    ramp = (colormap_rgb(sheet.colormap).numpy() * 255).round().astype(np.uint8)[None]
+    ramp = (colors.colormap_rgb(sheet.colormap).numpy() * 255).round().astype(np.uint8)[None]
     page.paste(Image.fromarray(ramp).resize((width, height)), (x, y))
     mark = x + round(width * min(max((sheet.threshold - low) / (high - low), 0.0), 1.0))
     for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
@@ -460,7 +453,7 @@ def save_overlays(
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
     headers = [FigureHeader.of(finding) for finding in answer]
-    sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
+    sheet = FigureStyle(colors.COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
 
     def save(prefix: str, q: int, picture: Image.Image) -> None:

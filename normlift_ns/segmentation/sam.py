@@ -22,20 +22,12 @@ from torch.nn.functional import gelu, interpolate, layer_norm, linear, pad, scal
 
 from normlift_ns.core.device import AdaptiveBatches, can_use_triton
 from normlift_ns.options import DEFAULT_SAM, SamPrecision
+from normlift_ns.segmentation import mask_filtering
 from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,
     import_transformers,
     load_sam_checkpoint,
     sam_identity,
-)
-from normlift_ns.segmentation.mask_filtering import (
-    MaskMeasurements,
-    Suppression,
-    mask_nms,
-    masks_to_boxes,
-    measure_logits,
-    remove_small_regions,
-    stack_masks,
 )
 from normlift_ns.segmentation.regions import RegionDefaults
 
@@ -337,7 +329,9 @@ class PromptedNetwork(ABC):
         padded = interpolate(logits[:, None].float(), (self._side, self._side), mode="bilinear", align_corners=False)
         return interpolate(padded[:, :, :height, :width], size, mode="bilinear", align_corners=False)[:, 0]
 
-    def measure(self, logits: Float[Tensor, "n y x"], size: tuple[int, int], offset: float) -> MaskMeasurements:
+    def measure(
+        self, logits: Float[Tensor, "n y x"], size: tuple[int, int], offset: float
+    ) -> mask_filtering.MaskMeasurements:
         """Return the measurements of `measure_logits` for enlarged logits.
 
         With Triton, the logits are not enlarged in memory. Pixels whose logits are within rounding of a threshold may
@@ -348,10 +342,10 @@ class PromptedNetwork(ABC):
 
             rows = self._bilinear_weights(logits.shape[1], size, 0)
             columns = self._bilinear_weights(logits.shape[2], size, 1)
-            return MaskMeasurements(*measure_masks(logits, *rows, *columns, offset))
-        parts = [measure_logits(logits.new_zeros(0, 1, 1), offset)]
-        parts.extend(self.masks(lambda batch: measure_logits(self.enlarge(batch, size), offset), logits))
-        return MaskMeasurements(*map(torch.cat, zip(*parts)))
+            return mask_filtering.MaskMeasurements(*measure_masks(logits, *rows, *columns, offset))
+        parts = [mask_filtering.measure_logits(logits.new_zeros(0, 1, 1), offset)]
+        parts.extend(self.masks(lambda batch: mask_filtering.measure_logits(self.enlarge(batch, size), offset), logits))
+        return mask_filtering.MaskMeasurements(*map(torch.cat, zip(*parts)))
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32)
@@ -578,7 +572,7 @@ class MaskRules:
     """Largest IoU of two boxes that are both kept."""
     region_area: int = 100
     """Remove holes and pieces with fewer pixels than this."""
-    suppression: Suppression = field(default_factory=Suppression)
+    suppression: mask_filtering.Suppression = field(default_factory=mask_filtering.Suppression)
 
 
 class _Candidates(NamedTuple):
@@ -638,7 +632,7 @@ class SamMasks(RegionDefaults):
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device; raises like `masks`."""
-        maps = [stack_masks(masks) for masks in self.masks(image).values()]
+        maps = [mask_filtering.stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(labels) for labels in maps)
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
@@ -674,12 +668,12 @@ class SamMasks(RegionDefaults):
         rows = torch.cat(list(kept.values())).unique()
         candidates = candidates.at(rows)
         masks = self._image_masks(candidates, crops, size)
-        masks, changed = remove_small_regions(masks, rules.region_area)
-        boxes, score = masks_to_boxes(masks), candidates.stability * candidates.predicted_iou
+        masks, changed = mask_filtering.remove_small_regions(masks, rules.region_area)
+        boxes, score = mask_filtering.masks_to_boxes(masks), candidates.stability * candidates.predicted_iou
         groups = {level: torch.searchsorted(rows, index) for level, index in kept.items()}
         kept = _distinct(groups, boxes, (~changed).float(), rules)
         return {
-            level: masks[index[mask_nms(masks[index], score[index], rules.suppression)]]
+            level: masks[index[mask_filtering.mask_nms(masks[index], score[index], rules.suppression)]]
             for level, index in kept.items()
         }
 

@@ -140,32 +140,6 @@ def test_cells_give_the_evidence_of_every_level(power, dtype, seed):
         assert found.rows.weight.dtype == alone.rows.weight.dtype == dtype
 
 
-@given(seed=SEEDS, relative=st.floats(0, 1))
-def test_pruning_stays_within_its_bound(seed, relative):
-    evidence = random_evidence(30, VIEWS, seed)
-    features = unit_rows(sum(VIEWS), 8, seed)
-    smaller, bound = evidence.prune(relative=relative)
-    before, after = lift(evidence, features), lift(smaller, features)
-    f, g = before.scalars.norm[:, None] * before.directions(), after.scalars.norm[:, None] * after.directions()
-    assert ((f - g).norm(dim=1) <= bound + 1e-12).all()
-    assert ((before.scalars.norm - after.scalars.norm).abs() <= bound + 1e-12).all()
-    has = evidence.rows.row_sums() > 0
-    assert (smaller.rows.row_sums()[has] > 0).all()
-    assert same(evidence.prune(relative=0.0)[0], evidence)
-
-
-def test_pruning_drops_something_and_says_what():
-    weight = torch.tensor([1.0, 0.25, 0.01, 2.0])
-    rows = SparseRows.from_coo(torch.tensor([0, 0, 0, 1]), torch.tensor([0, 1, 2, 0]), weight, 3)
-    blank = SparseRows.from_coo(torch.zeros(0).int(), torch.zeros(0).int(), torch.zeros(0), 3)
-    evidence = Evidence(rows, torch.zeros(3).int(), blank, 1)
-    smaller, bound = evidence.prune(relative=0.1)
-    assert smaller.rows.weight.tolist() == pytest.approx([1, 0.25, 2])
-    assert bound.tolist() == pytest.approx([2 * 0.01 / 1.26, 0, 0])
-    with pytest.raises(ValueError, match=r"relative must be in 0\.\.1"):
-        evidence.prune(relative=1.5)
-
-
 def test_save_and_load_are_exact_and_name_the_file(tmp_path):
     path = tmp_path / "e.safetensors"
     with pytest.raises(FileNotFoundError):

@@ -270,7 +270,7 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     whole, slanted = (float(seen.weight[seen.column == view].sum()) for view in (0, 1))
     assert whole > 0.05  # share of the picture
     assert whole > 0.5 * slanted
-    eye = pose.camera_to_world()[:3, 3]
+    eye = pose.camera.camera_to_world()[:3, 3]
     assert float(eye[0]) > 0.3  # not in the wall, nor behind it
     assert pose.regions[0] == 1
     assert pose.shown >= 0.3

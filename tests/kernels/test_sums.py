@@ -44,7 +44,7 @@ def test_norms_equal_those_of_the_cpu(dimension):
     found, expected = kernel_norms(evidence, table), _sums(evidence, table)
     for ours, theirs in zip(found, expected):
         assert torch.allclose(ours.double(), theirs.double(), rtol=2e-6, atol=0)
-    assert torch.equal(found[4].long(), expected.view_count.long())
+    assert torch.equal(found[4].long(), expected[4].long())
 
 
 def test_cancelled_sums_are_right():
@@ -74,7 +74,7 @@ def test_sums_of_many_entries_are_taken_in_float64():
     for ours, theirs in zip(found, exact):
         assert torch.allclose(ours.cpu().double(), theirs.double(), rtol=1e-12, atol=0)
     single = sparse.row_norms(*arrays, 0.0, 1000)
-    assert (single.total.cpu() - exact.total).abs().max() > 1e-9 * exact.total.max()
+    assert (single.total.cpu() - exact[0]).abs().max() > 1e-9 * exact[0].max()
     arrays = on_device(torch.arange(3), rows.offsets, rows.column, rows.weight, table, torch.ones(3))
     units = sparse.unit_sums(*arrays, torch.float32, 0.0, 10).cpu()
     sums_of_rows = rows.matmul(table.double())

@@ -6,13 +6,12 @@ import sys
 import urllib.error
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import yaml
 
 from normlift_ns import SemanticField
 from normlift_ns.query import engine
@@ -318,21 +317,3 @@ def test_a_stock_checkpoint_loads_and_a_field_of_other_gaussians_does_not(stock_
     state["gauss_params.means"][0, 0] += 1
     with pytest.raises(ValueError, match=rf"{semantics} was lifted from other Gaussians"):
         model.load_state_dict(dict(state), strict=True)
-
-
-def test_every_field_of_a_splatfacto_config_is_taken_over() -> None:
-    from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
-
-    from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig  # noqa: PLC0415
-
-    config = SplatfactoModelConfig()
-    for f in fields(config):
-        if f.name not in ("_target", "camera_optimizer"):
-            setattr(config, f.name, f"value of {f.name}")
-    upgraded = NormLiftModelConfig.upgrade(config, semantics=Path("x"))
-    assert upgraded._target is NormLiftModel
-    for f in fields(SplatfactoModelConfig):
-        assert f.name == "_target" or getattr(upgraded, f.name) == getattr(config, f.name)
-    assert upgraded.semantics == Path("x")
-    assert NormLiftModelConfig.upgrade(upgraded).semantics is None
-    assert yaml.load(yaml.dump(upgraded), Loader=yaml.Loader) == upgraded

@@ -93,7 +93,8 @@ def test_the_config_of_a_lifted_run_is_the_edited_one(stock: StockRun) -> None:
         config.output_dir = scene.location.relative_to_root(run_dir.parents[2])
         config.relative_model_dir = Path("nerfstudio_models")
         config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-        config.pipeline.model = NormLiftModelConfig.upgrade(config.pipeline.model, semantics=Path(FIELD_FOLDER))
+        values = {name: value for name, value in vars(config.pipeline.model).items() if name != "_target"}
+        config.pipeline.model = NormLiftModelConfig(**values, semantics=Path(FIELD_FOLDER))
         if config.output_dir.is_absolute():
             set_dataset(config, scene.location.data)
         skip_seed_points(config)

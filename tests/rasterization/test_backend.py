@@ -50,7 +50,7 @@ def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
         assert (device.has_triton(), _fastest(ON_GPU)) == (taken, "triton" if taken else "gsplat"), triton
         if not taken:
             with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
-                choose_backend("triton", ON_GPU, pictures=False)
+                choose_backend("triton", ON_GPU)
 
 
 def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):

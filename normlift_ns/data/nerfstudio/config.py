@@ -347,20 +347,18 @@ class _ConfigDumper(yaml.Dumper):
     """YAML dumper that writes the mirrors as nerfstudio writes its own classes."""
 
 
-def _represent_object(dumper: _ConfigDumper, config: Any) -> yaml.Node:
-    target = CLASS_TARGETS.get(type(config))
+def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
+    name, target = CONFIG_CLASS_NAMES[type(config)], CLASS_TARGETS.get(type(config))
+    if isinstance(config, EventName):
+        return dumper.represent_sequence(f"{OBJECT_TAG}/apply:{name}", [config.value])
     values = vars(config) if target is None else {_TARGET: _NAMES[target], **vars(config)}
-    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", values)
-
-
-def _represent_event(dumper: _ConfigDumper, event: EventName) -> yaml.Node:
-    return dumper.represent_sequence(f"{OBJECT_TAG}/apply:{CONFIG_CLASS_NAMES[EventName]}", [event.value])
+    return dumper.represent_mapping(f"{OBJECT_TAG}:{name}", values)
 
 
 _NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
 """One object per name, which a dump references like a single class."""
 for _cls in CONFIG_CLASS_NAMES:
-    _ConfigDumper.add_representer(_cls, _represent_event if _cls is EventName else _represent_object)
+    _ConfigDumper.add_representer(_cls, _represent)
 _ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
 
 

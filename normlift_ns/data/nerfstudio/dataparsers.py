@@ -18,14 +18,7 @@ from torch import Tensor
 
 from normlift_ns.data.colmap import ColmapCamera, ColmapImage, read_colmap_model
 from normlift_ns.data.frames import PERSPECTIVE_MODELS, read_image_header
-from normlift_ns.data.nerfstudio.config_classes import (
-    NAMED_COLORS,
-    BlenderDataParserConfig,
-    ColmapDataParserConfig,
-    FullImageDatamanagerConfig,
-    NerfstudioDataParserConfig,
-    PosedDataParserConfig,
-)
+from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.transforms import DISTORTION, FrameEntry, TransformsEntries, read_transforms_entries
 from normlift_ns.errors import InputError
 
@@ -33,7 +26,7 @@ _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
 
 
 def normalize_poses(
-    rows: Any, parser: PosedDataParserConfig, orientation: str
+    rows: Any, parser: config_classes.PosedDataParserConfig, orientation: str
 ) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"], float]:
     """Return poses in the scene's world, the transform to that world, and its scale.
 
@@ -266,7 +259,9 @@ class ParsedDataset:
     """Map from the poses in the capture to the scene's world: scale * (transform @ point)."""
 
 
-def split_files(files: Sequence[Path], lists: Mapping[str, Any], parser: PosedDataParserConfig) -> tuple[Any, Any]:
+def split_files(
+    files: Sequence[Path], lists: Mapping[str, Any], parser: config_classes.PosedDataParserConfig
+) -> tuple[Any, Any]:
     """Return the indices of the training and the evaluation images: by the dataset's lists, or else by eval_mode.
 
     Raises:
@@ -322,7 +317,7 @@ _CAMERA_TYPES = {
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
-def parse_dataset(datamanager: FullImageDatamanagerConfig) -> ParsedDataset:
+def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig) -> ParsedDataset:
     """Read the dataset of a run.
 
     If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts
@@ -380,7 +375,7 @@ def _row(entries: TransformsEntries, frame: FrameEntry) -> list[float]:
     return [*(float(entries.value(frame, name)) for name in _INTRINSICS), *distortion]
 
 
-def _check_transforms(meta: TransformsEntries, path: Path, parser: NerfstudioDataParserConfig) -> None:
+def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classes.NerfstudioDataParserConfig) -> None:
     for name in _INTRINSICS:
         incomplete = [frame.file_path for frame in meta.frames if meta.value(frame, name) is None]
         if incomplete:
@@ -400,7 +395,7 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: NerfstudioDat
         raise InputError(f"{path} lists masks for {masked} of {count} images; expected one for each, or none")
 
 
-def _transforms(parser: NerfstudioDataParserConfig) -> ParsedDataset:
+def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedDataset:
     path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
     folder, meta = path.parent, _entries(path, parser.data)
     _check_transforms(meta, path, parser)
@@ -443,7 +438,7 @@ def _lenses(rows: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "v 4"], Int6
 
 
 def _downscale_factor(
-    file: Path, parser: PosedDataParserConfig, has_copies: Callable[[int], bool] = lambda factor: True
+    file: Path, parser: config_classes.PosedDataParserConfig, has_copies: Callable[[int], bool] = lambda factor: True
 ) -> int:
     """Return the factor by which nerfstudio downscales images, which depends on one of them if the config has none."""
     if parser.downscale_factor is not None:
@@ -454,14 +449,14 @@ def _downscale_factor(
     return factor
 
 
-def _blender(parser: BlenderDataParserConfig) -> ParsedDataset:
-    if parser.alpha_color is not None and parser.alpha_color.lower() not in NAMED_COLORS:
-        raise InputError(f"alpha_color is {parser.alpha_color!r}, expected {', '.join(NAMED_COLORS)}")
+def _blender(parser: config_classes.BlenderDataParserConfig) -> ParsedDataset:
+    if parser.alpha_color is not None and parser.alpha_color.lower() not in config_classes.NAMED_COLORS:
+        raise InputError(f"alpha_color is {parser.alpha_color!r}, expected {', '.join(config_classes.NAMED_COLORS)}")
     train, held_out = (_blender_split(parser, split) for split in ("train", "test"))
     return ParsedDataset(train, held_out, torch.eye(4)[:3, :], parser.scale_factor)
 
 
-def _blender_split(parser: BlenderDataParserConfig, split: str) -> DatasetSplit:
+def _blender_split(parser: config_classes.BlenderDataParserConfig, split: str) -> DatasetSplit:
     path = parser.data / f"transforms_{split}.json"
     meta = _entries(path, parser.data)
     angle = meta.camera_angle_x
@@ -479,7 +474,7 @@ def _blender_split(parser: BlenderDataParserConfig, split: str) -> DatasetSplit:
     return DatasetSplit(files, None, "PERSPECTIVE", poses, intrinsics.expand(count, 4), sizes, None)
 
 
-def _parse_colmap(parser: ColmapDataParserConfig) -> ParsedDataset:
+def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDataset:
     model, images_dir = parser.data / parser.colmap_path, parser.data / parser.images_path
     if not model.is_dir():
         raise FileNotFoundError(
@@ -550,7 +545,7 @@ def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def _read_lists(parser: ColmapDataParserConfig) -> dict[str, Any]:
+def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]:
     folder, lists = parser.data / parser.images_path, {}
     for split in ("train", "test", "validation"):
         path = parser.data / f"{split}_list.txt"
@@ -565,8 +560,8 @@ def _downscaled(files: list[Path], folder: Path, factor: int) -> list[Path]:
 
 
 _PARSERS: dict[type, Any] = {
-    NerfstudioDataParserConfig: _transforms,
-    ColmapDataParserConfig: _parse_colmap,
-    BlenderDataParserConfig: _blender,
+    config_classes.NerfstudioDataParserConfig: _transforms,
+    config_classes.ColmapDataParserConfig: _parse_colmap,
+    config_classes.BlenderDataParserConfig: _blender,
 }
 """Functions that read the dataset of each data parser."""

@@ -19,15 +19,8 @@ from normlift_ns.core.scene import Views
 from normlift_ns.data.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import SplitViews, camera_type_error, open_scaled
+from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.config import RunLocation, locate_run, read_trainer_config, with_absolute_paths
-from normlift_ns.data.nerfstudio.config_classes import (
-    NAMED_COLORS,
-    BlenderDataParserConfig,
-    FullImageDatamanagerConfig,
-    NerfstudioDataParserConfig,
-    SplatfactoModelConfig,
-    TrainerConfig,
-)
 from normlift_ns.data.nerfstudio.dataparsers import DatasetSplit, apply_pose_adjustments, parse_dataset
 from normlift_ns.data.transforms import read_dataparser_transforms, relative_name
 from normlift_ns.errors import InputError
@@ -57,16 +50,16 @@ class TrainedViews(SplitViews):
         folder: Path,
         poses: Float[Tensor, "v 3 4"],
         background: Float[Tensor, " 3"],
-        datamanager: FullImageDatamanagerConfig,
+        datamanager: config_classes.FullImageDatamanagerConfig,
     ) -> None:
         names, scale = [relative_name(file, folder) for file in split.files], datamanager.camera_res_scale_factor
         super().__init__(split.files, names, split.masks, split.sizes.tolist(), poses, background, scale)
         self._split, parser = split, datamanager.dataparser
-        alpha = parser.alpha_color if isinstance(parser, BlenderDataParserConfig) else None
-        self._alpha_color = None if alpha is None else NAMED_COLORS[alpha.lower()]
+        alpha = parser.alpha_color if isinstance(parser, config_classes.BlenderDataParserConfig) else None
+        self._alpha_color = None if alpha is None else config_classes.NAMED_COLORS[alpha.lower()]
         """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them; None: it blends
         the background later."""
-        self._mask_color = parser.mask_color if isinstance(parser, NerfstudioDataParserConfig) else None
+        self._mask_color = parser.mask_color if isinstance(parser, config_classes.NerfstudioDataParserConfig) else None
         """Color that nerfstudio writes into pixels whose mask is zero."""
 
     def _lens(self, index: int) -> Intrinsics:
@@ -110,10 +103,10 @@ _ASSUMED_STEP = 30000
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
-def _background_color(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
+def _background_color(config: config_classes.SplatfactoModelConfig) -> Float[Tensor, " 3"]:
     """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
     name = config.background_color
-    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(NAMED_COLORS[name])
+    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(config_classes.NAMED_COLORS[name])
 
 
 def active_sh_degree(config: Any, step: int) -> int | None:
@@ -130,7 +123,7 @@ def active_sh_degree(config: Any, step: int) -> int | None:
 class NerfstudioScene:
     """A `Scene` made from a trained splatfacto run, or a lifted copy of one, on the CPU."""
 
-    config: TrainerConfig
+    config: config_classes.TrainerConfig
     """The config as stored; its paths are those of the training."""
     location: RunLocation
     """Current paths of the run's files."""
@@ -202,7 +195,7 @@ class NerfstudioScene:
         return view_colors(self.gaussians.means, self.coefficients, camera, degree)
 
     @property
-    def model_config(self) -> SplatfactoModelConfig:
+    def model_config(self) -> config_classes.SplatfactoModelConfig:
         """The model's part of the config."""
         return self.config.pipeline.model
 
@@ -297,7 +290,7 @@ def _in_scene_units(transform: Tensor, scale: float) -> Tensor:
 
 
 def _training_poses(
-    split: DatasetSplit, model: SplatfactoModelConfig, checkpoint: Checkpoint
+    split: DatasetSplit, model: config_classes.SplatfactoModelConfig, checkpoint: Checkpoint
 ) -> Float[Tensor, "v 3 4"]:
     """Return the poses that the Gaussians were fitted to; splatfacto applies optimized poses during training only."""
     if model.camera_optimizer.mode == "off":
