@@ -29,7 +29,7 @@ CAPTURES = ("fox", "tabletop")
 def planned(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
     """Seconds of every stage and `total`, as the check tells them; `wall`: what the check took."""
     file = folder / "plan.json"
-    given = ("--load-config", trained, "--output-dir", folder / name, *flags, "--json", file, "--overwrite", "True")
+    given = ("--load-config", trained, "--output-dir", folder / name, *flags, "--output-json", file, "--overwrite", "True")
     kernels = folder / "kernels"
     environment = {"TRITON_CACHE_DIR": f"{kernels}/triton", "NUMBA_CACHE_DIR": f"{kernels}/numba"}
     cost = run(HERE, "check", *given, environment={**environment, "PYTHONPYCACHEPREFIX": f"{kernels}/python"})

@@ -40,8 +40,8 @@ HEAD = """# Options of every command
 This page is generated from the code: `python -m research.reference`. `--help` prints the same texts, without loading
 torch.
 
-{flags} Options that are True or False are written `--refine False`, as in nerfstudio; `--save` alone means
-`--save True`. A value out of its range is refused before anything is loaded.
+{flags} Options that are True or False are written `--refine False`, as in nerfstudio; `--save-query` alone means
+`--save-query True`. A value out of its range is refused before anything is loaded.
 
 `ns-train normlift` has the options of `ns-normlift` too, as `--pipeline.source.…`, `--pipeline.lift.…` and
 `--pipeline.queries` ([training and lifting in one](train.md)).

@@ -142,9 +142,9 @@ has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
 check("weights", HEAVY | {"transformers", "skimage"})
 missing = ["--load-config", "nowhere/config.yml"]
 mistakes = [
-    (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "colour", "--sigma-d", "nan"]),
+    (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "colour", "--vote-sigma-d", "nan"]),
     (lift, ["--load-config", "config.yml", "--encoder", "colour", "--output-dir", "config.yml"]),
-    (query, [*missing, "--text", "a"]), (query, ["--load-config", "config.yml", "--text", "a", "--json", "no.txt/x"]),
+    (query, [*missing, "--text", "a"]), (query, ["--load-config", "config.yml", "--text", "a", "--output-json", "no.txt/x"]),
     (export, ["--load-config", "config.yml", "--output-dir", "config.yml"]), (view, missing),
     (evaluate, ["--load-config", "config.yml", "--protocol", "masks", "--labels", "nowhere"]), (batch, ["nowhere.txt"]),
 ]

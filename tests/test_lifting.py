@@ -304,7 +304,7 @@ def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.
     monkeypatch.setattr(pipeline, "refine", watched)
     fields = []
     for on in (False, True):
-        options = LiftOptions(consensus=on, beta=0.7, vote=RefineConfig(vote="posterior", k=3))
+        options = LiftOptions(consensus=on, reliability_beta=0.7, vote=RefineConfig(vote="posterior", k=3))
         fields.append(lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field)
     first, second = watched.call_args_list
     assert torch.equal(first.args[2], second.args[2]) and torch.equal(first.kwargs["own"], second.kwargs["own"])

@@ -47,7 +47,7 @@ def test_parts_smaller_than_one_gaussian_are_refused():
         with pytest.raises(InputError, match="min_size"):
             find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
         with pytest.raises(InputError, match="min_size"):
-            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_size=min_size)
+            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, object_min_gaussians=min_size)
 
 
 def test_scale_and_order_do_not_matter():

@@ -118,7 +118,7 @@ def test_options_are_made_or_refused(option, value):
 def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their_field():
     with pytest.raises(InputError, match=r"^sigma_d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
-    with named_as_flags(), pytest.raises(InputError, match=r"^--sigma-d must be positive, at least 1e-06, got nan$"):
+    with named_as_flags(), pytest.raises(InputError, match=r"^--vote-sigma-d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
     with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):
         RefineConfig(sigma_d=math.inf)
@@ -126,7 +126,7 @@ def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their
     assert [type(x) for x in (vote.k, vote.sigma_d, vote.tau)] == [int, float, float]
     assert SourceOptions(regions_dir="maps").regions_dir == Path("maps")  # type: ignore[arg-type]
     assert AskOptions(negatives=["a", "b"]).negatives == ("a", "b")  # type: ignore[arg-type]
-    assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
+    assert SplatOptions(eval_images=0.1).eval_images == ("0.1",)  # type: ignore[arg-type]
 
 
 def test_words_are_those_of_the_list_and_hold_characters_only():

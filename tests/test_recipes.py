@@ -105,8 +105,8 @@ def test_all_recipes_work(extended: Path, lifted: Path, tmp_path: Path) -> None:
     python(extended, "-c", SOURCE, lifted, tmp_path)
     python(extended, "-c", RULE, lifted)
     python(extended, "-c", FLAT)
-    asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
-    python(extended, "-m", "normlift_ns.cli.query", *asked, "--json", tmp_path / "a.json")
+    asked = ("--load-config", lifted, "--text", "red", "--relevancy", "mean", "--negatives", "blue")
+    python(extended, "-m", "normlift_ns.cli.query", *asked, "--output-json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
     table = tmp_path / "splat_table.csv"

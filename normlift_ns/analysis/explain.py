@@ -333,7 +333,7 @@ class RecordedVotes:
         """
         evidence, features = self._table
         source = self.field.source if refined else None
-        beta, unlabeled = self._option("beta", float, 1.0), self._option("unlabeled", str, "ignore")
+        beta, unlabeled = self._option("reliability_beta", float, 1.0), self._option("unlabeled", str, "ignore")
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
@@ -366,9 +366,9 @@ class RecordedVotes:
             levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
         evidence, features = Evidence.merge(*parts), torch.cat(tables)
         if self._option("consensus", bool, False):
-            options = {"power": (float, 1.0), "sample": (int, 50), "least": (float, CHANCE_AGREEMENT)}
-            kwargs = {name: self._option(f"consensus_{name}", *option) for name, option in options.items()}
-            features = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
+            power, sample = self._option("consensus_power", float, 1.0), self._option("consensus_sample", int, 50)
+            least, level = self._option("consensus_min_agreement", float, CHANCE_AGREEMENT), torch.cat(levels)
+            features = consensus(evidence, features, level=level, power=power, sample=sample, least=least).features
         return evidence, features
 
     def _cached_evidence(self, block: ViewBatch) -> Evidence:

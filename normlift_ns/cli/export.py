@@ -33,6 +33,7 @@ from normlift_ns.options import (
     CheckedOptions,
     check_device,
     check_prompt_list,
+    renamed,
 )
 
 if TYPE_CHECKING:
@@ -45,6 +46,12 @@ if TYPE_CHECKING:
     from normlift_ns.query.engine import Answer
 
 
+@renamed(
+    part="select",
+    reach="object_max_gap",
+    min_size="object_min_gaussians",
+    floater_limit="floater_threshold",
+)
 @dataclass
 class NormLiftExport(CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
@@ -55,7 +62,7 @@ class NormLiftExport(CheckedOptions):
     """Output folder, created if missing."""
     text: tuple[str, ...] = ()
     """Prompts to search for. Default: the queries stored in the run, with their stored options."""
-    part: Literal["scene", "selection", "rest", "clean"] = "scene"
+    select: Literal["scene", "selection", "rest", "clean"] = "scene"
     """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
     likely floaters, which are Gaussians floating in front of the cameras."""
     ask: AskOptions = field(default_factory=AskOptions)
@@ -63,7 +70,7 @@ class NormLiftExport(CheckedOptions):
     """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
     class_id and instance_id values, and <name>_objects.json the objects."""
     masks_dir: Path | None = None
-    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --part rest,
+    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --select rest,
     the values are swapped. Masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
     """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
@@ -80,13 +87,13 @@ class NormLiftExport(CheckedOptions):
     transfer_coordinates: Literal["capture", "scene"] = "capture"
     """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
     them. scene: the Gaussians' coordinates, as in exported files."""
-    reach: float = OBJECT_MAX_GAP
+    object_max_gap: float = OBJECT_MAX_GAP
     """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
     more objects."""
-    min_size: int = OBJECT_MIN_GAUSSIANS
+    object_min_gaussians: int = OBJECT_MIN_GAUSSIANS
     """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
-    floater_limit: float = FLOATER_THRESHOLD
-    """Score above which a Gaussian counts as a floater for --part clean; larger values leave out fewer Gaussians."""
+    floater_threshold: float = FLOATER_THRESHOLD
+    """Score above which a Gaussian counts as a floater for --select clean; larger values leave out fewer Gaussians."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -125,11 +132,13 @@ class NormLiftExport(CheckedOptions):
 
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
         job = exports.ExportJob(
-            run.scene, run.field, self._keep(run, answer), rest=self.part == "rest", overwrite=self.overwrite
+            run.scene, run.field, self._keep(run, answer), rest=self.select == "rest", overwrite=self.overwrite
         )
         if answer is None:
             return job
-        instances = exports.answer_instances(answer, reach=self.reach, min_size=self.min_size)
+        instances = exports.answer_instances(
+            answer, max_gap=self.object_max_gap, min_gaussians=self.object_min_gaussians
+        )
         objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
         transfer = None
         if cloud is not None:
@@ -143,13 +152,13 @@ class NormLiftExport(CheckedOptions):
         """Return the Gaussians of the exported part."""
         import torch  # noqa: PLC0415 (--help should not wait for it)
 
-        if self.part == "clean":
-            floaters = run.floaters(self.floater_limit).mask
+        if self.select == "clean":
+            floaters = run.floaters(self.floater_threshold).mask
             info(f"{int(floaters.sum()):,} likely floaters are left out")
             return ~floaters
-        if answer is None or self.part == "scene":
+        if answer is None or self.select == "scene":
             return torch.ones(len(run.field), dtype=torch.bool)
-        return answer.mask if self.part == "selection" else ~answer.mask
+        return answer.mask if self.select == "selection" else ~answer.mask
 
     def _outputs(self) -> dict[str, Path]:
         """Return the path of every output by its exporter."""
@@ -174,8 +183,8 @@ class NormLiftExport(CheckedOptions):
         cloud = outputs.get("cloud")
         self._check_answer()
         preflight.check_readable_file(self.transfer, "--transfer")
-        if self.masks_dir is not None and self.part == "clean":
-            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        if self.masks_dir is not None and self.select == "clean":
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --select clean")
         if cloud in files:
             raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
         preflight.check_writable_folder(self.masks_dir, "--masks-dir")
@@ -197,8 +206,8 @@ class NormLiftExport(CheckedOptions):
             from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
             flags += [f"--exporters {kind}"] if EXPORTERS.load(kind).needs_answer else []
-        if self.part in ("selection", "rest"):
-            flags.insert(0, f"--part {self.part}")
+        if self.select in ("selection", "rest"):
+            flags.insert(0, f"--select {self.select}")
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 

@@ -34,7 +34,15 @@ from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
-from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, check_number
+from normlift_ns.options import (
+    CheckedOptions,
+    LiftOptions,
+    SourceOptions,
+    SplatOptions,
+    check_device,
+    check_number,
+    renamed,
+)
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
@@ -73,6 +81,7 @@ class OpenedCapture(NamedTuple):
     stage_seconds: dict[str, float]
 
 
+@renamed(check="check_alignment")
 @dataclass
 class NormLift(CheckedOptions):
     """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a PLY
@@ -88,7 +97,7 @@ class NormLift(CheckedOptions):
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which are lifted too. It must also
     contain training images, whose cameras must not have moved."""
-    check: bool = True
+    check_alignment: bool = True
     """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
     dry_run: bool = False
     """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and cached views. The
@@ -153,7 +162,7 @@ class NormLift(CheckedOptions):
                 "Download them first, or give local files with --encoder-pretrained and --sam-model."
             )
         opened = self.open_capture(start_time)
-        warning = self.compare_cameras(opened, device) if self.check else None
+        warning = self.compare_cameras(opened, device) if self.check_alignment else None
         if warning is not None:
             info(f"Warning: {warning}")
         print_plan(self.make_plan(opened, source, device))
@@ -211,7 +220,7 @@ class NormLift(CheckedOptions):
                 "output_dir",
                 "timestamp",
                 "overwrite",
-                "check",
+                "check_alignment",
                 "device",
             )
             options: dict[str, Any] = {name: getattr(self, name) for name in names}
@@ -426,13 +435,13 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
 
     Args:
         agreement: B of the level, in 0..1.
-        least: Value of --consensus-least.
+        least: Value of --consensus-min-agreement.
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
     'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
-    'if they are bad masks of objects, try --consensus-least 0'
+    'if they are bad masks of objects, try --consensus-min-agreement 0'
     """
     from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
 
@@ -444,7 +453,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged
-    return f"{unchanged}; if they are bad masks of objects, try --consensus-least 0"
+    return f"{unchanged}; if they are bad masks of objects, try --consensus-min-agreement 0"
 
 
 def entrypoint() -> None:

@@ -89,10 +89,12 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
         return lifted
     cells = partial(_plain, power=options.get("weight_power", 1))
     evidence, features, level = _evidence_again(lifted, device, cells)
-    lift_kwargs = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
+    beta = options.get("reliability_beta", defaults.reliability_beta)
+    lift_kwargs = {"beta": beta, "unlabeled": options.get("unlabeled", defaults.unlabeled)}
     result = lift(evidence, features, **lift_kwargs)
     if enabled:
-        kwargs = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
+        names = {"power": "consensus_power", "sample": "consensus_sample", "least": "consensus_min_agreement"}
+        kwargs = {key: options.get(name) for key, name in names.items()}
         kwargs = {key: value for key, value in kwargs.items() if value is not None}
         table = consensus(evidence, features, level=level, **kwargs).features
         after = lift(evidence, table, **lift_kwargs)

@@ -21,7 +21,7 @@ from normlift_ns.io.atomic import (
     text_digest,
     write_text_file,
 )
-from normlift_ns.options import Storage
+from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
@@ -196,7 +196,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
     """Read and check a manifest.
 
     Returns:
-        Metadata, and the digests of files by path relative to the folder; None instead of digests for version 0.1.
+        Metadata with the option names of this version, and the digests of files by path relative to the folder; None instead of digests for version 0.1.
     Raises:
         FileNotFoundError: the manifest does not exist.
         ValueError: the manifest is damaged or has an unknown schema version.
@@ -230,6 +230,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
             raise InputError(f"it has a digest of {outside[0]!r}, which is not a file of a run")
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {LIFT_AGAIN}") from error
+    for name, options in (("options", LiftOptions), ("source", SourceOptions)):
+        if isinstance(facts.get(name), dict):
+            facts[name] = new_names(options, facts[name])
     return facts, digests
 
 

@@ -678,7 +678,7 @@ class SearchPanel(torch.nn.Module):
             vectors |= {prompt.text: prompt.vector for prompt in prompts_of_query(self._stored_query())}
         options: dict[str, Any] = {}
         if widgets is not None:
-            choices = {"rule": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
+            choices = {"relevancy": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
             options = {name: widget.value for name, widget in choices.items()}
 
         def encode(texts: Sequence[str]) -> Any:

@@ -32,7 +32,7 @@ def test_options_reach_the_regions(tmp_path):
     (tmp_path / "moved").mkdir()
     assert LabelFiles(tmp_path).identity == LabelFiles(tmp_path / "moved").identity  # names no place
     assert [x.identity["kind"] for x in (Superpixels(9), LabelFiles(tmp_path))] == ["superpixel", "files"]
-    source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", text_template="a {}"))
+    source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", prompt_template="a {}"))
     assert source == PatchFeatures(OpenClipEncoder("ViT-B-32", "openai", template="a {}"), 1024)
     assert make_source(SourceOptions(region_count=9)) == PatchFeatures(OpenClipEncoder(), 9)
 

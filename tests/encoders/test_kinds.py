@@ -204,11 +204,11 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
         program = [str(Path(sys.executable).with_name(command)), *map(str, words)]
         return subprocess.run(program, env=paths, capture_output=True, text=True, check=False)
 
-    few = ("--max-views", 4, "--lift-downscale", 2, "--k", 6, "--region-count", 200, "--timestamp", "rgb")
+    few = ("--max-views", 4, "--lift-downscale", 2, "--vote-k", 6, "--region-count", 200, "--timestamp", "rgb")
     lifted = trained.parents[2] / "normlift" / "rgb" / "config.yml"
     done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
     assert done.returncode == 0, done.stdout + done.stderr
-    asked = ("--load-config", lifted, "--json", tmp_path / "a.json", "--overwrite", "True", "--text", "red", "yellow")
+    asked = ("--load-config", lifted, "--output-json", tmp_path / "a.json", "--overwrite", "True", "--text", "red", "yellow")
     done = run("ns-normlift-query", *asked)
     assert done.returncode == 0, done.stdout + done.stderr
     red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]
@@ -216,4 +216,4 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     done = run("ns-normlift-query", *asked[:2], "--text", "purple")
     assert done.returncode == 1 and "text 'purple' is none of red, green, blue, yellow" in done.stderr
     done = run("ns-normlift-query", *asked[:2], "--text", "red", here=False)
-    assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-vectors" in done.stderr
+    assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-embeddings" in done.stderr

@@ -215,7 +215,7 @@ def test_unknown_names_are_refused_before_loading(monkeypatch):
         ({"encoder_pretrained": "my/clip"}, FileNotFoundError, ["my/clip does not exist"]),
         ({"encoder_pretrained": "clip.safetensors"}, FileNotFoundError, ["clip.safetensors does not exist", "colour"]),
         ({"text_template": "a photo"}, ValueError, ["'a photo'", "{}"]),
-        ({"encoder": "colour", "text_template": "a {}"}, ValueError, ["--text-template 'a {}'", "--encoder open_clip"]),
+        ({"encoder": "colour", "text_template": "a {}"}, ValueError, ["--prompt-template 'a {}'", "--encoder open_clip"]),
         ({"crop_fill": "grey"}, ValueError, ["crop_fill", "black, white", "'grey'"]),
     ):
         refused(lambda options=options: make_encoder(SourceOptions(**options)), *parts, error=error)

@@ -25,7 +25,7 @@ def run(request, trained: Path, made_once) -> nl.LiftedRun:
     def make(folder: Path) -> None:
         options = nl.LiftOptions(storage=request.param, max_views=6, consensus=request.param == "float16")
         source = nl.SourceOptions(encoder="colour")
-        nl.lift_run(trained, source=source, lift=options, output_dir=folder, timestamp="one", check=False)
+        nl.lift_run(trained, source=source, lift=options, output_dir=folder, timestamp="one", check_alignment=False)
 
     return nl.open_run(next(made_once(f"votes-{request.param}", make).glob("*/normlift/one/config.yml")))
 

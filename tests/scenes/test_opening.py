@@ -104,7 +104,7 @@ def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_pa
 def given(native) -> SplatOptions:
     """Images and held-out names of the run."""
     return SplatOptions(
-        colmap=Path("p"), images=native.location.folder / "images", holdout=tuple(native.held_out.names),
+        colmap=Path("p"), images=native.location.folder / "images", eval_images=tuple(native.held_out.names),
         gsplat_normalize=False,
     )  # fmt: skip
 
@@ -206,7 +206,7 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     run = lift_run(scene, timestamp="t", **OPTIONS)
     assert run.folder == tmp_path / "outputs" / "capture" / "normlift" / "t"
     path.unlink()  # the run holds its own copy
-    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check=False, **OPTIONS)
+    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check_alignment=False, **OPTIONS)
     expected = of_native.ask("red", "yellow")
     again = open_run(run.config)
     assert again.scene.train.names == scene.train.names
@@ -222,7 +222,7 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     assert np.abs(again.render("0003").numpy().astype(int) - photograph).mean() < 3
     rows = again.export(tmp_path / "again.ply", found["red"])
     assert 0.9 * int(found["red"].mask.sum()) < len(rows) <= int(found["red"].mask.sum())  # all but the faintest
-    second = lift_run(again.config, timestamp="second", check=False, **OPTIONS)  # and can be lifted again
+    second = lift_run(again.config, timestamp="second", check_alignment=False, **OPTIONS)  # and can be lifted again
     assert torch.equal(second.ask("red").selected, again.ask("red").selected)
 
     capture.rename(tmp_path / "elsewhere")
@@ -300,8 +300,8 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({**every, "test_every": 1}, "test_every must be at least 2"),
         ({**every, "test_every": 8, "holdout": ("0001",)}, "give only one of them"),
         ({**every, "holdout": ("1.5",)}, r"1\.5 .* between 0 and 1"),
-        ({**every, "holdout": ("list.txt",)}, r"--holdout .*list\.txt"),
-        ({**every, "holdout": ("cat",)}, "--holdout .*cat"),
+        ({**every, "holdout": ("list.txt",)}, r"--eval-images .*list\.txt"),
+        ({**every, "holdout": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
         ({"transforms": "t.json"}, "--colmap"),
         (every, "0 points"),
@@ -314,7 +314,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
 
 def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
     options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), holdout=())
-    for count, hint in ((12, "--test-every 8"), (5, "--test-every or --holdout")):
+    for count, hint in ((12, "--test-every 8"), (5, "--test-every or --eval-images")):
         moves = {"embeds.weight": torch.zeros(count, 9)}
         path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
         with pytest.raises(InputError, match=f" {count} training views.*{hint}"):
@@ -391,7 +391,7 @@ def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
     scene = open_scene(config)
     path = write_ply(tmp_path / "s.ply", ply_columns(SplatParameters(**scene.parameters)))
     folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
-    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
+    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, eval_images=("0.1",)))
     assert of_json.train.names == scene.train.names
     assert difference(scene, of_json, (0, -1)) < 1e-5
     rigid = []

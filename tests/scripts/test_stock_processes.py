@@ -123,7 +123,7 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
 def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
     shutil.copytree(lifted.parent, copy.parent)
-    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save", "True")
+    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save-query", "True")
     rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
     stored = load_query(copy.parent / "normlift")
