@@ -111,8 +111,8 @@ def lift_run(
         output_dir: output folder, instead of the outputs folder of the trained run.
         timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: replace a run directory of that name, and exported files with other content.
-        check_alignment: compare three training images with renders of the scene first. Warn if they differ; raise if the splat
-            does not show what the images show.
+        check_alignment: compare three training images with renders of the scene first. Warn if they differ; raise if
+            the splat does not show what the images show.
         device: auto, cpu or cuda.
         export: LangSplat files to also write the 2D features to; None: none.
         report: called with (stage, steps done, total steps).
@@ -140,8 +140,8 @@ def lift_run(
 
     request = LiftRequest(
         open_scene=opened, source=source, features=features, texts=texts,
-        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check_alignment=check_alignment,
-        device=device, export=export, report=report, say=say,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite,
+        check_alignment=check_alignment, device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
 

@@ -123,7 +123,8 @@ class LiftedRun:
         Args:
             texts: prompts.
             negatives: prompts to compare with. If None, use LERF's canonical negatives if the encoder knows them.
-            relevancy: how to compute relevancy from cosines, see `relevancy`. "auto" is lerf with negatives, else cosine.
+            relevancy: how to compute relevancy from cosines, see `normlift_ns.relevancy`. "auto" is lerf with
+                negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
                 relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for bare cosines of encoders other than
                 "color".

@@ -634,8 +634,8 @@ class RefineConfig(CheckedOptions):
     """Cosine at which two directions count as half agreeing in the vote, in -1..1; larger values require more similar
     directions. Default: 0.9 for posterior, 0.95 for paper."""
     gamma: float | None = None
-    """Softness of the agreement around the cosine --vote-tau, > 0; larger values blur the distinction between similar and
-    different directions. Default: 0.05 for posterior, 0.4 for paper."""
+    """Softness of the agreement around the cosine --vote-tau, > 0; larger values blur the distinction between similar
+    and different directions. Default: 0.05 for posterior, 0.4 for paper."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0; larger values change fewer Gaussians.
     Default: 0."""

@@ -31,7 +31,7 @@ from research.report import RESULTS, Report
 
 HERE = Path(__file__).parents[1]
 ON_CPU = {"CUDA_VISIBLE_DEVICES": "", "PYTHONWARNINGS": "ignore"}
-SOURCE = ("--encoder", "colour", "--device", "cpu")
+SOURCE = ("--encoder", "color", "--device", "cpu")
 
 
 class Cost(NamedTuple):

@@ -111,7 +111,15 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert stored is not None and stored.texts == ("red",)
     assert opened.field.manifest["features"]["kind"] == "given"
     (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
-    flags = ("--load-config", tmp_path / "moved" / "config.yml", "--text", "red", "file", "--output-json", tmp_path / "a.json")
+    flags = (
+        "--load-config",
+        tmp_path / "moved" / "config.yml",
+        "--text",
+        "red",
+        "file",
+        "--output-json",
+        tmp_path / "a.json",
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
@@ -156,8 +164,8 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .* 1; closest: a"),
         ({"queries": ["b"]}, "is empty"),
         ({"texts": {"a": [1, 2]}, "queries": "a"}, "queries must be a list"),
-        ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="colour")}, "texts"),
-        ({"source": nl.SourceOptions(encoder="colour")}, "source"),
+        ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="color")}, "texts"),
+        ({"source": nl.SourceOptions(encoder="color")}, "source"),
         ({"load_step": 3}, "open_scene"),
         *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
         ({"output_dir": 5}, "output_dir"),
@@ -172,11 +180,11 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
 
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
     with pytest.raises(FileExistsError, match="--timestamp"):
-        nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
+        nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
     with pytest.raises(TypeError, match=r"config\.yml .* got int"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
-        nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="colour"), timestamp="a/b", device="cpu")
+        nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
     for config in (None, 5, [], {}, float("nan"), b"x"):

@@ -51,7 +51,7 @@ from normlift_ns.query.arrays import open_quick
 how = {"rule": "mean", "negatives": ["blue", "yellow"]}
 run = nl.open_run(sys.argv[1])
 ours = run.ask("red", **how).relevancy.numpy()
-text, *negatives = (run.ask(text, rule="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))
+text, *negatives = (run.ask(text, relevancy="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))
 by_hand = 1 / (1 + np.exp(-10 * (text - sum(negatives) / 2)))
 valid = run.field.valid().numpy()
 np.testing.assert_allclose(ours[valid], by_hand[valid], atol=2e-6)

@@ -75,8 +75,8 @@ def one_line_errors(program: str) -> Iterator[None]:
 def _unboxed(stderr: str, program: str) -> str:
     r"""Return the text inside tyro's box, or below its dashed line if the terminal has no box characters.
 
-    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--vote-k'. Expected 1 values. │\n╰─────╯", "/bin/x"))
-    --vote-k needs a value.
+    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--data'. Expected 1 values. │\n╰─────╯", "/bin/x"))
+    --data needs a value.
     >>> print(_unboxed(" Missing\n -----\n  Missing value for argument '--vote-k'. Expected 1 values.\n", "/bin/x"))
     --vote-k needs a value.
     """

@@ -204,8 +204,8 @@ def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
         _existing_mode(Path(source.sam_model), "--sam-model")
     if source.prompt_template not in ("{}", "ensemble") and "{}" not in source.prompt_template:
         raise InputError(
-            f"--prompt-template {short_repr(source.prompt_template)} has no {{}} for the prompt; give a template such as "
-            '"a photo of a {}"'
+            f"--prompt-template {short_repr(source.prompt_template)} has no {{}} for the prompt; give a template such "
+            'as "a photo of a {}"'
         )
     needed = source.features == "none" or (len(texts) > 0 and source.text_embeddings is None)
     kind = encoder_kind(source.encoder)  # raises for an unknown encoder

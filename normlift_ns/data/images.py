@@ -28,8 +28,9 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
         names: sorted names of all images.
         test_every: hold out every n-th image, starting with the first, as gsplat's trainer does, and Inria's with
             --eval.
-        eval_images: image names, with or without folder and suffix; or a text file with one name per line; or a fraction
-            below 1. As in ns-train's dataparser, the training images are then evenly spaced, and the rest is held out.
+        eval_images: image names, with or without folder and suffix; or a text file with one name per line; or a
+            fraction below 1. As in ns-train's dataparser, the training images are then evenly spaced, and the rest is
+            held out.
     Raises:
         ValueError: if no image has one of the names, or both options are given.
     """
@@ -60,7 +61,8 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
         return None  # an image name
     if not 0 < fraction < 1:
         raise InputError(
-            f"--eval-images {eval_images[0]} is not a fraction: expected a number between 0 and 1, such as 0.1, or image names"
+            f"--eval-images {eval_images[0]} is not a fraction: expected a number between 0 and 1, such as 0.1, or "
+            "image names"
         )
     return fraction
 

@@ -101,8 +101,8 @@ def _make_texts(
 def _check_unchanged(pretrained: str, expected: object) -> None:
     """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
     remedy = (
-        "restore the file of the lift, give embeddings of your texts by the same network with --text-embeddings, or lift "
-        "again with: ns-normlift"
+        "restore the file of the lift, give embeddings of your texts by the same network with --text-embeddings, or "
+        "lift again with: ns-normlift"
     )
     if not isinstance(expected, str):
         return

@@ -196,7 +196,8 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
     """Read and check a manifest.
 
     Returns:
-        Metadata with the option names of this version, and the digests of files by path relative to the folder; None instead of digests for version 0.1.
+        Metadata with the option names of this version, and the digests of files by path relative to the
+        folder; None instead of digests for version 0.1.
     Raises:
         FileNotFoundError: the manifest does not exist.
         ValueError: the manifest is damaged or has an unknown schema version.

@@ -31,7 +31,7 @@ NAMES = ["open_clip", "colour", *HUB]
 def options_of(name: str, folder: Path) -> SourceOptions:
     """Of an encoder by its files, which lie in the folder."""
     if name == "colour":
-        return SourceOptions(encoder="colour")
+        return SourceOptions(encoder="color")
     if name == "open_clip":
         return SourceOptions(encoder_model=CLIP, encoder_pretrained=str(folder / "tiny.safetensors"))
     return SourceOptions(encoder=HUB[name], encoder_model=str(folder))

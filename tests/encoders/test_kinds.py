@@ -142,7 +142,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
     entry = f"[{MASK_SOURCES.group}]\nhalves = halves_plug:HALVES\nlangsplat = halves_plug:HALVES\n"
 
     def options(**more: Any) -> SourceOptions:
-        return SourceOptions(**{"encoder": "colour", "regions": "halves", **more})
+        return SourceOptions(**{"encoder": "color", "regions": "halves", **more})
 
     refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
     with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
@@ -208,7 +208,17 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     lifted = trained.parents[2] / "normlift" / "rgb" / "config.yml"
     done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
     assert done.returncode == 0, done.stdout + done.stderr
-    asked = ("--load-config", lifted, "--output-json", tmp_path / "a.json", "--overwrite", "True", "--text", "red", "yellow")
+    asked = (
+        "--load-config",
+        lifted,
+        "--output-json",
+        tmp_path / "a.json",
+        "--overwrite",
+        "True",
+        "--text",
+        "red",
+        "yellow",
+    )
     done = run("ns-normlift-query", *asked)
     assert done.returncode == 0, done.stdout + done.stderr
     red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]

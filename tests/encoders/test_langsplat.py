@@ -288,8 +288,8 @@ def test_flags_make_the_source(folder):
     for given, parts in (
         ({**options, "regions": "grid"}, ["--regions", "--regions-dir", "--features"]),
         ({**options, "regions_dir": folder}, ["leave one of them out"]),
-        ({**options, "encoder": "colour"}, ["--encoder colour", "--encoder-model"]),
-        ({"encoder": "colour", "text_vectors": folder / "texts.npz"}, ["--text-embeddings", "--features langsplat"]),
+        ({**options, "encoder": "color"}, ["--encoder color", "--encoder-model"]),
+        ({"encoder": "color", "text_embeddings": folder / "texts.npz"}, ["--text-embeddings", "--features langsplat"]),
     ):
         refused(lambda given=given: make_source(SourceOptions(**given)), *parts)
 

@@ -38,7 +38,7 @@ from tests.scenes.made import in_file_world, ply_columns, rows_of, saved_run, wr
 ROUNDED = 5e-4
 """Where the Gaussians themselves were moved to another world in float32, single pixels cross thresholds: 9e-5 seen."""
 OPTIONS = {
-    "source": SourceOptions(encoder="colour", regions="grid"),
+    "source": SourceOptions(encoder="color", regions="grid"),
     "lift": LiftOptions(storage="evidence", max_views=4, vote=RefineConfig(k=12)),
 }
 
@@ -130,7 +130,7 @@ def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, ki
         write_gsplat(tmp_path / "ckpt_29999_rank1.pt", rows_of(splat, slice(4000, None)))
     elif kind == "moved":  # the training turned and shifted the cameras a little; the project has them as they were
         moves = 0.05 * torch.randn(len(native.train), 9, generator=generator(0), dtype=torch.float64)
-        frames = _before(frames, moves, given.holdout)
+        frames = _before(frames, moves, given.eval_images)
         write_gsplat(path, splat, pose_adjust={"embeds.weight": moves, "identity": torch.zeros(6)})
     else:  # the project lies in another world, and the training normalized it
         matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
@@ -298,10 +298,10 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
-        ({**every, "test_every": 8, "holdout": ("0001",)}, "give only one of them"),
-        ({**every, "holdout": ("1.5",)}, r"1\.5 .* between 0 and 1"),
-        ({**every, "holdout": ("list.txt",)}, r"--eval-images .*list\.txt"),
-        ({**every, "holdout": ("cat",)}, "--eval-images .*cat"),
+        ({**every, "test_every": 8, "eval_images": ("0001",)}, "give only one of them"),
+        ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
+        ({**every, "eval_images": ("list.txt",)}, r"--eval-images .*list\.txt"),
+        ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
         ({"transforms": "t.json"}, "--colmap"),
         (every, "0 points"),
@@ -313,7 +313,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
 
 
 def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
-    options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), holdout=())
+    options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), eval_images=())
     for count, hint in ((12, "--test-every 8"), (5, "--test-every or --eval-images")):
         moves = {"embeds.weight": torch.zeros(count, 9)}
         path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
@@ -325,7 +325,7 @@ def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_
 def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames, given, tmp_path: Path) -> None:
     project = write_colmap(tmp_path / "p", frames, "PINHOLE")
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    base = replace(given, colmap=project, holdout=())
+    base = replace(given, colmap=project, eval_images=())
     (tmp_path / "images_2").mkdir()
     for frame in frames:  # of other format, as gsplat's trainer makes them
         Image.open(frame.file).resize((81, 60)).save(tmp_path / "images_2" / f"{frame.file.stem}.webp")
@@ -340,8 +340,8 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
     shares = [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]  # as ns-train
     for more, expected in (
         ({"test_every": 8}, [names[0], names[8]]),  # as gsplat
-        ({"holdout": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
-        ({"holdout": ("0.1",)}, shares),
+        ({"eval_images": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
+        ({"eval_images": ("0.1",)}, shares),
     ):
         scene = open_splat(path, replace(base, **more))
         assert scene.held_out.names == expected

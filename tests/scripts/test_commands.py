@@ -53,7 +53,11 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
 
 
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
-    places = {"--output-json": tmp_path / "a.json", "--output-npz": tmp_path / "a.npz", "--render-dir": tmp_path / "pictures"}
+    places = {
+        "--output-json": tmp_path / "a.json",
+        "--output-npz": tmp_path / "a.npz",
+        "--render-dir": tmp_path / "pictures",
+    }
     outputs = [word for pair in places.items() for word in pair]
     flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
@@ -231,7 +235,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
     output = ("--load-config", little, "--vote-k", "12", "--output-dir", tmp_path / "out")
-    exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
+    exporting = ("--encoder", "color", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
     assert len(list((tmp_path / "features").iterdir())) == 2 * 6
     texts = ("red", "sky blue")

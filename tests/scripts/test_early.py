@@ -51,9 +51,9 @@ def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"normlift_ns.{name}", None)
 
 
-COLOUR = ("--encoder", "colour")
+COLOUR = ("--encoder", "color")
 LIFT = [
-    ("--encoder colour --reliability-beta nan", "--reliability-beta", "got nan"),
+    ("--encoder color --reliability-beta nan", "--reliability-beta", "got nan"),
     ("--encoder words", "'words'", "--encoder"),
     ("--queries oragne", "oragne", "orange"),
     ("--threshold 0.5", "--threshold"),
@@ -243,7 +243,7 @@ def test_places_of_a_config_and_others_are_looked_at_without_harm(config, tmp_pa
 
 
 def test_options_of_what_is_off_are_refused():
-    for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_least": 0.0}.items():
+    for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_min_agreement": 0.0}.items():
         with pytest.raises(InputError, match=f"--{name.replace('_', '-')} is for --consensus True"):
             check_unused_options(LiftOptions(consensus=False, **{name: value}))
     with pytest.raises(InputError, match="--vote-prior is for --vote posterior"):

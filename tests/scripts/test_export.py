@@ -126,7 +126,10 @@ def test_objects_of_the_room(lifted: Path, tmp_path: Path, monkeypatch) -> None:
 
 def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
-    for flags, fact in ((("red", "--threshold", "1.5", "--select", "selection"), "no Gaussian"), (("oragne",), "orange")):
+    for flags, fact in (
+        (("red", "--threshold", "1.5", "--select", "selection"), "no Gaussian"),
+        (("oragne",), "orange"),
+    ):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
         assert not list((tmp_path / "x").glob("*"))

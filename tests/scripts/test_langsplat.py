@@ -148,7 +148,7 @@ def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     relative = Path(os.path.relpath(source, tmp_path))
-    flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
+    flags = ("--encoder", "color", "--output-dir", "lifted", "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
     config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
     asked = ("--load-config", config, "--text", "orange", "crimson", "--output-json", "a.json")
@@ -168,7 +168,7 @@ def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
     captures = SHARED / "captures"
     source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
     regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
-    flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
+    flags = ("--encoder", "color", *regions, "--output-dir", tmp_path, "--timestamp", "t")
     monkeypatch.chdir(captures)
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
     run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)

@@ -120,7 +120,7 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
     assert (unnamed.text, unnamed.gaussians) == ("", found.objects[0].gaussians)
     assert run.catalogue(answer.mask & False).objects == ()
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="metres_per_unit"):
+        with pytest.raises(InputError, match="meters_per_unit"):
             run.catalogue(answer, meters_per_unit=wrong)
 
 
@@ -179,7 +179,16 @@ def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch)
 def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     rows = {}
     for part in ("scene", "clean"):
-        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", "--select", part)
+        flags = (
+            "--load-config",
+            lifted,
+            "--output-dir",
+            tmp_path,
+            "--output-filename",
+            f"{part}.ply",
+            "--select",
+            part,
+        )
         assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
         rows[part] = np.load(tmp_path / f"{part}_rows.npy")
     mask = open_run(lifted).floaters().mask

@@ -46,7 +46,7 @@ def stranger(little: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ply = write_ply(folder / "splat.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
     world = little.parent / "dataparser_transforms.json"
     cameras = SplatOptions(transforms=folder / "room", world_transform=world, rasterize_mode="classic")
-    source = SourceOptions(encoder="colour", region_count=64)
+    source = SourceOptions(encoder="color", region_count=64)
     options = {"timestamp": "t", "queries": ("red",), "source": source, "output_dir": folder / "outputs"}
     config = NormLift(load_ply=ply, splat=cameras, **options).main().config
     ply.unlink()  # it is not needed any more

@@ -101,7 +101,10 @@ def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
     program = "from normlift_ns.cli.start import lift; lift()"
     config = tmp_path / ("long-" * 30) / "no.yml"
-    for flags, fact in ((("--load-config", str(config)), str(config)), (("--vote-k", "many"), "--vote-k cannot be 'many'.")):
+    for flags, fact in (
+        (("--load-config", str(config)), str(config)),
+        (("--vote-k", "many"), "--vote-k cannot be 'many'."),
+    ):
         master, slave = pty.openpty()
         words = [sys.executable, "-c", program, *flags]
         subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)

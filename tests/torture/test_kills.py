@@ -51,7 +51,7 @@ class Place:
         self.config = self.runs / "one" / "config.yml"
 
     def lift(self, *flags: object) -> tuple[object, ...]:
-        common = ("--encoder", "colour", "--check-alignment", False, "--device", "cpu")
+        common = ("--encoder", "color", "--check-alignment", False, "--device", "cpu")
         return ("lift", "--load-config", self.trained, *common, *flags)
 
     def save(self) -> None:

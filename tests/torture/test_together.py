@@ -127,7 +127,10 @@ def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record:
     assert codes == [0] * EIGHT, logs
     assert tree(place.config.parent) in known
     place.restore()
-    mixed = [*(place.lift("--vote-k", 6) for _ in range(3)), *(export(place, "red", "--overwrite", True) for _ in range(3))]
+    mixed = [
+        *(place.lift("--vote-k", 6) for _ in range(3)),
+        *(export(place, "red", "--overwrite", True) for _ in range(3)),
+    ]
     codes, logs = together(place, tmp_path, *mixed, save(TEXTS[0]), save(TEXTS[1]))
     assert set(codes) == {0}, logs
     assert len(list(place.runs.glob("[!.]*"))) == 4
