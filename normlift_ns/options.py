@@ -474,8 +474,8 @@ class SourceOptions:
     >>> from normlift_ns import LiftOptions, SourceOptions, lift_run
     >>> source = SourceOptions(encoder="color", regions="grid", region_count=192)
     >>> run = lift_run(config, source=source, lift=LiftOptions(max_views=3), output_dir=folder)
-    >>> run.field.manifest["encoder"]["encoder"], run.ask("red")["red"].peak > 0.9
-    ('colour', True)
+    >>> run.field.manifest["options"]["max_views"], run.ask("red")["red"].peak > 0.9
+    (3, True)
     """
 
     encoder: str = "open_clip"
