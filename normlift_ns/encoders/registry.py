@@ -201,7 +201,7 @@ ENCODERS = Registry(
 
 
 def canonical_name(encoder: str) -> str:
-    """Return the documented name of an encoder; runs and commands may also have the name colour."""
+    """Return the documented name of an encoder; commands accept the spelling "colour", which runs record."""
     return "color" if encoder == "colour" else encoder
 
 
