@@ -136,15 +136,9 @@ class LiftedRun:
         if not all(isinstance(text, str) for text in texts):
             raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
         question = make_query(
-            self.field,
-            self.texts.rows,
-            texts,
-            negatives=negatives,
-            relevancy=relevancy,
-            threshold=threshold,
-            min_reliability=min_reliability,
-            refined=refined,
-        )
+            self.field, self.texts.rows, texts, negatives=negatives, relevancy=relevancy, threshold=threshold,
+            min_reliability=min_reliability, refined=refined,
+        )  # fmt: skip
         return run_query(self.field, self.scene.gaussians.means, question)
 
     def ask_stored(self) -> Answer | None:
@@ -212,22 +206,12 @@ class LiftedRun:
         for file, written in zip(export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        instances = (
-            None
-            if answer is None
-            else answer_instances(answer, max_gap=object_max_gap, min_gaussians=object_min_gaussians)
-        )
+        instances = None if answer is None else answer_instances(answer, object_max_gap, object_min_gaussians)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return write_splat_ply(
-            path,
-            TrainedSplat.of(self.scene),
-            self.field,
-            answer,
-            keep=keep,
-            instances=instances,
-            objects=objects,
-            overwrite=overwrite,
-        )
+            path, TrainedSplat.of(self.scene), self.field, answer,
+            keep=keep, instances=instances, objects=objects, overwrite=overwrite,
+        )  # fmt: skip
 
     def masks(
         self,

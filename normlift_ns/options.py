@@ -151,20 +151,20 @@ def renamed(**names: str) -> Callable[[_Target], _Target]:
     >>> @renamed(part="select")
     ... def export(select): return select
     >>> with warnings.catch_warnings(record=True) as given:
+    ...     warnings.simplefilter("always")
     ...     export(part="rest"), str(given[0].message)
-    ('rest', 'part is now select; the old name will not work in the next version')
+    ('rest', 'part is now select; the old name works in this version only')
     """
 
     def decorate(target: Any) -> Any:
-        if not isinstance(target, type):
+        if not is_dataclass(target):
             return _accept_old_keywords(target, names)
-        cls: Any = target
-        cls.old_names = {**getattr(cls, "old_names", {}), **names}
-        cls.__init__ = _accept_old_keywords(cls.__init__, cls.old_names)
-        cls.__getattr__ = _get_renamed
-        restore = getattr(cls, "__setstate__", lambda self, state: vars(self).update(state))
-        cls.__setstate__ = lambda self, state: restore(self, new_names(cls, state))
-        return cls
+        target.old_names = {**getattr(target, "old_names", {}), **names}
+        target.__init__ = _accept_old_keywords(target.__init__, target.old_names)
+        target.__getattr__ = _get_renamed
+        restore = getattr(target, "__setstate__", lambda self, state: vars(self).update(state))
+        target.__setstate__ = lambda self, state: restore(self, new_names(target, state))
+        return target
 
     return decorate
 
@@ -188,8 +188,7 @@ def _get_renamed(self: Any, name: str) -> Any:
 
 
 def _warn_renamed(old: str, new: str) -> None:
-    message = f"{old} is now {new}; the old name will not work in the next version"
-    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    warnings.warn(f"{old} is now {new}; the old name works in this version only", DeprecationWarning, stacklevel=3)
 
 
 def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,12 +205,16 @@ def names_of_0_2(options: Any) -> dict[str, Any]:
     return {name: names_of_0_2(value) if is_dataclass(value) else value for name, value in values.items()}
 
 
-def renamed_flags(options: Any) -> dict[str, str]:
-    """Return the renamed flags of an options dataclass and of its groups: the new flag by the old one."""
-    names = VOTE_FLAGS if options is RefineConfig else getattr(options, "old_names", {})
-    flags = {f"--{old}".replace("_", "-"): f"--{new}".replace("_", "-") for old, new in names.items()}
+def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
+    """Return the renamed flags of an options dataclass and of its groups: the new flag by the old one.
+
+    Args:
+        prefix: Start of the flags. In commands of other packages, those of `RefineConfig` have no other names.
+    """
+    names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
+    flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
     for hint in filter(is_dataclass, _hints(options).values()):
-        flags |= renamed_flags(hint)
+        flags |= renamed_flags(hint, prefix)
     return flags
 
 
@@ -235,8 +238,7 @@ def rename_flags(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:
 
 @cache
 def _print_renamed(old: str, new: str) -> None:
-    if sys.stderr is not None:
-        sys.stderr.write(f"{old} is now {new}; the old name will not work in the next version.\n")
+    print(f"{old} is now {new}; the old name works in this version only.", file=sys.stderr)
 
 
 def check_options(options: Any) -> None:
@@ -537,6 +539,11 @@ class SourceOptions:
         check_options(self)
         check_prompt_list("sam3_prompts", self.sam3_prompts)
 
+    @classmethod
+    def stored(cls, values: Mapping[str, Any]) -> SourceOptions:
+        """Return options that a manifest records, in the names of this version or of version 0.2."""
+        return cls(**new_names(cls, values))
+
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
         """Return options whose sam3 prompts are filled in from `queries` if none are set."""
         missing = self.regions == "sam3" and len(self.sam3_prompts) == 0
@@ -722,10 +729,6 @@ class LiftOptions(CheckedOptions):
         vars(self).update({"consensus": False, **options})
 
 
-_ENCODING = ("text_embeddings", "prompt_template")
-"""Fields of `AskOptions` that encode prompts."""
-
-
 @renamed(rule="relevancy", text_vectors="text_embeddings", text_template="prompt_template")
 @dataclass(frozen=True)
 class AskOptions:
@@ -761,8 +764,8 @@ class AskOptions:
 
     def rules(self) -> dict[str, Any]:
         """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
-        return {name: value for name, value in vars(self).items() if name not in _ENCODING}
+        return {name: value for name, value in vars(self).items() if name not in self.encoding()}
 
     def encoding(self) -> dict[str, Any]:
         """Return the other options, which encode prompts, as keyword arguments of `open_run`."""
-        return {name: getattr(self, name) for name in _ENCODING}
+        return {"text_embeddings": self.text_embeddings, "prompt_template": self.prompt_template}

@@ -159,8 +159,8 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
     """Return the options of a lift for `consensus`."""
-    power, sample, least = options.consensus_power, options.consensus_sample, options.consensus_min_agreement
-    return {"power": power, "sample": sample, "least": least}
+    least = options.consensus_min_agreement
+    return {"power": options.consensus_power, "sample": options.consensus_sample, "least": least}
 
 
 def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:

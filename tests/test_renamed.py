@@ -112,7 +112,10 @@ def test_ns_train_has_old_options_of_our_methods(capsys):
     ]
     new = [*old[:1], "--pipeline.lift.reliability-beta", "2", "--pipeline.source.prompt-template=a {}", *old[4:]]
     assert entry._rename_flags(["/bin/ns-train", *old]) == ["/bin/ns-train", *new]
-    assert [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()] == [old[1], old[3].partition("=")[0]]
+    assert [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()] == [
+        old[1],
+        old[3].partition("=")[0],
+    ]
     for others in (["/bin/ns-viewer", *old], ["/bin/ns-train", "splatfacto", *old[1:]], ["ns-train"], []):
         assert entry._rename_flags(others) == others
 

@@ -165,9 +165,7 @@ def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor,
     return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
-def _large_components(
-    means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int
-) -> tuple[Int32[Tensor, " n"], int]:
+def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
     """Return `connected_components` with -1 for those that are too small, and the number of the others."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
@@ -277,7 +275,6 @@ def find_instances(
     means: Float[Tensor, "n 3"],
     relevancy: Float[Tensor, "n q"],
     selected: Bool[Tensor, "n q"],
-    *,
     max_gap: float = OBJECT_MAX_GAP,
     min_gaussians: int = OBJECT_MIN_GAUSSIANS,
 ) -> Instances:

@@ -309,8 +309,7 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     if name is None and program.parent == Path(__file__).parent:  # started as a module
         name = f"python -m {__package__}.{program.stem}"
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
-    arguments = rename_flags(arguments, renamed_flags(command))
-    arguments = fill_boolean_values(arguments, boolean_flags(command))
+    arguments = fill_boolean_values(rename_flags(arguments, renamed_flags(command)), boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
     with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
@@ -454,9 +453,8 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
         params = docstring_parser.parse_from_object(cls).params
         texts |= {param.arg_name: param.description or "" for param in params}
     for field in fields(options):
-        hint, text, name = hints[field.name], texts.get(field.name, ""), None
-        if options is RefineConfig:
-            name = VOTE_FLAGS.get(field.name, field.name).replace("_", "-")
+        hint, text = hints[field.name], texts.get(field.name, "")
+        name = VOTE_FLAGS.get(field.name) if options is RefineConfig else None
         if is_dataclass(hint):
             add_help_texts(hint, nested=True)
             text, name = first_paragraph(hint), "" if nested else None

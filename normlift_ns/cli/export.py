@@ -47,11 +47,8 @@ if TYPE_CHECKING:
 
 
 @renamed(
-    part="select",
-    reach="object_max_gap",
-    min_size="object_min_gaussians",
-    floater_limit="floater_threshold",
-)
+    part="select", reach="object_max_gap", min_size="object_min_gaussians", floater_limit="floater_threshold"
+)  # fmt: skip
 @dataclass
 class NormLiftExport(CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
@@ -136,9 +133,7 @@ class NormLiftExport(CheckedOptions):
         )
         if answer is None:
             return job
-        instances = exports.answer_instances(
-            answer, max_gap=self.object_max_gap, min_gaussians=self.object_min_gaussians
-        )
+        instances = exports.answer_instances(answer, self.object_max_gap, self.object_min_gaussians)
         objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
         transfer = None
         if cloud is not None:

@@ -34,15 +34,7 @@ from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
-from normlift_ns.options import (
-    CheckedOptions,
-    LiftOptions,
-    SourceOptions,
-    SplatOptions,
-    check_device,
-    check_number,
-    renamed,
-)
+from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, renamed
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
@@ -212,18 +204,8 @@ class NormLift(CheckedOptions):
             info_progress(text)
 
         with progress_bars() as report:
-            names = (
-                "open_scene",
-                "source",
-                "lift",
-                "queries",
-                "output_dir",
-                "timestamp",
-                "overwrite",
-                "check_alignment",
-                "device",
-            )
-            options: dict[str, Any] = {name: getattr(self, name) for name in names}
+            names = ("source", "lift", "queries", "output_dir", "timestamp", "overwrite", "check_alignment", "device")
+            options: dict[str, Any] = {name: getattr(self, name) for name in ("open_scene", *names)}
             export = None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite)
             request = LiftRequest(**options, export=export, report=report, say=on_message)
             if team is None:
@@ -243,7 +225,6 @@ class NormLift(CheckedOptions):
     def check_early(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
-        check_number("num_devices", self.num_devices, int)
         if self.num_devices > 1 and ":" in self.device:
             raise InputError(
                 f"--device {self.device} is one GPU, but --num-devices is {self.num_devices}; give --device cuda"

@@ -11,15 +11,7 @@ from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.run_dir import field_folder, read_manifest, text_cache_folder
-from normlift_ns.options import (
-    AskOptions,
-    LiftOptions,
-    SourceOptions,
-    SplatOptions,
-    check_prompt_list,
-    new_names,
-    short_repr,
-)
+from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
 
 def check_readable_file(path: Path | None, flag: str) -> None:
@@ -146,7 +138,7 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
         return
     check_readable_file(ask.text_embeddings, "--text-embeddings")
     try:
-        stored = SourceOptions(**new_names(SourceOptions, read_manifest(folder)[0]["encoder"]))
+        stored = SourceOptions.stored(read_manifest(folder)[0]["encoder"])
     except (KeyError, TypeError, ValueError, OSError):  # reported when the run is opened
         return
     names = text_cache_folder(folder.parent)

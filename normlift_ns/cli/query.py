@@ -48,14 +48,14 @@ if TYPE_CHECKING:
     from normlift_ns.query.question import Query
 
 
+_OUTPUTS = ("output_json", "output_npz", "render_dir")
+"""Options of files that hold an answer."""
+
+
 @renamed(
-    save="save_query",
-    json="output_json",
-    output_path="output_npz",
-    why="explain",
-    why_dir="explain_dir",
-    metres_per_unit="meters_per_unit",
-)
+    save="save_query", json="output_json", output_path="output_npz",
+    why="explain", why_dir="explain_dir", metres_per_unit="meters_per_unit",
+)  # fmt: skip
 @dataclass
 class NormLiftQuery(CheckedOptions):
     """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
@@ -252,13 +252,9 @@ class NormLiftQuery(CheckedOptions):
 
         run, answer = self._run, self._answer_with_scene(question)
         instances = objects.find_instances(answer.texts, answer.means, answer.relevancy, answer.selected)
+        transform, device = objects.similarity_to_capture(run.folder, run.scene.identity), choose_device("auto")
         catalog = objects.make_catalogue(
-            run.scene,
-            run.field,
-            instances,
-            objects.similarity_to_capture(run.folder, run.scene.identity),
-            meters_per_unit=self.meters_per_unit,
-            device=choose_device("auto"),
+            run.scene, run.field, instances, transform, meters_per_unit=self.meters_per_unit, device=device
         )
         if self.objects_dir is not None:
             metadata = {"texts": list(question.texts), **question.settings()}
@@ -270,11 +266,8 @@ class NormLiftQuery(CheckedOptions):
         check_device(self.device)
         self._check_texts()
         check_lifted_run(self.load_config, self.data, self.ask)
-        if (
-            self.output_json
-            and self.output_npz
-            and os.path.realpath(self.output_json) == os.path.realpath(self.output_npz)
-        ):
+        outputs = [os.path.realpath(path) for path in (self.output_json, self.output_npz) if path is not None]
+        if len(set(outputs)) < len(outputs):
             raise InputError(f"--output-json and --output-npz name the same file, {self.output_npz}")
         for flag, path in (("--output-json", self.output_json), ("--output-npz", self.output_npz)):
             check_new_files(path, overwrite=self.overwrite, flags=flag)
@@ -294,16 +287,7 @@ class NormLiftQuery(CheckedOptions):
             )
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
-        for name in (
-            "output_json",
-            "output_npz",
-            "render_dir",
-            "save_query",
-            "explain",
-            "explain_dir",
-            "segment",
-            "objects",
-        ):
+        for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
         self._check_dependent_options()
@@ -412,14 +396,9 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
-    arrays: dict[str, Any] = {
-        "relevancy": result.relevancy,
-        "reliability": result.field.scalars.reliability,
-        "valid": result.valid,
-        **extra,
-    }
+    arrays = {"relevancy": result.relevancy, "reliability": result.field.scalars.reliability, "valid": result.valid}
     with atomic_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        np.savez(file, names=np.array(result.question.texts), **arrays)
+        np.savez(file, names=np.array(result.question.texts), **arrays, **extra)
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:

@@ -18,11 +18,9 @@ if TYPE_CHECKING:
 
 
 @renamed(
-    share_readonly="read_only",
-    most_drawn="max_gaussians",
-    text_vectors="text_embeddings",
-    text_template="prompt_template",
-)
+    share_readonly="read_only", most_drawn="max_gaussians",
+    text_vectors="text_embeddings", text_template="prompt_template",
+)  # fmt: skip
 @dataclass
 class NormLiftView(CheckedOptions):
     """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
@@ -79,12 +77,9 @@ class NormLiftView(CheckedOptions):
         from normlift_ns.viewer.shared import Run, make_records  # noqa: PLC0415
 
         run = open_run(
-            self.load_config,
-            data=self.data,
-            device=self.device,
-            text_embeddings=self.text_embeddings,
-            prompt_template=self.prompt_template,
-        )
+            self.load_config, data=self.data, device=self.device,
+            text_embeddings=self.text_embeddings, prompt_template=self.prompt_template,
+        )  # fmt: skip
         space = SelectionContext(run.field, run.scene.gaussians.means.detach())
         records = make_records(run.scene, self.max_gaussians)
         shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.read_only, lambda: run.votes)

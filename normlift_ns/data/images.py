@@ -61,8 +61,7 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
         return None  # an image name
     if not 0 < fraction < 1:
         raise InputError(
-            f"--eval-images {eval_images[0]} is not a fraction: expected a number between 0 and 1, such as 0.1, or "
-            "image names"
+            f"--eval-images {eval_images[0]} is not a fraction: expected a number between 0 and 1, or image names"
         )
     return fraction
 
@@ -70,9 +69,7 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
 def _read_names(file: Path) -> list[str]:
     """Read image names from a text file, one per line."""
     if not file.is_file():
-        raise InputError(
-            f"--eval-images names the file {file}, which does not exist. Expected one image name per line."
-        )
+        raise InputError(f"--eval-images names the file {file}, which does not exist. Expected one name per line.")
     try:
         names = [line.strip() for line in file.read_text("utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:

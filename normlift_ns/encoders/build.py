@@ -34,10 +34,8 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
         raise InputError(
             f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
         )
-    if options.text_embeddings is not None:
-        raise InputError(
-            f"--text-embeddings {options.text_embeddings} is for imported features; add --features langsplat"
-        )
+    if (file := options.text_embeddings) is not None:
+        raise InputError(f"--text-embeddings {file} is for imported features; add --features langsplat")
     name = resolve_regions(options, device)
     masks = _make_masks(options, name, device)
     return masks if MASK_SOURCES.load(name).has_features else RegionFeatures(masks, make_encoder(options, device))

@@ -233,9 +233,8 @@ def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
     """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
     from normlift_ns.encoders.text_files import TextEmbeddingFile  # noqa: PLC0415 (needs numpy)
 
-    return (
-        make_encoder(options, device) if options.text_embeddings is None else TextEmbeddingFile(options.text_embeddings)
-    )
+    file = options.text_embeddings
+    return make_encoder(options, device) if file is None else TextEmbeddingFile(file)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:

@@ -89,8 +89,8 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
         return lifted
     cells = partial(_plain, power=options.get("weight_power", 1))
     evidence, features, level = _evidence_again(lifted, device, cells)
-    beta = options.get("reliability_beta", defaults.reliability_beta)
-    lift_kwargs = {"beta": beta, "unlabeled": options.get("unlabeled", defaults.unlabeled)}
+    beta, unlabeled = (options.get(key, getattr(defaults, key)) for key in ("reliability_beta", "unlabeled"))
+    lift_kwargs = {"beta": beta, "unlabeled": unlabeled}
     result = lift(evidence, features, **lift_kwargs)
     if enabled:
         names = {"power": "consensus_power", "sample": "consensus_sample", "least": "consensus_min_agreement"}

@@ -231,10 +231,13 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
             raise InputError(f"it has a digest of {outside[0]!r}, which is not a file of a run")
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {LIFT_AGAIN}") from error
-    for name, options in (("options", LiftOptions), ("source", SourceOptions)):
-        if isinstance(facts.get(name), dict):
-            facts[name] = new_names(options, facts[name])
-    return facts, digests
+    return facts | _new_names(facts), digests
+
+
+def _new_names(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a manifest that record options, with the names of this version."""
+    recorded = {"options": LiftOptions, "source": SourceOptions}
+    return {name: new_names(recorded[name], x) for name, x in facts.items() if name in recorded and isinstance(x, dict)}
 
 
 def read_text(path: Path) -> str:

@@ -14,14 +14,11 @@ from typing import Any
 
 def _rename_flags(words: list[str]) -> list[str]:
     """Return the command line of this process with the new names of options, if it is ns-train with our method."""
-    from normlift_ns.options import LiftOptions, SourceOptions, rename_flags  # noqa: PLC0415 (the import may fail)
+    from normlift_ns.options import LiftOptions, SourceOptions, rename_flags, renamed_flags  # noqa: PLC0415 (may fail)
 
     if Path("".join(words[:1])).stem != "ns-train" or not "".join(words[1:2]).startswith("normlift"):
         return words
-    flags: dict[str, str] = {}
-    for prefix, options in (("--pipeline.lift.", LiftOptions), ("--pipeline.source.", SourceOptions)):
-        names: dict[str, str] = vars(options)["old_names"]
-        flags |= {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
+    flags = renamed_flags(LiftOptions, "--pipeline.lift.") | renamed_flags(SourceOptions, "--pipeline.source.")
     return rename_flags(words, flags)
 
 

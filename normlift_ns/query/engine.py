@@ -425,10 +425,10 @@ def presence_limit(rule: RelevancyRule, encoder: str | None) -> float | None:
     Plain cosines have a meaning only if their distribution is known, as it is for the color encoder, where 0.9 is a
     neighboring shade. Cosines of CLIP lie between 0.1 and 0.4, and vary by prompt, in the scene or not.
 
-    >>> presence_limit("lerf", "open_clip"), presence_limit("cosine", "color"), presence_limit("cosine", "open_clip")
+    >>> presence_limit("lerf", "open_clip"), presence_limit("cosine", "colour"), presence_limit("cosine", "open_clip")
     (0.62, 0.9, None)
     """
-    return _COLOR_LIMIT if rule == "cosine" and encoder == "color" else RELEVANCY_RULES[rule].presence_limit
+    return _COLOR_LIMIT if rule == "cosine" and encoder == "colour" else RELEVANCY_RULES[rule].presence_limit
 
 
 def _suggest(median: float, top: float) -> float:

@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 from normlift_ns.encoders.registry import (
     EncoderKind,
     absolute_paths,
-    canonical_name,
     encoder_kind,
     find_encoder_kind,
     make_encoder,
@@ -23,7 +22,7 @@ from normlift_ns.encoders.registry import (
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
-from normlift_ns.options import RelevancyRule, SourceOptions, names_of_0_2, new_names
+from normlift_ns.options import RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that determine the encoder or the text embeddings of a field; its manifest records them by their
@@ -192,14 +191,14 @@ def _options(field: HasManifest) -> SourceOptions:
             "(--text-embeddings), or lift again with texts"
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
-    return SourceOptions(**new_names(SourceOptions, {**stored, **placeholder}))
+    return SourceOptions.stored({**stored, **placeholder})
 
 
 def encoder_name(field: HasManifest) -> str | None:
     """Return the name of the encoder of a field; None if the manifest does not record it."""
     stored = field.manifest.get("encoder")
     name = stored.get("encoder") if isinstance(stored, Mapping) else None
-    return canonical_name(name) if isinstance(name, str) else None
+    return name if isinstance(name, str) else None
 
 
 def default_rule(field: HasManifest) -> DefaultRule:

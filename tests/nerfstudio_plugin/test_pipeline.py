@@ -82,7 +82,7 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     assert torch.equal(loaded.means.cpu(), model.means.cpu())
 
     stored, again = yaml.load(trained.config.read_text(), Loader=yaml.Loader).pipeline, run.config.pipeline
-    assert (stored.lift, stored.source.encoder) == (LIFT, "colour")
+    assert (stored.lift, stored.source.encoder) == (LIFT, "color")
     assert (again.lift, again.queries) == (LIFT, ("red", "sky blue"))
     assert not any("normlift" in name for name in trained.pipeline.state_dict())
     attributes = dict.fromkeys(("optimizers", "grad_scaler", "pipeline", "trainer"))
