@@ -157,7 +157,7 @@ def renamed(**names: str) -> Callable[[_Target], _Target]:
     """
 
     def decorate(target: Any) -> Any:
-        if not is_dataclass(target):
+        if not hasattr(target, "__dataclass_fields__"):
             return _accept_old_keywords(target, names)
         target.old_names = {**getattr(target, "old_names", {}), **names}
         target.__init__ = _accept_old_keywords(target.__init__, target.old_names)

@@ -192,6 +192,7 @@ class Pipeline:
 def test_options_within_options_of_a_command_are_a_message(monkeypatch, capsys):
     """As in ns-train normlift, which reads its flags with tyro, before it trains."""
     monkeypatch.setitem(LiftOptions.__annotations__, "vote", RefineConfig)  # as before a command of ours has named it
+    monkeypatch.setitem(RefineConfig.__annotations__, "sigma_d", "float | None")
     with pytest.raises(SystemExit) as stop:
         tyro.cli(Pipeline, args=["--lift.vote.sigma-d", "nan"])
     shown = " ".join(capsys.readouterr().err.replace("│", " ").split())
