@@ -126,7 +126,8 @@ class NormLift(CheckedOptions):
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
-            words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
+            words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # told once
+            program = [sys.executable, "-m", "normlift_ns.cli.lift"]
             other = [*program, *split_output_flags(words)[0]]  # only the first process writes the log file
             code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], print_error)
             if code > 0:
