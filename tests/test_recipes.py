@@ -48,7 +48,7 @@ RULE = """
 import sys, numpy as np, normlift_ns as nl
 from pathlib import Path
 from normlift_ns.query.arrays import open_quick
-how = {"rule": "mean", "negatives": ["blue", "yellow"]}
+how = {"relevancy": "mean", "negatives": ["blue", "yellow"]}
 run = nl.open_run(sys.argv[1])
 ours = run.ask("red", **how).relevancy.numpy()
 text, *negatives = (run.ask(text, relevancy="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))

@@ -20,7 +20,7 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import RelevancyRule, check_bool, check_number, short_repr
+from normlift_ns.options import RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
 
 
@@ -64,6 +64,7 @@ class Query:
         return {"relevancy": self.rule, "threshold": self.threshold, "min_reliability": self.min_reliability}
 
 
+@renamed(rule="relevancy")
 def make_query(
     field: HasManifest,
     encode: Callable[[Sequence[str]], Any],
