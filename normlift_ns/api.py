@@ -57,6 +57,7 @@ from normlift_ns.options import (
     check_bool,
     check_path,
     check_prompt_list,
+    renamed,
 )
 from normlift_ns.pipeline import LiftResult, lift_scene, resolve_gsplat_version
 from normlift_ns.progress import ProgressCallback, StageTimer
@@ -66,6 +67,7 @@ from normlift_ns.query.text_encoder import encoder_settings, precomputed_setting
 from normlift_ns.rasterization.settings import RasterSettings
 
 
+@renamed(check="check_alignment")
 def lift_run(
     config_or_scene: str | Path | Scene,
     *,
@@ -79,7 +81,7 @@ def lift_run(
     output_dir: str | Path | None = None,
     timestamp: str | None = None,
     overwrite: bool = False,
-    check: bool = True,
+    check_alignment: bool = True,
     device: str = "auto",
     export: FeatureExport | None = None,
     report: ProgressCallback = lambda stage, done, total: None,
@@ -103,8 +105,8 @@ def lift_run(
         output_dir: output folder, instead of the outputs folder of the trained run.
         timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: replace a run directory of that name, and exported files with other content.
-        check: compare three training images with renders of the scene first. Warn if they differ; raise if the splat
-            does not show what the images show.
+        check_alignment: compare three training images with renders of the scene first. Warn if they differ; raise if
+            the splat does not show what the images show.
         device: auto, cpu or cuda.
         export: LangSplat files to also write the 2D features to; None: none.
         report: called with (stage, steps done, total steps).
@@ -132,8 +134,8 @@ def lift_run(
 
     request = LiftRequest(
         open_scene=opened, source=source, features=features, texts=texts,
-        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
-        device=device, export=export, report=report, say=say,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite,
+        check_alignment=check_alignment, device=device, export=export, report=report, say=say,
     )  # fmt: skip
     return run_lift(request)
 
@@ -152,7 +154,7 @@ class LiftRequest:
     output_dir: str | Path | None = None
     timestamp: str | None = None
     overwrite: bool = False
-    check: bool = True
+    check_alignment: bool = True
     device: str = "auto"
     export: FeatureExport | None = None
     report: ProgressCallback = lambda stage, done, total: None
@@ -164,7 +166,7 @@ class LiftRequest:
         if self.features is not None and self.source is not None:
             raise InputError("features replace source; pass only one of the two")
         check_prompt_list("queries", self.queries)
-        check_bool("check", self.check)
+        check_bool("check_alignment", self.check_alignment)
         check_bool("overwrite", self.overwrite)
         if self.output_dir is not None:
             check_path("output_dir", self.output_dir)
@@ -259,7 +261,7 @@ def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str 
 
 def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
     """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
-    if not prepared.request.check:
+    if not prepared.request.check_alignment:
         return
     with stages("check") as step:
         warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
@@ -304,7 +306,7 @@ def query_to_store(
     if length != field.dimension:
         raise InputError(
             f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; name the model "
-            "of the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
+            "of the features with --encoder-model and --encoder-pretrained, or give --text-embeddings"
         )
     negatives = None
     if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet

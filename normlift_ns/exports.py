@@ -54,10 +54,10 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
 
 
 def answer_instances(
-    answer: Answer, *, reach: float = OBJECT_MAX_GAP, min_size: int = OBJECT_MIN_GAUSSIANS
+    answer: Answer, max_gap: float = OBJECT_MAX_GAP, min_gaussians: int = OBJECT_MIN_GAUSSIANS
 ) -> Instances:
     """Return class and object of every Gaussian; see `find_instances`."""
-    return find_instances(answer.texts, answer.means, answer.relevancy, answer.selected, reach=reach, min_size=min_size)
+    return find_instances(answer.texts, answer.means, answer.relevancy, answer.selected, max_gap, min_gaussians)
 
 
 def exportable_rows(columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:

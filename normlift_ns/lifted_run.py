@@ -50,6 +50,7 @@ from normlift_ns.options import (
     check_bool,
     check_number,
     check_path,
+    renamed,
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
 from normlift_ns.query.question import Query, load_query, make_query, save_query
@@ -98,11 +99,12 @@ class LiftedRun:
         """
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
+    @renamed(rule="relevancy")
     def ask(
         self,
         *texts: str,
         negatives: Sequence[str] | None = None,
-        rule: RelevancyRule | Literal["auto"] = "auto",
+        relevancy: RelevancyRule | Literal["auto"] = "auto",
         threshold: float | Literal["auto"] | None = None,
         min_reliability: float = 0.0,
         refined: bool = True,
@@ -112,10 +114,11 @@ class LiftedRun:
         Args:
             texts: prompts.
             negatives: prompts to compare with. If None, use LERF's canonical negatives if the encoder knows them.
-            rule: how to compute relevancy from cosines, see `relevancy`. "auto" is lerf with negatives, else cosine.
+            relevancy: how to compute relevancy from cosines, see `normlift_ns.relevancy`. "auto" is lerf with
+                negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None is 0.5, or 0.02 for rule margin, or "auto" for bare cosines of encoders other than
-                "colour".
+                relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for bare cosines of encoders other than
+                "color".
             min_reliability: minimum R of a selected Gaussian, in 0..1.
             refined: use the refined features, after the vote.
         Raises:
@@ -128,7 +131,7 @@ class LiftedRun:
             self.texts.rows,
             texts,
             negatives=negatives,
-            rule=rule,
+            relevancy=relevancy,
             threshold=threshold,
             min_reliability=min_reliability,
             refined=refined,
@@ -157,6 +160,7 @@ class LiftedRun:
             )
         return save_query(self.folder / FIELD_FOLDER, question)
 
+    @renamed(reach="object_max_gap", min_size="object_min_gaussians")
     def export(
         self,
         path: str | Path,
@@ -164,8 +168,8 @@ class LiftedRun:
         *,
         answer: Answer | None = None,
         objects: Mapping[str, Any] | None = None,
-        reach: float = OBJECT_MAX_GAP,
-        min_size: int = OBJECT_MIN_GAUSSIANS,
+        object_max_gap: float = OBJECT_MAX_GAP,
+        object_min_gaussians: int = OBJECT_MIN_GAUSSIANS,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
         """Write Gaussians to a PLY file, and their row indices in the scene to <stem>_rows.npy next to it.
@@ -178,8 +182,8 @@ class LiftedRun:
             answer: answer that provides relevancies, class_id and instance_id. If None, use that of `part`, if it has
                 one.
             objects: table to write to <stem>_objects.json, with JSON types only.
-            reach: largest gap between Gaussians of one object, as in `find_objects`.
-            min_size: minimum number of Gaussians in an object, as in `find_objects`.
+            object_max_gap: largest gap between Gaussians of one object, as in `find_objects`.
+            object_min_gaussians: minimum number of Gaussians in an object, as in `find_objects`.
             overwrite: replace files of these names. Without `objects`, also remove an earlier table of objects.
         Returns:
             The row indices of the written Gaussians.
@@ -199,7 +203,7 @@ class LiftedRun:
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        instances = None if answer is None else exports.answer_instances(answer, reach=reach, min_size=min_size)
+        instances = None if answer is None else exports.answer_instances(answer, object_max_gap, object_min_gaussians)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return exports.write_splat_ply(
             path,
@@ -321,8 +325,9 @@ class LiftedRun:
         answer = _answer_of(part)
         return self.votes.explain(self._mask(part), refined=answer is None or answer.question.refined)
 
+    @renamed(metres_per_unit="meters_per_unit")
     def catalogue(
-        self, part: Answer | Finding | Bool[Tensor, " n"], *, metres_per_unit: float | None = None
+        self, part: Answer | Finding | Bool[Tensor, " n"], *, meters_per_unit: float | None = None
     ) -> Catalogue:
         """List the objects of a selection, in the coordinates of the capture and in those of the scene.
 
@@ -332,7 +337,7 @@ class LiftedRun:
         Args:
             part: Gaussians selected by an answer or finding, or a mask of Gaussians, whose objects have no text. A
                 Gaussian that several prompts select belongs to the one with the largest relevancy.
-            metres_per_unit: length of one unit of the capture in meters. With it, positions in the capture are in
+            meters_per_unit: length of one unit of the capture in meters. With it, positions in the capture are in
                 meters.
         Raises:
             ValueError: the mask has another type or length, the unit length is not positive, or
@@ -341,17 +346,17 @@ class LiftedRun:
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
-        >>> ball = run.catalogue(run.ask("red", "yellow"), metres_per_unit=2.0).objects[0]
+        >>> ball = run.catalogue(run.ask("red", "yellow"), meters_per_unit=2.0).objects[0]
         >>> ball.id, ball.text, ball.gaussians > 20, ball.views, len(ball.best_views)
         (1, 'red', True, 10, 3)
         >>> bool(max(ball.capture.box.size) < 1.5 * min(ball.capture.box.size))  # about as wide as high
         True
         """
-        if metres_per_unit is not None:
-            check_number("metres_per_unit", metres_per_unit)
+        if meters_per_unit is not None:
+            check_number("meters_per_unit", meters_per_unit)
         instances, transform = self._instances(part), self.to_capture
         return make_catalogue(
-            self.scene, self.field, instances, transform, metres_per_unit=metres_per_unit, device=self.device
+            self.scene, self.field, instances, transform, meters_per_unit=meters_per_unit, device=self.device
         )
 
     @property
@@ -461,13 +466,14 @@ def _answer_of(part: Any) -> Answer | None:
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
+@renamed(text_vectors="text_embeddings", text_template="prompt_template")
 def open_run(
     load_config: str | Path,
     *,
     data: str | Path | None = None,
     device: str = "auto",
-    text_vectors: str | Path | None = None,
-    text_template: str | None = None,
+    text_embeddings: str | Path | None = None,
+    prompt_template: str | None = None,
 ) -> LiftedRun:
     """Open a lifted run, from any working directory.
 
@@ -475,8 +481,8 @@ def open_run(
         load_config: config.yml of the run.
         data: current path of the dataset, if it was moved.
         device: device of the text encoder (auto, cpu or cuda).
-        text_vectors: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
-        text_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
+        text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
+        prompt_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
             lift.
     Raises:
         FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
@@ -486,7 +492,7 @@ def open_run(
     >>> answer["yellow"].objects[0].size > 20
     True
     """
-    vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
+    vectors = None if text_embeddings is None else check_path("text_embeddings", text_embeddings)
     device = choose_device(device)
     folder, scene, stored = open_stored_run(load_config, data)
-    return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=text_template), device)
+    return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=prompt_template), device)

@@ -11,15 +11,17 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 import types
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from normlift_ns.errors import InputError
 from normlift_ns.registry import installed_names
@@ -51,21 +53,28 @@ def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
 
 
 _POSITIVE = OptionRange(_MIN_DIVISOR, _MAX_FLOAT, f"positive, at least {_MIN_DIVISOR:g}")
+_NOT_NEGATIVE = OptionRange(0.0, _MAX_FLOAT, "not negative")
 _OPTIONS_BY_RANGE = {
     _at_least(0): ("load_step",),
-    _at_least(1): ("k", "max_views", "lift_downscale", "consensus_sample", "segment_views", "min_size"),
+    _at_least(1): ("k", "max_views", "lift_downscale", "consensus_sample", "segment_views", "object_min_gaussians"),
     _at_least(1, 4096): ("num_devices",),
     _at_least(1, 2**20): ("region_count",),
-    _at_least(1, 10**7): ("most_drawn",),
+    _at_least(1, 10**7): ("max_gaussians",),
     _at_least(2): ("test_every",),
     _at_least(3, 10**5): ("views",),
     _at_least(2000, 10**8): ("num_gaussians",),
-    OptionRange(0.0, 1.0, "in 0..1"): ("consensus_least", "min_reliability", "min_opacity", "purity"),
+    OptionRange(0.0, 1.0, "in 0..1"): ("consensus_min_agreement", "min_reliability", "min_opacity", "purity"),
     OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
-    OptionRange(0.0, _MAX_FLOAT, "not negative"): ("delta", "prior", "beta", "consensus_power", "min_weight"),
-    _POSITIVE: ("sigma_d", "gamma", "reach", "metres_per_unit", "transfer_distance"),
+    OptionRange(0.0, _MAX_FLOAT, "not negative"): (
+        "delta",
+        "prior",
+        "reliability_beta",
+        "consensus_power",
+        "min_weight",
+    ),
+    _POSITIVE: ("sigma_d", "gamma", "object_max_gap", "meters_per_unit", "transfer_distance"),
     OptionRange(1e-9, _MAX_FLOAT, "positive, at least 1e-09"): ("tolerance",),
-    OptionRange(-_MAX_FLOAT, _MAX_FLOAT, "finite"): ("threshold", "floater_limit", "margin"),
+    OptionRange(-_MAX_FLOAT, _MAX_FLOAT, "finite"): ("threshold", "floater_threshold", "margin"),
     OptionRange(-_MAX_INT, _MAX_INT, "a 32-bit integer"): ("regions_background",),
     OptionRange(1, 65535, "a port number, 1..65535"): ("port",),
     OptionRange(1.0, 86400.0, "in 1..86400"): ("patience",),
@@ -78,12 +87,16 @@ _show_flags: ContextVar[bool] = ContextVar("flags", default=False)
 
 @contextmanager
 def named_as_flags() -> Iterator[None]:
-    """Let messages name options as flags (--sigma-d) instead of fields (sigma_d)."""
+    """Let messages name options as flags (--vote-sigma-d) instead of fields (sigma_d)."""
     token = _show_flags.set(True)
     try:
         yield
     finally:
         _show_flags.reset(token)
+
+
+VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "prior")}
+"""Names of the fields of `RefineConfig` on the command line."""
 
 
 def option_name(name: str) -> str:
@@ -93,9 +106,116 @@ def option_name(name: str) -> str:
     'sigma_d'
     >>> with named_as_flags():
     ...     option_name("sigma_d")
-    '--sigma-d'
+    '--vote-sigma-d'
     """
-    return f"--{name.replace('_', '-')}" if _show_flags.get() else name
+    return f"--{VOTE_FLAGS.get(name, name).replace('_', '-')}" if _show_flags.get() else name
+
+
+# Renamed options and keywords. The old names work for one version, in Python and on the command line.
+
+
+_Target = TypeVar("_Target")
+
+
+def renamed(**names: str) -> Callable[[_Target], _Target]:
+    """Accept old keywords of a function, or old names of the fields of a dataclass, with a DeprecationWarning.
+
+    Objects that are restored with `__setstate__`, as from a config.yml, may have old names without a warning.
+
+    Args:
+        names: New name by old name.
+
+    >>> @renamed(part="select")
+    ... def export(select): return select
+    >>> with warnings.catch_warnings(record=True) as given:
+    ...     warnings.simplefilter("always")
+    ...     export(part="rest"), str(given[0].message)
+    ('rest', 'part is now select; the old name works in this version only')
+    """
+
+    def decorate(target: Any) -> Any:
+        if not hasattr(target, "__dataclass_fields__"):
+            return _accept_old_keywords(target, names)
+        target.old_names = {**getattr(target, "old_names", {}), **names}
+        target.__init__ = _accept_old_keywords(target.__init__, target.old_names)
+        target.__getattr__ = _get_renamed
+        restore = getattr(target, "__setstate__", lambda self, state: vars(self).update(state))
+        target.__setstate__ = lambda self, state: restore(self, new_names(target, state))
+        return target
+
+    return decorate
+
+
+def _accept_old_keywords(function: Callable[..., Any], names: Mapping[str, str]) -> Callable[..., Any]:
+    @wraps(function)
+    def accept(*args: Any, **kwargs: Any) -> Any:
+        for old in names.keys() & kwargs.keys():
+            _warn_renamed(old, names[old])
+            kwargs[names[old]] = kwargs.pop(old)  # `replace` passes the new name too, with the value to replace
+        return function(*args, **kwargs)
+
+    return accept
+
+
+def _get_renamed(self: Any, name: str) -> Any:
+    if name not in type(self).old_names:
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+    _warn_renamed(name, type(self).old_names[name])
+    return getattr(self, type(self).old_names[name])
+
+
+def _warn_renamed(old: str, new: str) -> None:
+    warnings.warn(f"{old} is now {new}; the old name works in this version only", DeprecationWarning, stacklevel=3)
+
+
+def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return stored values of an options dataclass with the names of this version."""
+    return {options.old_names.get(name, name): value for name, value in stored.items()}
+
+
+def names_of_0_2(options: Any) -> dict[str, Any]:
+    """Return options as a dictionary with the names of version 0.2, which keys and manifests keep."""
+    old_names = {new: old for old, new in getattr(options, "old_names", {}).items()}
+    values = {old_names.get(field.name, field.name): getattr(options, field.name) for field in fields(options)}
+    if values.get("encoder") == "color":
+        values["encoder"] = "colour"
+    return {name: names_of_0_2(value) if is_dataclass(value) else value for name, value in values.items()}
+
+
+def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
+    """Return the renamed flags of an options dataclass and of its groups: the new flag by the old one.
+
+    Args:
+        prefix: Start of the flags. In commands of other packages, those of `RefineConfig` have no other names.
+    """
+    names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
+    flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
+    for hint in filter(is_dataclass, _hints(options).values()):
+        flags |= renamed_flags(hint, prefix)
+    return flags
+
+
+def rename_flags(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:
+    """Return a command line with the new names of its flags; print a line on standard error for each old name.
+
+    Args:
+        words: The command line. Words after "--" are for another command and stay as they are.
+        flags: The new flag by the old one.
+
+    >>> rename_flags(["--beta=2", "--text_vectors", "a", "--", "--beta"], {"--beta": "--reliability-beta"})
+    ['--reliability-beta=2', '--text_vectors', 'a', '--', '--beta']
+    """
+    end = [*words, "--"].index("--")
+    parts = [word.partition("=") for word in words[:end]]
+    found = {flag: flags[name] for flag, *_ in parts if (name := flag.replace("_", "-")) in flags}
+    for old, new in found.items():
+        _print_renamed(old, new)
+    return [found.get(flag, flag) + equals + value for flag, equals, value in parts] + list(words[end:])
+
+
+@cache
+def _print_renamed(old: str, new: str) -> None:
+    print(f"{old} is now {new}; the old name works in this version only.", file=sys.stderr)
 
 
 def check_options(options: Any) -> None:
@@ -123,7 +243,7 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
     Raises:
         InputError: The value is not a number, not finite, or out of range.
 
-    >>> check_number("min_size", 20, int), check_number("reach", 4)
+    >>> check_number("object_min_gaussians", 20, int), check_number("object_max_gap", 4)
     (20, 4.0)
     """
     integer = kind is int
@@ -322,6 +442,7 @@ FLOATER_THRESHOLD = 1.9
 """Score above which a Gaussian is a likely floater, see `analysis.objects`."""
 
 
+@renamed(text_template="prompt_template", text_vectors="text_embeddings", region_texts="sam3_prompts")
 @dataclass(frozen=True)
 class SourceOptions:
     """2D features: the encoder, and the image regions that it encodes.
@@ -330,15 +451,15 @@ class SourceOptions:
         ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import LiftOptions, SourceOptions, lift_run
-    >>> source = SourceOptions(encoder="colour", regions="grid", region_count=192)
+    >>> source = SourceOptions(encoder="color", regions="grid", region_count=192)
     >>> run = lift_run(config, source=source, lift=LiftOptions(max_views=3), output_dir=folder)
-    >>> run.field.manifest["encoder"]["encoder"], run.ask("red")["red"].peak > 0.9
-    ('colour', True)
+    >>> run.field.manifest["options"]["max_views"], run.ask("red")["red"].peak > 0.9
+    (3, True)
     """
 
     encoder: str = "open_clip"
     """Encoder of regions and prompts. open_clip: CLIP, on masked crops or on patches. siglip, siglip2, metaclip2: the
-    same with networks of the transformers library. colour: mean colors compared with color names, without learned
+    same with networks of the transformers library. color: mean colors compared with color names, without learned
     weights. Any other name: an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
@@ -348,7 +469,7 @@ class SourceOptions:
     """open_clip: pretrained weights, as a tag to download or a local file of the same architecture."""
     crop_fill: CropFill = "black"
     """Color that replaces everything outside the region in a crop."""
-    text_template: str = "{}"
+    prompt_template: str = "{}"
     """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
     mean over seven OpenCLIP templates. {} alone is the bare prompt."""
     regions: str = "auto"
@@ -357,7 +478,7 @@ class SourceOptions:
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
     neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
     cases use superpixel. Any other name: a mask source from an installed plugin."""
-    region_texts: tuple[str, ...] = ()
+    sam3_prompts: tuple[str, ...] = ()
     """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None
     """Approximate number of regions per image, for superpixel, grid and patches; larger values give smaller regions.
@@ -385,7 +506,7 @@ class SourceOptions:
     """Folder with the precomputed features of --features."""
     features_missing: MissingFeatures = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
-    text_vectors: Path | None = None
+    text_embeddings: Path | None = None
     """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
 
     def __post_init__(self) -> None:
@@ -393,14 +514,20 @@ class SourceOptions:
             plugins = [name for name in installed_names(MASK_GROUP) if name not in get_args(FeatureKind)]
             _check_choice("regions", self.regions, list(dict.fromkeys((*get_args(RegionKind), *plugins))))
         check_options(self)
-        check_prompt_list("region_texts", self.region_texts)
+        check_prompt_list("sam3_prompts", self.sam3_prompts)
+
+    @classmethod
+    def stored(cls, values: Mapping[str, Any]) -> SourceOptions:
+        """Return options that a manifest records, in the names of this version or of version 0.2."""
+        return cls(**new_names(cls, values))
 
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
         """Return options whose sam3 prompts are filled in from `queries` if none are set."""
-        missing = self.regions == "sam3" and len(self.region_texts) == 0
+        missing = self.regions == "sam3" and len(self.sam3_prompts) == 0
         return replace(self, region_texts=tuple(queries)) if missing else self
 
 
+@renamed(holdout="eval_images")
 @dataclass(frozen=True)
 class SplatOptions:
     """Cameras and images of a splat without a nerfstudio run.
@@ -433,7 +560,7 @@ class SplatOptions:
     test_every: int | None = None
     """Interval n of held-out images: training left out every n-th image, starting with the first. It is 8 in gsplat's
     trainer, and in Inria's with --eval. Default: no held-out images, or those that transforms.json lists."""
-    holdout: tuple[str, ...] = ()
+    eval_images: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1 (the default of ns-train)."""
     rasterize_mode: RasterizeMode | None = None
@@ -442,8 +569,8 @@ class SplatOptions:
     """Background color behind the splat, and behind images with an alpha channel."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.holdout, str | float):
-            object.__setattr__(self, "holdout", (str(self.holdout),))
+        if isinstance(self.eval_images, str | float):
+            object.__setattr__(self, "eval_images", (str(self.eval_images),))
         check_options(self)
 
 
@@ -479,7 +606,7 @@ class RefineConfig(CheckedOptions):
     """
 
     vote: VoteKind = "posterior"
-    """Weight of a Gaussian's own evidence in the vote. posterior: the number of views that saw it, against --prior
+    """Weight of a Gaussian's own evidence in the vote. posterior: the number of views that saw it, against --vote-prior
     views for all neighbors together. paper: one voter among its neighbors (equations 9 and 10 of the paper)."""
     k: int = 36
     """Number of neighbors K in the vote, at least 1; larger values ask a wider neighborhood and take longer."""
@@ -491,8 +618,8 @@ class RefineConfig(CheckedOptions):
     """Cosine at which two directions count as half agreeing in the vote, in -1..1; larger values require more similar
     directions. Default: 0.9 for posterior, 0.95 for paper."""
     gamma: float | None = None
-    """Softness of the agreement around the cosine --tau, > 0; larger values blur the distinction between similar and
-    different directions. Default: 0.05 for posterior, 0.4 for paper."""
+    """Softness of the agreement around the cosine --vote-tau, > 0; larger values blur the distinction between similar
+    and different directions. Default: 0.05 for posterior, 0.4 for paper."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0; larger values change fewer Gaussians.
     Default: 0."""
@@ -511,6 +638,7 @@ class RefineConfig(CheckedOptions):
         return VOTE_DEFAULTS[self.vote]._replace(**{name: value for name, value in values.items() if value is not None})
 
 
+@renamed(beta="reliability_beta", consensus_least="consensus_min_agreement", gsplat_rules="gsplat_version")
 @dataclass(frozen=True)
 class LiftOptions(CheckedOptions):
     """Views, consensus, storage and rasterization of a lift.
@@ -530,7 +658,7 @@ class LiftOptions(CheckedOptions):
     """Number of training views to use at most, evenly spaced; more views are slower and more reliable. Default: all."""
     lift_downscale: int = 1
     """Factor that divides the size of images and cameras, at least 1; larger values are faster and coarser."""
-    beta: float = 1.0
+    reliability_beta: float = 1.0
     """Strength of the prior in the reliability, in virtual views, >= 0; larger values lower the reliability of
     Gaussians that few views see."""
     unlabeled: UnlabeledMode = "ignore"
@@ -547,7 +675,7 @@ class LiftOptions(CheckedOptions):
     consensus_sample: int = 50
     """Number of Gaussians that the consensus samples in every region (all of them in smaller regions); larger values
     are more exact and slower. Needs --consensus True."""
-    consensus_least: float = 0.4
+    consensus_min_agreement: float = 0.4
     """Agreement of regions across views, in 0..1, up to which overlaps count as chance and features stay unchanged;
     larger values switch the consensus off in more scenes. Use 0 if your masks show objects, however badly. Needs
     --consensus True."""
@@ -565,7 +693,7 @@ class LiftOptions(CheckedOptions):
     backend: BackendName = "auto"
     """Rasterization backend. triton: our own kernels, on a GPU. gsplat: gsplat's compiled kernels, on a GPU. numba:
     compiled code for the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
-    gsplat_rules: GsplatVersion = "auto"
+    gsplat_version: GsplatVersion = "auto"
     """gsplat version whose rasterization to reproduce, because it decides the weights that a scene was trained with.
     installed: the gsplat version on this machine. auto: the version recorded with the scene, else 1.4. Version 1.6 is
     not released yet and may still change."""
@@ -578,6 +706,7 @@ class LiftOptions(CheckedOptions):
         vars(self).update({"consensus": False, **options})
 
 
+@renamed(rule="relevancy", text_vectors="text_embeddings", text_template="prompt_template")
 @dataclass(frozen=True)
 class AskOptions:
     """Comparison of prompts with the scene, and selection of Gaussians.
@@ -588,21 +717,21 @@ class AskOptions:
 
     negatives: tuple[str, ...] | None = None
     """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
-    texture). colour: none."""
-    rule: RelevancyRule | Literal["auto"] = "auto"
+    texture). color: none."""
+    relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. cosine: the cosine itself. lerf: the softmax against each negative, at its minimum. margin:
     the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
-    relevancies. Default: set by the encoder (colour: 0.5), else 0.5 for lerf, 0.02 for margin and auto for
+    relevancies. Default: set by the encoder (color: 0.5), else 0.5 for lerf, 0.02 for margin and auto for
     cosine."""
     min_reliability: float = 0.0
     """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""
     refined: bool = True
     """Use the directions after the vote. False: the directions of the lift alone."""
-    text_vectors: Path | None = None
+    text_embeddings: Path | None = None
     """NPZ file with one vector per prompt, used instead of the encoder that lifted the run."""
-    text_template: str | None = None
+    prompt_template: str | None = None
     """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
     mean over seven OpenCLIP templates. Default: the template of the lift."""
 
@@ -612,8 +741,8 @@ class AskOptions:
 
     def rules(self) -> dict[str, Any]:
         """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("text_")}
+        return {name: value for name, value in vars(self).items() if name not in self.encoding()}
 
     def encoding(self) -> dict[str, Any]:
         """Return the other options, which encode prompts, as keyword arguments of `open_run`."""
-        return {name: value for name, value in vars(self).items() if name.startswith("text_")}
+        return {"text_embeddings": self.text_embeddings, "prompt_template": self.prompt_template}

@@ -144,7 +144,7 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
     Raises:
         ValueError: the options ask for the rules of the installed gsplat, but it is not installed.
     """
-    return resolve_gsplat_rules(options.gsplat_rules, scene.identity.get("gsplat_rules"))
+    return resolve_gsplat_rules(options.gsplat_version, scene.identity.get("gsplat_rules"))
 
 
 def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> RasterConfig:
@@ -159,7 +159,8 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
     """Return the options of a lift for `consensus`."""
-    return {name: getattr(options, f"consensus_{name}") for name in ("power", "sample", "least")}
+    least = options.consensus_min_agreement
+    return {"power": options.consensus_power, "sample": options.consensus_sample, "least": least}
 
 
 def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
@@ -176,7 +177,7 @@ def lift_features(
     Args:
         table: features of the views, after consensus if enabled. R is that of the features before the consensus.
     """
-    kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
+    kwargs = {"beta": options.reliability_beta, "unlabeled": options.unlabeled}
     lifted = lift(views.evidence, table, **kwargs)
     own = lifted.scalars.own_evidence
     if options.consensus:
@@ -350,7 +351,7 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
             features = torch.eye(_WARM_UP_REGIONS, _WARM_UP_DIMENSION, dtype=config.dtype, device=sample.means.device)
             if options.consensus:
                 consensus(evidence, features)
-            lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+            lifted = lift(evidence, features, beta=options.reliability_beta, unlabeled=options.unlabeled)
             if options.refine and len(sample) > options.vote.k:
                 neighbors = nearest_neighbors(sample.means, options.vote.k)
                 own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability

@@ -701,7 +701,7 @@ def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
             "Download them first, or give local files with --encoder-pretrained and --sam-model."
         )
     opened = open_capture(request, start_time)
-    warning = compare_cameras(opened, lift, device) if request.check else None
+    warning = compare_cameras(opened, lift, device) if request.check_alignment else None
     if warning is not None:
         request.say(f"Warning: {warning}")
     return plan_opened(opened, source, lift, device, num_devices)

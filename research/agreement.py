@@ -5,7 +5,8 @@
 
 Regions are masks, damaged by every step of the ladder, and partitions that know of no things: squares, and superpixels
 of the rendered views. A region of a partition is called by the mean of what its pixels are called. Writes
-results/agreement.json: B, and points of mIoU gained over the lift alone, as it is and with `--consensus-least 0`.
+results/agreement.json: B, and points of mIoU gained over the lift alone, as it is and with
+`--consensus-min-agreement 0`.
 """
 
 from __future__ import annotations

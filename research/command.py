@@ -87,7 +87,7 @@ def add_questions(report: Report, trained: Path, folder: Path, repeats: int) -> 
     texts = [f"a thing of kind {i}" for i in range(repeats)]
     clip = make_weights(folder, texts)
     exact = torch.load(folder / "rows.pt", weights_only=True).numpy()
-    lifted(trained, folder, "colour", "--encoder", "colour", "--timestamp", "run")
+    lifted(trained, folder, "colour", "--encoder", "color", "--timestamp", "run")
     lifted(trained, folder, "clip", "--regions", "grid", "--region-count", 4, *clip, "--timestamp", "run")
     runs = {name: next((folder / name).glob("*/normlift/run/config.yml")) for name in ("colour", "clip")}
 

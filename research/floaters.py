@@ -60,7 +60,7 @@ def signals(world: World, scalars: Scalars, score: Tensor) -> dict[str, Tensor]:
     found = {"score": score, "opacity": -world.scene.opacities, "W": -s.weight, "N_eff": -s.n_eff}
     found |= {"R": -s.reliability, "norm": -s.norm, "C_inter": -s.c_inter}
     for reach in REACHES:
-        label = connected_components(world.scene.means, world.scene.opacities >= 1 / 255, reach=reach).long()
+        label = connected_components(world.scene.means, world.scene.opacities >= 1 / 255, max_gap=reach).long()
         size = torch.bincount(label[label >= 0])
         small = (label >= 0) & (size[label.clamp(min=0)] < SMALL * len(label))
         found[f"component_{reach:g}"] = small.double()

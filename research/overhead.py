@@ -31,7 +31,7 @@ from research.report import RESULTS, Report
 
 HERE = Path(__file__).parents[1]
 ON_CPU = {"CUDA_VISIBLE_DEVICES": "", "PYTHONWARNINGS": "ignore"}
-SOURCE = ("--encoder", "colour", "--device", "cpu")
+SOURCE = ("--encoder", "color", "--device", "cpu")
 
 
 class Cost(NamedTuple):
@@ -116,7 +116,7 @@ def main(before: Path, config: Path | None, repeats: int, gaussians: int, output
         def lift(name: str, checkout: Path) -> Cost:
             target = folder / name
             shutil.rmtree(target, ignore_errors=True)
-            check = ("--check", False) if name == "now" else ()
+            check = ("--check-alignment", False) if name == "now" else ()
             flags = ("--load-config", trained, *SOURCE, "--output-dir", target, "--timestamp", "run", *check)
             return run(checkout, "lift", *flags, environment=ON_CPU)
 

@@ -29,7 +29,17 @@ CAPTURES = ("fox", "tabletop")
 def planned(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
     """Seconds of every stage and `total`, as the check tells them; `wall`: what the check took."""
     file = folder / "plan.json"
-    given = ("--load-config", trained, "--output-dir", folder / name, *flags, "--json", file, "--overwrite", "True")
+    given = (
+        "--load-config",
+        trained,
+        "--output-dir",
+        folder / name,
+        *flags,
+        "--output-json",
+        file,
+        "--overwrite",
+        "True",
+    )
     kernels = folder / "kernels"
     environment = {"TRITON_CACHE_DIR": f"{kernels}/triton", "NUMBA_CACHE_DIR": f"{kernels}/numba"}
     cost = run(HERE, "check", *given, environment={**environment, "PYTHONPYCACHEPREFIX": f"{kernels}/python"})
@@ -65,7 +75,7 @@ def main(runs: dict[str, Path], device: str, quick: bool, output: Path) -> None:
     report = Report(f"planning_{'cpu' if device == 'cpu' else 'gpu'}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        ends: dict[str, tuple[object, ...]] = {"colour": ("--encoder", "colour", "--regions", "superpixel")}
+        ends: dict[str, tuple[object, ...]] = {"colour": ("--encoder", "color", "--regions", "superpixel")}
         if not quick:
             ends["patches"] = ("--regions", "patches", *make_weights(folder, ["fox"]))
         few = ("--max-views", 8) if quick else ()

@@ -23,7 +23,7 @@ from normlift_ns.cli.export import NormLiftExport
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.query import NormLiftQuery
 from normlift_ns.cli.view import NormLiftView
-from normlift_ns.options import OPTION_RANGES
+from normlift_ns.options import OPTION_RANGES, VOTE_FLAGS, RefineConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 COMMANDS: dict[str, type] = {
@@ -40,8 +40,8 @@ HEAD = """# Options of every command
 This page is generated from the code: `python -m research.reference`. `--help` prints the same texts, without loading
 torch.
 
-{flags} Options that are True or False are written `--refine False`, as in nerfstudio; `--save` alone means
-`--save True`. A value out of its range is refused before anything is loaded.
+{flags} Options that are True or False are written `--refine False`, as in nerfstudio; `--save-query` alone means
+`--save-query True`. A value out of its range is refused before anything is loaded.
 
 `ns-train normlift` has the options of `ns-normlift` too, as `--pipeline.source.…`, `--pipeline.lift.…` and
 `--pipeline.queries` ([training and lifting in one](train.md)).
@@ -89,7 +89,8 @@ def _rows(options: Any, names: list[str]) -> Iterator[str]:
         texts |= {p.arg_name: p.description or "" for p in docstring_parser.parse_from_object(part).params}
     for name in names:
         text = _text(texts[name])
-        shown = f"`--{name.replace('_', '-')}`"
+        flag = VOTE_FLAGS[name] if options is RefineConfig and name in VOTE_FLAGS else name
+        shown = f"`--{flag.replace('_', '-')}`"
         for part in get_args(hints[name])[1:]:  # a place on the command line has no flag
             shown = f"`{part.metavar}`" if getattr(part, "metavar", None) else shown
         cells = (shown, _default(fields[name]), _values(name, _bare(hints[name])), text)

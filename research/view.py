@@ -187,7 +187,7 @@ def fox_run(folder: Path) -> Path:
     from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
 
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    options, colour = LiftOptions(max_views=12, lift_downscale=2), SourceOptions(encoder="colour")
+    options, colour = LiftOptions(max_views=12, lift_downscale=2), SourceOptions(encoder="color")
     run = NormLift(source, source=colour, lift=options, output_dir=folder, timestamp="view").main()
     assert run is not None
     return run.config

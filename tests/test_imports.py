@@ -142,9 +142,10 @@ has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
 check("weights", HEAVY | {"transformers", "skimage"})
 missing = ["--load-config", "nowhere/config.yml"]
 mistakes = [
-    (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "colour", "--sigma-d", "nan"]),
-    (lift, ["--load-config", "config.yml", "--encoder", "colour", "--output-dir", "config.yml"]),
-    (query, [*missing, "--text", "a"]), (query, ["--load-config", "config.yml", "--text", "a", "--json", "no.txt/x"]),
+    (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "color", "--vote-sigma-d", "nan"]),
+    (lift, ["--load-config", "config.yml", "--encoder", "color", "--output-dir", "config.yml"]),
+    (query, [*missing, "--text", "a"]),
+    (query, ["--load-config", "config.yml", "--text", "a", "--output-json", "no.txt/x"]),
     (export, ["--load-config", "config.yml", "--output-dir", "config.yml"]), (view, missing),
     (evaluate, ["--load-config", "config.yml", "--protocol", "masks", "--labels", "nowhere"]), (batch, ["nowhere.txt"]),
 ]
@@ -160,7 +161,7 @@ for command, words in mistakes:
 normlift_ns.lift, normlift_ns.render
 check("functions", HEAVY - {"torch", "numpy", "scipy"})
 import normlift_ns.api, normlift_ns.encoders.build as build
-build.make_source(normlift_ns.SourceOptions(encoder="colour")).text(["red"])
+build.make_source(normlift_ns.SourceOptions(encoder="color")).text(["red"])
 check("colours", {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"})
 """
 

@@ -42,7 +42,7 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     assert torch.equal(answer["yellow"].mask, yellow.mask)
     assert torch.equal(answer.mask, red.mask | yellow.mask)
     assert (run.field.scalars.reliability[answer.mask] >= 0.3).all()
-    lead = run.ask("red", negatives=["orange", "brown"], rule="margin")
+    lead = run.ask("red", negatives=["orange", "brown"], relevancy="margin")
     assert lead.question.threshold == 0.02 and (lead.relevancy[lead.selected] > 0.02).all()
     loose, sure = (run.ask("red", threshold=0.2, min_reliability=least).mask for least in (0.0, 0.8))
     assert 0 < int(sure.sum()) < int(loose.sum())
@@ -111,7 +111,15 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert stored is not None and stored.texts == ("red",)
     assert opened.field.manifest["features"]["kind"] == "given"
     (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
-    flags = ("--load-config", tmp_path / "moved" / "config.yml", "--text", "red", "file", "--json", tmp_path / "a.json")
+    flags = (
+        "--load-config",
+        tmp_path / "moved" / "config.yml",
+        "--text",
+        "red",
+        "file",
+        "--output-json",
+        tmp_path / "a.json",
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
@@ -156,8 +164,8 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .* 1; closest: a"),
         ({"queries": ["b"]}, "is empty"),
         ({"texts": {"a": [1, 2]}, "queries": "a"}, "queries must be a list"),
-        ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="colour")}, "texts"),
-        ({"source": nl.SourceOptions(encoder="colour")}, "source"),
+        ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="color")}, "texts"),
+        ({"source": nl.SourceOptions(encoder="color")}, "source"),
         ({"load_step": 3}, "open_scene"),
         *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
         ({"output_dir": 5}, "output_dir"),
@@ -172,11 +180,11 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
 
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
     with pytest.raises(FileExistsError, match="--timestamp"):
-        nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
+        nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
     with pytest.raises(TypeError, match=r"config\.yml .* got int"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
-        nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="colour"), timestamp="a/b", device="cpu")
+        nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
     for config in (None, 5, [], {}, float("nan"), b"x"):
@@ -228,7 +236,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")
     with pytest.raises(ValueError, match="auto, cosine, lerf, margin; got 'LERF'"):
-        run.ask("red", rule="LERF")  # type: ignore[arg-type]
+        run.ask("red", relevancy="LERF")  # type: ignore[arg-type]
     for wrong in (
         *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),
         *({"threshold": value} for value in (float("nan"), "x", [1], 10**400, True)),
@@ -275,7 +283,7 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
     monkeypatch.setattr(rasterize, "choose_backend", recording)
     half = (torch.arange(160).expand(120, 160) // 80, torch.eye(2))
     given: Any = {"features": [half] * 12, "texts": {"left": torch.tensor([1.0, 0.0])}, "timestamp": "rules"}
-    plain, later = nl.LiftOptions(refine=False), nl.LiftOptions(refine=False, gsplat_rules="1.6")
+    plain, later = nl.LiftOptions(refine=False), nl.LiftOptions(refine=False, gsplat_version="1.6")
     run = nl.lift_run(trained, **given, lift=later, output_dir=tmp_path)
     again = nl.lift_run(run.config, **given, lift=plain, output_dir=tmp_path / "again")
     assert run.field.manifest["gsplat_rules"] == again.field.manifest["gsplat_rules"] == "1.6"

@@ -97,7 +97,7 @@ def test_what_is_no_number_or_in_no_range_is_refused_and_the_ends_of_the_range_a
 
 def test_values_of_other_types_are_refused():
     for cls, name, kind in FIELDS:
-        if name != "holdout":  # where a number is a share
+        if name != "eval_images":  # where a number is a share
             for value in (object(), {}, 1j, b"x", *(() if bool in kind else (True,))):
                 refused(cls, name, value)
 
@@ -118,7 +118,10 @@ def test_options_are_made_or_refused(option, value):
 def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their_field():
     with pytest.raises(InputError, match=r"^sigma_d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
-    with named_as_flags(), pytest.raises(InputError, match=r"^--sigma-d must be positive, at least 1e-06, got nan$"):
+    with (
+        named_as_flags(),
+        pytest.raises(InputError, match=r"^--vote-sigma-d must be positive, at least 1e-06, got nan$"),
+    ):
         RefineConfig(sigma_d=math.nan)
     with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):
         RefineConfig(sigma_d=math.inf)
@@ -126,14 +129,14 @@ def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their
     assert [type(x) for x in (vote.k, vote.sigma_d, vote.tau)] == [int, float, float]
     assert SourceOptions(regions_dir="maps").regions_dir == Path("maps")  # type: ignore[arg-type]
     assert AskOptions(negatives=["a", "b"]).negatives == ("a", "b")  # type: ignore[arg-type]
-    assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
+    assert SplatOptions(eval_images=0.1).eval_images == ("0.1",)  # type: ignore[arg-type]
 
 
 def test_words_are_those_of_the_list_and_hold_characters_only():
     for name in ("regions", "features", "crop_fill", "features_missing"):
         for value in ("x", "", 1, None):
             refused(SourceOptions, name, value, "must be one of ")
-    for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "text_template"):
+    for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "prompt_template"):
         for value in ("a\0b", "a\udc80"):
             refused(SourceOptions, name, value)
 
@@ -175,10 +178,10 @@ def test_more_neighbours_than_there_are_and_a_reach_that_cannot_be():
         assert kept == replace(RefineConfig(), **kept.numbers._asdict())  # the defaults in numbers
     with pytest.raises(InputError, match="k must be at most 1,024, got 100,000"):
         nearest_neighbors(means, 100_000)
-    for reach in (math.nan, math.inf, 0.0, -1.0):
-        with pytest.raises(InputError, match="reach must be"):
-            connected_components(means, means[:, 0] >= 0, reach=reach)
-    assert check_number("reach", 4) == 4.0
+    for max_gap in (math.nan, math.inf, 0.0, -1.0):
+        with pytest.raises(InputError, match="object_max_gap must be"):
+            connected_components(means, means[:, 0] >= 0, max_gap=max_gap)
+    assert check_number("object_max_gap", 4) == 4.0
 
 
 @dataclass
@@ -189,6 +192,7 @@ class Pipeline:
 def test_options_within_options_of_a_command_are_a_message(monkeypatch, capsys):
     """As in ns-train normlift, which reads its flags with tyro, before it trains."""
     monkeypatch.setitem(LiftOptions.__annotations__, "vote", RefineConfig)  # as before a command of ours has named it
+    monkeypatch.setitem(RefineConfig.__annotations__, "sigma_d", "float | None")
     with pytest.raises(SystemExit) as stop:
         tyro.cli(Pipeline, args=["--lift.vote.sigma-d", "nan"])
     shown = " ".join(capsys.readouterr().err.replace("│", " ").split())

@@ -250,7 +250,7 @@ def test_the_manifest_says_what_rasterized_and_by_which_rules(tmp_path):
     made = scene("a.png")
     for asked, recorded, rules in (("auto", None, "1.4"), ("auto", "1.5", "1.5"), ("1.6", "1.5", "1.6")):
         made.identity = {} if recorded is None else {"gsplat_rules": recorded}
-        found = lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made, gsplat_rules=asked, backend="auto")
+        found = lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made, gsplat_version=asked, backend="auto")
         assert found.field.manifest["gsplat_rules"] == rules
         assert found.field.manifest["backend"] == "numba"
         assert RasterSettings.recorded(found.field.manifest) == RasterSettings.of_gsplat(rules)
@@ -304,7 +304,7 @@ def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.
     monkeypatch.setattr(pipeline, "refine", watched)
     fields = []
     for on in (False, True):
-        options = LiftOptions(consensus=on, beta=0.7, vote=RefineConfig(vote="posterior", k=3))
+        options = LiftOptions(consensus=on, reliability_beta=0.7, vote=RefineConfig(vote="posterior", k=3))
         fields.append(lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field)
     first, second = watched.call_args_list
     assert torch.equal(first.args[2], second.args[2]) and torch.equal(first.kwargs["own"], second.kwargs["own"])

@@ -54,7 +54,7 @@ def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path)
     last = typed(tmp_path, lift, *places, *SMALL, "--queries", "red", "--quiet").splitlines()[-1]
     ask = shlex.split(last)
     assert ask[0] == "ns-normlift-query"
-    typed(tmp_path, python.with_name(ask[0]), *ask[1:], "--json", "answers.json")
+    typed(tmp_path, python.with_name(ask[0]), *ask[1:], "--output-json", "answers.json")
     assert json.loads((tmp_path / "answers.json").read_text())
     typed(tmp_path, python.with_name("ns-normlift-export"), *ask[1:3], "--output-dir", "exported")
 

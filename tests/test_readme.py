@@ -18,6 +18,7 @@ import torch
 
 import normlift_ns
 from normlift_ns.cli.lift import NormLift
+from normlift_ns.options import VOTE_FLAGS, RefineConfig
 from research.reference import COMMANDS, PAGE
 from research.reference import page as reference
 
@@ -45,7 +46,8 @@ def flags(options: Any) -> set[str]:
     hints, found = get_type_hints(options), set()
     for field in fields(options):
         hint = hints[field.name]
-        found |= flags(hint) if is_dataclass(hint) else {f"--{field.name.replace('_', '-')}"}
+        name = VOTE_FLAGS.get(field.name, field.name) if options is RefineConfig else field.name
+        found |= flags(hint) if is_dataclass(hint) else {f"--{name.replace('_', '-')}"}
     return found
 
 

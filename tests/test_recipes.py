@@ -48,10 +48,10 @@ RULE = """
 import sys, numpy as np, normlift_ns as nl
 from pathlib import Path
 from normlift_ns.query.arrays import open_quick
-how = {"rule": "mean", "negatives": ["blue", "yellow"]}
+how = {"relevancy": "mean", "negatives": ["blue", "yellow"]}
 run = nl.open_run(sys.argv[1])
 ours = run.ask("red", **how).relevancy.numpy()
-text, *negatives = (run.ask(text, rule="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))
+text, *negatives = (run.ask(text, relevancy="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))
 by_hand = 1 / (1 + np.exp(-10 * (text - sum(negatives) / 2)))
 valid = run.field.valid().numpy()
 np.testing.assert_allclose(ours[valid], by_hand[valid], atol=2e-6)
@@ -105,8 +105,8 @@ def test_all_recipes_work(extended: Path, lifted: Path, tmp_path: Path) -> None:
     python(extended, "-c", SOURCE, lifted, tmp_path)
     python(extended, "-c", RULE, lifted)
     python(extended, "-c", FLAT)
-    asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
-    python(extended, "-m", "normlift_ns.cli.query", *asked, "--json", tmp_path / "a.json")
+    asked = ("--load-config", lifted, "--text", "red", "--relevancy", "mean", "--negatives", "blue")
+    python(extended, "-m", "normlift_ns.cli.query", *asked, "--output-json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
     table = tmp_path / "splat_table.csv"

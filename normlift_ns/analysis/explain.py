@@ -326,7 +326,7 @@ class RecordedVotes:
         """
         evidence, features = self._table
         source = self.field.source if refined else None
-        beta, unlabeled = self._option("beta", float, 1.0), self._option("unlabeled", str, "ignore")
+        beta, unlabeled = self._option("reliability_beta", float, 1.0), self._option("unlabeled", str, "ignore")
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
@@ -355,9 +355,9 @@ class RecordedVotes:
         parts = (evidence_collection.ViewObservations.of_block(block, self._cached_evidence(block)) for block in blocks)
         evidence, features, level = evidence_collection.ViewObservations.merge(parts)
         if self._option("consensus", bool, False):
-            options = {"power": (float, 1.0), "sample": (int, 50), "least": (float, CHANCE_AGREEMENT)}
-            kwargs = {name: self._option(f"consensus_{name}", *option) for name, option in options.items()}
-            features = consensus(evidence, features, level=level, **kwargs).features
+            power, sample = self._option("consensus_power", float, 1.0), self._option("consensus_sample", int, 50)
+            least = self._option("consensus_min_agreement", float, CHANCE_AGREEMENT)
+            features = consensus(evidence, features, level=level, power=power, sample=sample, least=least).features
         return evidence, features
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:

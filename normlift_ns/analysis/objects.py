@@ -165,11 +165,11 @@ def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor,
     return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
-def _large_components(means: Tensor, selected: Tensor, reach: float, min_size: int) -> tuple[Int32[Tensor, " n"], int]:
+def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
     """Return `connected_components` with -1 for those that are too small, and the number of the others."""
-    check_number("min_size", min_size, int)
-    labels = connected_components(means, selected, reach=reach)
-    count = int((torch.bincount(labels[labels >= 0].long()) >= min_size).sum())  # sizes are in descending order
+    check_number("object_min_gaussians", min_gaussians, int)
+    labels = connected_components(means, selected, max_gap=max_gap)
+    count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
     return labels.where(labels < count, -1), count
 
 
@@ -193,20 +193,20 @@ def evidence_weights(scalars: Scalars, rows: Bool[Tensor, " n"]) -> Float64[Tens
 
 
 def connected_components(
-    means: Float[Tensor, "n 3"], selected: Bool[Tensor, " n"], *, reach: float = OBJECT_MAX_GAP
+    means: Float[Tensor, "n 3"], selected: Bool[Tensor, " n"], *, max_gap: float = OBJECT_MAX_GAP
 ) -> Int32[Tensor, " n"]:
     """Label each selected Gaussian with its connected component, 0 for the largest; label the others -1.
 
-    Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `reach`
+    Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `max_gap`
     times the median spacing. The spacing of a selected Gaussian is its distance to the nearest selected one at a
     different position. Components of equal size are ordered by their first Gaussian.
 
     Args:
-        reach: maximum distance in units of the median spacing, > 0.
+        max_gap: maximum distance in units of the median spacing, > 0.
     Raises:
-        ValueError: `reach` is not positive and finite.
+        ValueError: `max_gap` is not positive and finite.
     """
-    check_number("reach", reach)
+    check_number("object_max_gap", max_gap)
     from scipy.sparse import coo_array  # noqa: PLC0415 (a lift does not need it)
     from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415
 
@@ -216,7 +216,7 @@ def connected_components(
         return labels.to(means.device)
     neighbors = nearest_neighbors(means.cpu()[rows], _NEIGHBORS)
     spacing = neighbors.spacing[neighbors.spacing.isfinite()]
-    limit = reach * float(spacing.median()) if len(spacing) > 0 else 0.0
+    limit = max_gap * float(spacing.median()) if len(spacing) > 0 else 0.0
     near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
     first, slot = np.nonzero(near)
     second = neighbors.index.numpy()[first, slot]
@@ -275,22 +275,21 @@ def find_instances(
     means: Float[Tensor, "n 3"],
     relevancy: Float[Tensor, "n q"],
     selected: Bool[Tensor, "n q"],
-    *,
-    reach: float = OBJECT_MAX_GAP,
-    min_size: int = OBJECT_MIN_GAUSSIANS,
+    max_gap: float = OBJECT_MAX_GAP,
+    min_gaussians: int = OBJECT_MIN_GAUSSIANS,
 ) -> Instances:
     """Assign each selected Gaussian to a class and an object.
 
     A Gaussian that several prompts select belongs to the prompt with the highest relevancy.
 
     Args:
-        reach, min_size: as in `find_objects`.
+        max_gap, min_gaussians: as in `find_objects`.
     Raises:
         ValueError: as in `find_objects`.
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
-    >>> instances = find_instances(("cup", "box"), means, relevancy, relevancy > 0.5, min_size=1)
+    >>> instances = find_instances(("cup", "box"), means, relevancy, relevancy > 0.5, min_gaussians=1)
     >>> instances.class_id.tolist(), instances.instance_id.tolist(), instances.classes
     ([1, 1, 2, 0], [1, 1, 2, 0], (1, 2))
     """
@@ -298,7 +297,7 @@ def find_instances(
     instance_id = torch.zeros_like(class_id)
     classes: list[int] = []
     for number in range(1, len(texts) + 1):
-        labels, count = _large_components(means, class_id == number, reach, min_size)
+        labels, count = _large_components(means, class_id == number, max_gap, min_gaussians)
         instance_id = torch.where(labels >= 0, labels + 1 + len(classes), instance_id)
         classes += [number] * count
     return Instances(texts, class_id, instance_id, tuple(classes))
@@ -416,17 +415,17 @@ def make_catalogue(
     instances: Instances,
     capture: SimilarityTransform,
     *,
-    metres_per_unit: float | None = None,
+    meters_per_unit: float | None = None,
     device: str = "cpu",
 ) -> Catalogue:
     """Summarize every object in a catalog.
 
     Args:
         capture: transform from the coordinates of the scene to those of the capture.
-        metres_per_unit: length of a capture unit in meters, > 0; None if unknown.
+        meters_per_unit: length of a capture unit in meters, > 0; None if unknown.
         device: device that renders the objects, to rank images.
     """
-    unit = 1.0 if metres_per_unit is None else metres_per_unit
+    unit = 1.0 if meters_per_unit is None else meters_per_unit
     to_capture = SimilarityTransform(capture.rotation, unit * capture.scale, unit * capture.shift)
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
     weight, reliability = (x.double().cpu().numpy() for x in (field.scalars.weight + 1e-12, field.scalars.reliability))
@@ -457,7 +456,7 @@ def make_catalogue(
             )
         )
     small = int(((instances.class_id > 0) & (instances.instance_id == 0)).sum())
-    return Catalogue(tuple(objects), small, metres_per_unit)
+    return Catalogue(tuple(objects), small, meters_per_unit)
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
@@ -647,7 +646,7 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
     Raises:
         ValueError: the scalars have a different number of Gaussians, or the limit is not finite.
     """
-    limit = check_number("floater_limit", limit)
+    limit = check_number("floater_threshold", limit)
     if len(scalars.norm) != len(scene):
         raise InputError(f"the lift has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
     rows = (scene.drawable & (scene.opacities >= MIN_OPACITY)).nonzero().squeeze(1)

@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,7 +33,7 @@ from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
-from normlift_ns.options import CheckedOptions, short_repr
+from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
@@ -119,7 +119,7 @@ def _capture_key(command: NormLift) -> str:
     The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
     features, label maps and weights, it includes their paths only.
     """
-    options = {name: value for name, value in asdict(command).items() if name not in _NOT_IN_KEY}
+    options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
     files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
     if command.load_config is not None:
         step = "*" if command.load_step is None else f"{command.load_step:09d}"

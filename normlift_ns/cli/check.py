@@ -20,6 +20,7 @@ from normlift_ns.cli.lift import NormLift, print_plan
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
 from normlift_ns.io.atomic import write_text_file
+from normlift_ns.options import renamed
 
 if TYPE_CHECKING:
     from normlift_ns.planning import Diagnostic, Plan
@@ -28,12 +29,13 @@ if TYPE_CHECKING:
 _Result = TypeVar("_Result")
 
 
+@renamed(json="output_json")
 @dataclass
 class NormLiftCheck(NormLift):
     """Check a capture and this machine before a lift, with the options of ns-normlift, without lifting. Encodes a few
     images to estimate the seconds of every stage, memory and disk. The exit code is 1 if there is an error."""
 
-    json: Path | None = None
+    output_json: Path | None = None
     """JSON file for the findings and the plan, in addition to the printed table."""
     dry_run: tyro.conf.Suppress[bool] = True
 
@@ -44,13 +46,13 @@ class NormLiftCheck(NormLift):
             SystemExit: There is an error; the exit code is 1.
         """
         start_time = time.perf_counter()
-        check_new_files(self.json, overwrite=self.overwrite, flags="--json")
+        check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
         rows, plan = self._rows(start_time)
         _show(rows, plan)
-        if self.json is not None:
+        if self.output_json is not None:
             findings = {"version": normlift_ns.__version__, "findings": [asdict(row) for row in rows]}
             text = json.dumps({**findings, "plan": None if plan is None else plan.to_json()}, indent=1) + "\n"
-            write_text_file(self.json, text, overwrite=self.overwrite)
+            write_text_file(self.output_json, text, overwrite=self.overwrite)
         if any(row.state == "error" for row in rows):
             raise SystemExit(1)
 
@@ -82,7 +84,7 @@ class NormLiftCheck(NormLift):
         rows.append(Diagnostic("capture", "ok", count))
         rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
-        if self.check:
+        if self.check_alignment:
             compare = partial(planning.compare_cameras, opened, self.lift, device)
             compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(compare()))
             rows += [] if compared is None else [compared]

@@ -29,7 +29,7 @@ from rich.text import Text
 
 import normlift_ns
 from normlift_ns.errors import EXIT_USER_ERROR, InputError, OutputError, describe_error, escape_unprintable
-from normlift_ns.options import named_as_flags
+from normlift_ns.options import VOTE_FLAGS, RefineConfig, named_as_flags, rename_flags, renamed_flags
 
 _CORNERS = ("╭", "┏")
 _REWRITES = (
@@ -75,10 +75,10 @@ def one_line_errors(program: str) -> Iterator[None]:
 def _unboxed(stderr: str, program: str) -> str:
     r"""Return the text inside tyro's box, or below its dashed line if the terminal has no box characters.
 
-    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--k'. Expected 1 values. │\n╰─────╯", "/bin/x"))
-    --k needs a value.
-    >>> print(_unboxed(" Missing\n -----\n  Missing value for argument '--k'. Expected 1 values.\n", "/bin/x"))
-    --k needs a value.
+    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--data'. Expected 1 values. │\n╰─────╯", "/bin/x"))
+    --data needs a value.
+    >>> print(_unboxed(" Missing\n -----\n  Missing value for argument '--vote-k'. Expected 1 values.\n", "/bin/x"))
+    --vote-k needs a value.
     """
     stderr = re.sub(r"\x1b\[[\d;]*m", "", stderr)  # terminal colors
     lines = stderr.splitlines()
@@ -117,8 +117,8 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
     Raises:
         InputError: --log-file has no file, or --quiet is neither True nor False.
 
-    >>> split_output_flags(["--k", "8", "--quiet", "--log-file", "a.log"])
-    (['--k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
+    >>> split_output_flags(["--vote-k", "8", "--quiet", "--log-file", "a.log"])
+    (['--vote-k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
     """
     end = words.index("--") if "--" in words else len(words)  # the rest is for another command
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -309,7 +309,7 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     if name is None and program.parent == Path(__file__).parent:  # started as a module
         name = f"python -m {__package__}.{program.stem}"
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
-    arguments = fill_boolean_values(arguments, boolean_flags(command))
+    arguments = fill_boolean_values(rename_flags(arguments, renamed_flags(command)), boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
     with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
@@ -328,8 +328,8 @@ def boolean_flags(options: Any) -> set[str]:
 def fill_boolean_values(words: Sequence[str], flags: Collection[str]) -> list[str]:
     """Insert True after every boolean flag that has no value.
 
-    >>> fill_boolean_values(["--save", "--text", "a", "--stdin"], {"--save", "--stdin"})
-    ['--save', 'True', '--text', 'a', '--stdin', 'True']
+    >>> fill_boolean_values(["--save-query", "--text", "a", "--stdin"], {"--save-query", "--stdin"})
+    ['--save-query', 'True', '--text', 'a', '--stdin', 'True']
     """
     words_with_values = []
     for word, following in zip(words, [*words[1:], "--"]):
@@ -453,7 +453,8 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
         params = docstring_parser.parse_from_object(cls).params
         texts |= {param.arg_name: param.description or "" for param in params}
     for field in fields(options):
-        hint, text, name = hints[field.name], texts.get(field.name, ""), None
+        hint, text = hints[field.name], texts.get(field.name, "")
+        name = VOTE_FLAGS.get(field.name) if options is RefineConfig else None
         if is_dataclass(hint):
             add_help_texts(hint, nested=True)
             text, name = first_paragraph(hint), "" if nested else None

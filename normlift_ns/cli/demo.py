@@ -24,7 +24,7 @@ from normlift_ns.options import AskOptions, CheckedOptions, SourceOptions
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
-_ASK_OPTIONS = AskOptions(threshold="auto")
+_ASK = AskOptions(threshold="auto")
 _COMPILE = (
     "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
 )
@@ -66,17 +66,17 @@ class Demo(CheckedOptions):
         compiling.wait()
 
         CONSOLE.rule("Lifting")
-        flags = ("--encoder", "colour", "--region-count", REGION_COUNT)
+        flags = ("--encoder", "color", "--region-count", REGION_COUNT)
         _show("ns-normlift", "--load-config", config, *flags, "--queries", *_PROMPTS)
-        source = SourceOptions(encoder="colour", region_count=REGION_COUNT)
+        source = SourceOptions(encoder="color", region_count=REGION_COUNT)
         run = NormLift(config, source=source, queries=_PROMPTS, timestamp="demo", overwrite=True).main()
         assert run is not None  # this is the only process
 
         CONSOLE.rule("Searching")
         renders, answers = self.folder / "pictures", self.folder / "answers.json"
-        flags = ("--threshold", "auto", "--render-dir", renders, "--json", answers)
+        flags = ("--threshold", "auto", "--render-dir", renders, "--output-json", answers)
         _show("ns-normlift-query", "--load-config", run.config, "--text", *_PROMPTS, *flags)
-        NormLiftQuery(run.config, _PROMPTS, ask=_ASK_OPTIONS, render_dir=renders, json=answers, overwrite=True).main()
+        NormLiftQuery(run.config, _PROMPTS, ask=_ASK, render_dir=renders, output_json=answers, overwrite=True).main()
         middle = f"{sample_evenly(self.views, 3)[1]:04d}"
         pictures = [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])]
         with atomic_file(renders / "overview.png", overwrite=True) as draft:

@@ -14,7 +14,7 @@ from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_
 from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_readable_file, check_readable_folder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_output_paths
-from normlift_ns.options import CheckedOptions, check_device
+from normlift_ns.options import CheckedOptions, check_device, renamed
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.options import Evaluation
@@ -28,6 +28,7 @@ _WITHOUT_TRUTH = ("coverage", "timing")
 """Studies that need no ground truth."""
 
 
+@renamed(text_vectors="text_embeddings")
 @dataclass
 class NormLiftEval(CheckedOptions):
     """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
@@ -53,7 +54,7 @@ class NormLiftEval(CheckedOptions):
     (512 channels through gsplat). baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat, in our implementation
     on the features of the run. coverage: regions without reliable evidence, unused images that would help, and new
     poses, as renders and as a camera path."""
-    text_vectors: Path | None = None
+    text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the encoder that lifted the runs."""
     data: Path | None = None
     """Current path of the dataset, if it was moved; for a single run."""
@@ -105,7 +106,7 @@ class NormLiftEval(CheckedOptions):
         from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (--help should not wait for torch)
 
         for config in self.load_config:
-            run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
+            run = open_run(config, data=self.data, device=device, text_embeddings=self.text_embeddings)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
             texts = cast(Any, None) if self.protocol == "none" else run.texts  # no encoder is needed without prompts
             yield EvaluatedRun(run.scene, run.field, texts, self.refined, cache_folder(run.folder))
@@ -129,7 +130,7 @@ class NormLiftEval(CheckedOptions):
 
     def _check_files(self) -> None:
         """Raise errors unless input files exist, and output files can be written."""
-        check_readable_file(self.text_vectors, "--text-vectors")
+        check_readable_file(self.text_embeddings, "--text-embeddings")
         for config in self.load_config:
             check_lifted_run(config, self.data)
         for labels in self.labels:

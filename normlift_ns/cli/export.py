@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from normlift_ns.query.engine import Answer
 
 
+@options.renamed(
+    part="select", reach="object_max_gap", min_size="object_min_gaussians", floater_limit="floater_threshold"
+)
 @dataclass
 class NormLiftExport(options.CheckedOptions):
     """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
@@ -36,7 +39,7 @@ class NormLiftExport(options.CheckedOptions):
     """Output folder, created if missing."""
     text: tuple[str, ...] = ()
     """Prompts to search for. Default: the queries stored in the run, with their stored options."""
-    part: Literal["scene", "selection", "rest", "clean"] = "scene"
+    select: Literal["scene", "selection", "rest", "clean"] = "scene"
     """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
     likely floaters, which are Gaussians floating in front of the cameras."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
@@ -44,7 +47,7 @@ class NormLiftExport(options.CheckedOptions):
     """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
     class_id and instance_id values, and <name>_objects.json the objects."""
     masks_dir: Path | None = None
-    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --part rest,
+    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --select rest,
     the values are swapped. Masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
     """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
@@ -61,13 +64,13 @@ class NormLiftExport(options.CheckedOptions):
     transfer_coordinates: Literal["capture", "scene"] = "capture"
     """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
     them. scene: the Gaussians' coordinates, as in exported files."""
-    reach: float = options.OBJECT_MAX_GAP
+    object_max_gap: float = options.OBJECT_MAX_GAP
     """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
     more objects."""
-    min_size: int = options.OBJECT_MIN_GAUSSIANS
+    object_min_gaussians: int = options.OBJECT_MIN_GAUSSIANS
     """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
-    floater_limit: float = options.FLOATER_THRESHOLD
-    """Score above which a Gaussian counts as a floater for --part clean; larger values leave out fewer Gaussians."""
+    floater_threshold: float = options.FLOATER_THRESHOLD
+    """Score above which a Gaussian counts as a floater for --select clean; larger values leave out fewer Gaussians."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -106,11 +109,11 @@ class NormLiftExport(options.CheckedOptions):
 
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
         job = exports.ExportJob(
-            run.scene, run.field, self._keep(run, answer), rest=self.part == "rest", overwrite=self.overwrite
+            run.scene, run.field, self._keep(run, answer), rest=self.select == "rest", overwrite=self.overwrite
         )
         if answer is None:
             return job
-        instances = exports.answer_instances(answer, reach=self.reach, min_size=self.min_size)
+        instances = exports.answer_instances(answer, self.object_max_gap, self.object_min_gaussians)
         objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
         transfer = None
         if cloud is not None:
@@ -124,13 +127,13 @@ class NormLiftExport(options.CheckedOptions):
         """Return the Gaussians of the exported part."""
         import torch  # noqa: PLC0415 (--help should not wait for it)
 
-        if self.part == "clean":
-            floaters = run.floaters(self.floater_limit).mask
+        if self.select == "clean":
+            floaters = run.floaters(self.floater_threshold).mask
             common.info(f"{int(floaters.sum()):,} likely floaters are left out")
             return ~floaters
-        if answer is None or self.part == "scene":
+        if answer is None or self.select == "scene":
             return torch.ones(len(run.field), dtype=torch.bool)
-        return answer.mask if self.part == "selection" else ~answer.mask
+        return answer.mask if self.select == "selection" else ~answer.mask
 
     def _outputs(self) -> dict[str, Path]:
         """Return the path of every output by its exporter."""
@@ -155,8 +158,8 @@ class NormLiftExport(options.CheckedOptions):
         cloud = outputs.get("cloud")
         self._check_answer()
         preflight.check_readable_file(self.transfer, "--transfer")
-        if self.masks_dir is not None and self.part == "clean":
-            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        if self.masks_dir is not None and self.select == "clean":
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --select clean")
         if cloud in files:
             raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
         preflight.check_writable_folder(self.masks_dir, "--masks-dir")
@@ -178,8 +181,8 @@ class NormLiftExport(options.CheckedOptions):
             from normlift_ns.exports import EXPORTERS  # noqa: PLC0415 (imports torch)
 
             flags += [f"--exporters {kind}"] if EXPORTERS.load(kind).needs_answer else []
-        if self.part in ("selection", "rest"):
-            flags.insert(0, f"--part {self.part}")
+        if self.select in ("selection", "rest"):
+            flags.insert(0, f"--select {self.select}")
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
 

@@ -23,7 +23,7 @@ from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
-from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, check_number
+from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, renamed
 
 if TYPE_CHECKING:
     from normlift_ns.api import LiftRequest
@@ -54,6 +54,7 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
         raise
 
 
+@renamed(check="check_alignment")
 @dataclass
 class NormLift(CheckedOptions):
     """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a PLY
@@ -69,7 +70,7 @@ class NormLift(CheckedOptions):
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which are lifted too. It must also
     contain training images, whose cameras must not have moved."""
-    check: bool = True
+    check_alignment: bool = True
     """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
     dry_run: bool = False
     """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and cached views. The
@@ -108,7 +109,8 @@ class NormLift(CheckedOptions):
                 common.info(
                     f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster."
                 )
-            words, program = sys.argv[1:], [sys.executable, "-m", "normlift_ns.cli.lift"]
+            words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # told once
+            program = [sys.executable, "-m", "normlift_ns.cli.lift"]
             # Only the first process writes the log file.
             other = [*program, *common.split_output_flags(words)[0]]
             code = launch_processes([[*program, *words], *[other] * (self.num_devices - 1)], common.print_error)
@@ -170,7 +172,6 @@ class NormLift(CheckedOptions):
     def check_early(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
-        check_number("num_devices", self.num_devices, int)
         if self.num_devices > 1 and ":" in self.device:
             raise InputError(
                 f"--device {self.device} is one GPU, but --num-devices is {self.num_devices}; give --device cuda"
@@ -362,13 +363,13 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
 
     Args:
         agreement: B of the level, in 0..1.
-        least: Value of --consensus-least.
+        least: Value of --consensus-min-agreement.
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
     'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
-    'if they are bad masks of objects, try --consensus-least 0'
+    'if they are bad masks of objects, try --consensus-min-agreement 0'
     """
     from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
 
@@ -380,7 +381,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged
-    return f"{unchanged}; if they are bad masks of objects, try --consensus-least 0"
+    return f"{unchanged}; if they are bad masks of objects, try --consensus-min-agreement 0"
 
 
 def entrypoint() -> None:

@@ -136,14 +136,14 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
     folder = field_folder(Path(os.path.abspath(config)).parent)
     if ask is None:
         return
-    check_readable_file(ask.text_vectors, "--text-vectors")
+    check_readable_file(ask.text_embeddings, "--text-embeddings")
     try:
-        stored = SourceOptions(**read_manifest(folder)[0]["encoder"])
+        stored = SourceOptions.stored(read_manifest(folder)[0]["encoder"])
     except (KeyError, TypeError, ValueError, OSError):  # reported when the run is opened
         return
     names = text_cache_folder(folder.parent)
     cached = names.is_dir() and any(names.iterdir())  # the cache may contain the prompts
-    if ask.text_vectors is None and stored.text_vectors is None and not cached:
+    if ask.text_embeddings is None and stored.text_embeddings is None and not cached:
         from normlift_ns.encoders.registry import find_encoder_kind  # noqa: PLC0415 (not needed for --help)
 
         kind = find_encoder_kind(stored.encoder)
@@ -171,11 +171,11 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
 def check_unused_options(lift: LiftOptions) -> None:
     """Raise InputError for options that have no effect because their step is off."""
     default = LiftOptions()
-    for name in ("consensus_power", "consensus_sample", "consensus_least"):
+    for name in ("consensus_power", "consensus_sample", "consensus_min_agreement"):
         if not lift.consensus and getattr(lift, name) != getattr(default, name):
             raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
     if lift.vote.vote != "posterior" and lift.vote.prior != default.vote.prior:
-        raise InputError("--prior is for --vote posterior. Set that, or leave it out.")
+        raise InputError("--vote-prior is for --vote posterior. Set that, or leave it out.")
 
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
@@ -188,18 +188,18 @@ def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     check_prompt_list("queries", texts)
     check_readable_folder(source.regions_dir, "--regions-dir")
     check_readable_folder(source.features_dir, "--features-dir")
-    check_readable_file(source.text_vectors, "--text-vectors")
+    check_readable_file(source.text_embeddings, "--text-embeddings")
     name = requested_regions(source) if source.features == "none" else source.features
     if name != "auto":
         check_mask_options(source.looking_for(texts), name)
     if source.sam_model is not None and is_local_path(source.sam_model, 2):
         _existing_mode(Path(source.sam_model), "--sam-model")
-    if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
+    if source.prompt_template not in ("{}", "ensemble") and "{}" not in source.prompt_template:
         raise InputError(
-            f"--text-template {short_repr(source.text_template)} has no {{}} for the prompt; give a template such as "
-            '"a photo of a {}"'
+            f"--prompt-template {short_repr(source.prompt_template)} has no {{}} for the prompt; give a template such "
+            'as "a photo of a {}"'
         )
-    needed = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
+    needed = source.features == "none" or (len(texts) > 0 and source.text_embeddings is None)
     kind = encoder_kind(source.encoder)  # raises for an unknown encoder
     if needed:
         kind.check(source)

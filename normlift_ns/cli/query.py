@@ -20,7 +20,15 @@ from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_w
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
-from normlift_ns.options import CATALOG_FILES, DEFAULT_SAM3, AskOptions, CheckedOptions, check_device, check_prompt_list
+from normlift_ns.options import (
+    CATALOG_FILES,
+    DEFAULT_SAM3,
+    AskOptions,
+    CheckedOptions,
+    check_device,
+    check_prompt_list,
+    renamed,
+)
 
 if TYPE_CHECKING:
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
@@ -31,6 +39,18 @@ if TYPE_CHECKING:
     from normlift_ns.query.question import Query
 
 
+_OUTPUTS = ("output_json", "output_npz", "render_dir")
+"""Options of files that hold an answer."""
+
+
+@renamed(
+    save="save_query",
+    json="output_json",
+    output_path="output_npz",
+    why="explain",
+    why_dir="explain_dir",
+    metres_per_unit="meters_per_unit",
+)
 @dataclass
 class NormLiftQuery(CheckedOptions):
     """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
@@ -46,20 +66,20 @@ class NormLiftQuery(CheckedOptions):
     """Read one prompt per line from standard input, and print each answer as one line of JSON."""
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
-    save: bool = False
+    save_query: bool = False
     """Store the queries in the run, replacing earlier ones. ns-render and ns-viewer then render their relevancy."""
-    json: Path | None = None
+    output_json: Path | None = None
     """JSON file to write the table to."""
-    output_path: Path | None = None
+    output_npz: Path | None = None
     """NPZ file to write relevancy [N, Q], reliability [N], valid [N] and names to, for N Gaussians and Q prompts."""
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
     """Training images whose cameras to render from, such as 0001 0042. Default: three evenly spaced images."""
-    why: bool = False
+    explain: bool = False
     """List the images and regions that voted for the selection, and how well they agree."""
-    why_dir: Path | None = None
-    """Folder for the images of --why, with outlines of the regions that voted."""
+    explain_dir: Path | None = None
+    """Folder for the images of --explain, with outlines of the regions that voted."""
     segment: Literal["sam3"] | None = None
     """Also segment some training views with SAM 3 and lift its masks. The table then has their relevancy, their
     agreement between views and their reliability."""
@@ -77,7 +97,7 @@ class NormLiftQuery(CheckedOptions):
     objects_dir: Path | None = None
     """Folder for the list of --objects with box axes, in capture and scene coordinates: objects.json, objects.csv, and
     boxes as meshes (objects.ply, objects_scene.ply). docs/objects.md explains every column."""
-    metres_per_unit: float | None = None
+    meters_per_unit: float | None = None
     """Length of one capture unit in meters for --objects, > 0; positions and sizes are then in meters."""
     overwrite: bool = False
     """Replace existing files of the same names."""
@@ -106,21 +126,21 @@ class NormLiftQuery(CheckedOptions):
         result = run.ask(self.text, **self.ask.rules())
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
         rows = result.to_json()
-        show_why = self._explain(result, rows) if self.why else None
+        show_why = self._explain(result, rows) if self.explain else None
         sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
         show_objects = self._list_objects(result.question) if self.objects else None
-        if self.json is not None:
+        if self.output_json is not None:
             question = result.question
             rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": question.negatives}
             text = json.dumps({"queries": rows, **rules}, indent=2) + "\n"
-            write_text_file(self.json, text, overwrite=self.overwrite)
-        if self.output_path is not None:
-            _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
+            write_text_file(self.output_json, text, overwrite=self.overwrite)
+        if self.output_npz is not None:
+            _write_arrays(self.output_npz, result, sam3_arrays, self.overwrite)
         if save_renders is not None:
             save_renders()
-        stored = save_query(run.run_dir / FIELD_FOLDER, result.question) if self.save else None
-        folders = (self.render_dir, self.why_dir, self.objects_dir)
-        written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
+        stored = save_query(run.run_dir / FIELD_FOLDER, result.question) if self.save_query else None
+        folders = (self.render_dir, self.explain_dir, self.objects_dir)
+        written = [path for path in (self.output_json, self.output_npz, *folders, stored) if path is not None]
         print_answer(rows, result.question)
         for print_table in (show_sam3, show_why, show_objects):
             if print_table is not None:
@@ -177,8 +197,8 @@ class NormLiftQuery(CheckedOptions):
         reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
         for row, why in zip(rows, reasons):
             row["why"] = None if why is None else explanation_to_json(votes.names, why)
-        if self.why_dir is not None:
-            save_vote_images(votes, self.text, reasons, self.why_dir, overwrite=self.overwrite)
+        if self.explain_dir is not None:
+            save_vote_images(votes, self.text, reasons, self.explain_dir, overwrite=self.overwrite)
         return lambda: print_explanations(votes.names, self.text, reasons)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
@@ -202,10 +222,14 @@ class NormLiftQuery(CheckedOptions):
         common.info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
         cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
         segmented = query_sam3(
-            run.scene, cached.find, question.texts,
-            views=self.segment_views, min_reliability=question.min_reliability,
-            settings=RasterSettings.recorded(run.field.manifest), device=device,
-        )  # fmt: skip
+            run.scene,
+            cached.find,
+            question.texts,
+            views=self.segment_views,
+            min_reliability=question.min_reliability,
+            settings=RasterSettings.recorded(run.field.manifest),
+            device=device,
+        )
         summaries = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(result.selected))
         for row, summary in zip(rows, summaries):
             row["segment"] = {"model": model, **summary}
@@ -227,13 +251,9 @@ class NormLiftQuery(CheckedOptions):
 
         run, answer = self._run, self._answer_with_scene(question)
         instances = objects.find_instances(answer.texts, answer.means, answer.relevancy, answer.selected)
+        transform, device = objects.similarity_to_capture(run.folder, run.scene.identity), choose_device("auto")
         catalog = objects.make_catalogue(
-            run.scene,
-            run.field,
-            instances,
-            objects.similarity_to_capture(run.folder, run.scene.identity),
-            metres_per_unit=self.metres_per_unit,
-            device=choose_device("auto"),
+            run.scene, run.field, instances, transform, meters_per_unit=self.meters_per_unit, device=device
         )
         if self.objects_dir is not None:
             metadata = {"texts": list(question.texts), **question.settings()}
@@ -245,12 +265,13 @@ class NormLiftQuery(CheckedOptions):
         check_device(self.device)
         self._check_texts()
         check_lifted_run(self.load_config, self.data, self.ask)
-        if self.json and self.output_path and os.path.realpath(self.json) == os.path.realpath(self.output_path):
-            raise InputError(f"--json and --output-path name the same file, {self.output_path}")
-        for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
+        outputs = [os.path.realpath(path) for path in (self.output_json, self.output_npz) if path is not None]
+        if len(set(outputs)) < len(outputs):
+            raise InputError(f"--output-json and --output-npz name the same file, {self.output_npz}")
+        for flag, path in (("--output-json", self.output_json), ("--output-npz", self.output_npz)):
             check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
-        check_writable_folder(self.why_dir, "--why-dir")
+        check_writable_folder(self.explain_dir, "--explain-dir")
         if self.objects_dir is not None:
             files = (self.objects_dir / name for name in CATALOG_FILES)
             check_new_files(*files, overwrite=self.overwrite, flags="--objects-dir")
@@ -265,7 +286,7 @@ class NormLiftQuery(CheckedOptions):
             )
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
-        for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
+        for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
         self._check_dependent_options()
@@ -278,11 +299,11 @@ class NormLiftQuery(CheckedOptions):
     def _check_dependent_options(self) -> None:
         for name, needed, flag in (
             ("render_views", self.render_dir, "--render-dir FOLDER"),
-            ("why_dir", self.why, "--why True"),
+            ("explain_dir", self.explain, "--explain True"),
             ("segment_model", self.segment, "--segment sam3"),
             ("segment_views", self.segment, "--segment sam3"),
             ("objects_dir", self.objects, "--objects True"),
-            ("metres_per_unit", self.objects, "--objects True"),
+            ("meters_per_unit", self.objects, "--objects True"),
         ):
             if not needed and getattr(self, name) != getattr(type(self), name):
                 raise InputError(f"--{name.replace('_', '-')} has no effect without {flag}; add that flag")
@@ -374,14 +395,9 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
-    arrays: dict[str, Any] = {
-        "relevancy": result.relevancy,
-        "reliability": result.field.scalars.reliability,
-        "valid": result.valid,
-        **extra,
-    }
+    arrays = {"relevancy": result.relevancy, "reliability": result.field.scalars.reliability, "valid": result.valid}
     with atomic_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        np.savez(file, names=np.array(result.question.texts), **arrays)
+        np.savez(file, names=np.array(result.question.texts), **arrays, **extra)
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
@@ -463,7 +479,7 @@ def print_catalog(catalog: Catalogue) -> None:
         common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
 
 
-# ns-normlift-query --why: the images that voted for a selection.
+# ns-normlift-query --explain: the images that voted for a selection.
 
 
 IMAGES_PER_GROUP = 3

@@ -11,12 +11,18 @@ from typing import TYPE_CHECKING, NoReturn
 from normlift_ns.cli.common import TerminatedError, info, run_command, run_command_process
 from normlift_ns.cli.preflight import check_lifted_run, check_readable_file
 from normlift_ns.errors import InputError
-from normlift_ns.options import CheckedOptions, check_device
+from normlift_ns.options import CheckedOptions, check_device, renamed
 
 if TYPE_CHECKING:
     from normlift_ns.viewer.adapter import Door
 
 
+@renamed(
+    share_readonly="read_only",
+    most_drawn="max_gaussians",
+    text_vectors="text_embeddings",
+    text_template="prompt_template",
+)
 @dataclass
 class NormLiftView(CheckedOptions):
     """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
@@ -31,15 +37,15 @@ class NormLiftView(CheckedOptions):
     """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
     port: int = 7008
     """Port to listen on, in 1..65535; if it is in use, the next free one."""
-    share_readonly: bool = False
+    read_only: bool = False
     """Forbid visitors from storing prompts in the run or writing files on this machine; their exports become browser
     downloads."""
-    most_drawn: int = 1_000_000
+    max_gaussians: int = 1_000_000
     """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
     need more browser memory."""
-    text_vectors: Path | None = None
+    text_embeddings: Path | None = None
     """NPZ file with one vector per prompt, used instead of encoding prompts."""
-    text_template: str | None = None
+    prompt_template: str | None = None
     """Template of the text that the network encodes, with {} for the prompt. Default: the template of the lift."""
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
@@ -51,7 +57,7 @@ class NormLiftView(CheckedOptions):
         check_device(self.device)
         _check_host(self.host)
         check_lifted_run(self.load_config, self.data)
-        check_readable_file(self.text_vectors, "--text-vectors")
+        check_readable_file(self.text_embeddings, "--text-embeddings")
         from normlift_ns.viewer.adapter import Door  # noqa: PLC0415 (--help should not wait for viser)
 
         door = Door(self.host, self.port)
@@ -76,12 +82,12 @@ class NormLiftView(CheckedOptions):
             self.load_config,
             data=self.data,
             device=self.device,
-            text_vectors=self.text_vectors,
-            text_template=self.text_template,
+            text_embeddings=self.text_embeddings,
+            prompt_template=self.prompt_template,
         )
         space = SelectionContext(run.field, run.scene.gaussians.means.detach())
-        records = make_records(run.scene, self.most_drawn)
-        shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.share_readonly, lambda: run.votes)
+        records = make_records(run.scene, self.max_gaussians)
+        shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.read_only, lambda: run.votes)
         people = People(shared)
         door.open(f"normlift: {run.scene.name}", people.come, people.go)
 

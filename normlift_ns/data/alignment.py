@@ -102,13 +102,13 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
             f"The cameras do not look at this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
-            f"of three training views. {causes}. --check False lifts anyway."
+            f"of three training views. {causes}. --check-alignment False lifts anyway."
         )
     if match.psnr < match.mean_color_psnr and not trained_cameras:
         raise InputError(
             f"The splat does not show what its images show: renders from three of the cameras are further from the "
             f"images ({match.psnr:.1f} dB) than their mean color is ({match.mean_color_psnr:.1f} dB). {causes}. "
-            "--check False lifts anyway."
+            "--check-alignment False lifts anyway."
         )
     if match.focal_factor != 1.0:
         return (

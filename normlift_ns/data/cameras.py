@@ -106,7 +106,7 @@ def adjust_poses(
         hint = " The trainer holds out every 8th image: give --test-every 8." if len(deltas) == without_eighth else ""
         raise InputError(
             f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
-            f"{len(frames)} images are training views. Give the held-out images with --test-every or --holdout.{hint}"
+            f"{len(frames)} images are training views. Name the others with --test-every or --eval-images.{hint}"
         )
     by_name = {}
     for frame, delta in zip(trained, deltas.numpy()):

@@ -92,9 +92,9 @@ def open_splat(
 def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
     """Return the names of the images that the training did not use."""
     held_out, frames = cameras.held_out, cameras.frames
-    if options.test_every is not None or len(options.holdout) > 0:
+    if options.test_every is not None or len(options.eval_images) > 0:
         names = [frame.name for frame in frames]
-        held_out = held_out_names(names, test_every=options.test_every, holdout=options.holdout)
+        held_out = held_out_names(names, test_every=options.test_every, eval_images=options.eval_images)
     if len(held_out) == len(frames) and options.views == "train":
         raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
     return held_out
@@ -162,7 +162,7 @@ def _assumptions(
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")
     texts.append(
-        "Weights are computed as in gsplat, in the version of --gsplat-rules (default: 1.4). Versions before 1.6 cap "
+        "Weights are computed as in gsplat, in the version of --gsplat-version (default: 1.4). Versions before 1.6 cap "
         "the opacity of a Gaussian in a pixel at 0.999, version 1.6 and Inria's trainer at 0.99. Inria's trainer "
         "assumes the principal point in the middle of the image. Distorted images are undistorted as in ns-train."
     )
@@ -170,7 +170,7 @@ def _assumptions(
         lifted = "lifted too" if options.views == "all" else "not lifted"
         texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
     else:
-        texts.append(f"All {len(frames)} images are lifted; see --test-every and --holdout.")
+        texts.append(f"All {len(frames)} images are lifted; see --test-every and --eval-images.")
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})

@@ -34,8 +34,8 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
         raise InputError(
             f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
         )
-    if options.text_vectors is not None:
-        raise InputError(f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat")
+    if (file := options.text_embeddings) is not None:
+        raise InputError(f"--text-embeddings {file} is for imported features; add --features langsplat")
     name = resolve_regions(options, device)
     masks = _make_masks(options, name, device)
     return masks if MASK_SOURCES.load(name).has_features else RegionFeatures(masks, make_encoder(options, device))
@@ -49,7 +49,7 @@ def _make_masks(options: SourceOptions, name: str, device: str) -> Any:
     return PluginRegions.made(name, lambda: source.make(options, device))
 
 
-_PATHS = ("regions_dir", "features_dir", "text_vectors")
+_PATHS = ("regions_dir", "features_dir", "text_embeddings")
 """Options that are paths."""
 
 

@@ -414,6 +414,6 @@ def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[
     return weights.third_party_errors(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded",
         "connect to the internet once, give a folder with --encoder-model, or use the encoder that needs no weights: "
-        "--encoder colour",
+        "--encoder color",
         FileNotFoundError,
     )

@@ -75,13 +75,13 @@ def _folder() -> Path:
     """Return the folder of the open_clip package."""
     spec = find_spec("open_clip")
     if spec is None or spec.origin is None:
-        raise InputError("open_clip is not installed (pip install open_clip_torch); --encoder colour works without it")
+        raise InputError("open_clip is not installed (pip install open_clip_torch); --encoder color works without it")
     return Path(spec.origin).parent
 
 
 OPEN_CLIP_REMEDY = (
     "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
-    "the encoder that needs no weights: --encoder colour"
+    "the encoder that needs no weights: --encoder color"
 )
 
 

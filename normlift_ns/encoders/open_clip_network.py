@@ -93,7 +93,7 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
     with third_party_errors(
         f"the tokenizer of OpenCLIP model {model} cannot be loaded",
         "connect to the internet once, use a model with OpenCLIP's own tokenizer such as "
-        f"{DEFAULT_MODEL}, or use the encoder that needs none: --encoder colour",
+        f"{DEFAULT_MODEL}, or use the encoder that needs none: --encoder color",
         FileNotFoundError,
     ):
         tokenizer = open_clip.get_tokenizer(model)

@@ -39,7 +39,7 @@ class EncoderKind:
     The module that defines it should import torch only inside `make`, so that queries and error messages stay fast.
 
     >>> from normlift_ns.encoders.registry import encoder_kind
-    >>> encoder_kind("colour").negatives, encoder_kind("open_clip").rule
+    >>> encoder_kind("color").negatives, encoder_kind("open_clip").rule
     ((), 'lerf')
     """
 
@@ -73,7 +73,7 @@ def _make_encoder(options: SourceOptions, device: str) -> Encoder:
     from normlift_ns.encoders.open_clip_network import OpenClipEncoder  # noqa: PLC0415 (needs torch)
 
     model, pretrained = options.encoder_model, options.encoder_pretrained
-    return OpenClipEncoder(model, pretrained, options.crop_fill, device, options.text_template)
+    return OpenClipEncoder(model, pretrained, options.crop_fill, device, options.prompt_template)
 
 
 def _make_texts(
@@ -82,7 +82,7 @@ def _make_texts(
     """Make the text encoder of a lifted run, see `EncoderKind.texts`. A weight file is read completely at every use."""
     from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
 
-    model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.text_template
+    model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.prompt_template
     _check_unchanged(pretrained, recorded.get("pretrained"))
 
     def network() -> TextEncoder:
@@ -101,8 +101,8 @@ def _make_texts(
 def _check_unchanged(pretrained: str, expected: object) -> None:
     """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
     remedy = (
-        "restore the file of the lift, give embeddings of your texts by the same network with --text-vectors, or lift "
-        "again with: ns-normlift"
+        "restore the file of the lift, give embeddings of your texts by the same network with --text-embeddings, or "
+        "lift again with: ns-normlift"
     )
     if not isinstance(expected, str):
         return
@@ -162,7 +162,7 @@ def _make_kind(family: ModelFamily) -> EncoderKind:
 
         check_transformers_version(family)
         model = resolve_model_name(options, family)
-        return HuggingFaceEncoder(family, model, options.crop_fill, device, options.text_template)
+        return HuggingFaceEncoder(family, model, options.crop_fill, device, options.prompt_template)
 
     check = partial(check_huggingface_options, family=family)
     return EncoderKind(make, check=check, has_patches=lambda options: True, paths=("encoder_model",))
@@ -174,8 +174,8 @@ SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("sig
 def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
 
-    if options.text_template != "{}":
-        raise InputError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
+    if options.prompt_template != "{}":
+        raise InputError(f"--prompt-template {options.prompt_template!r} is for --encoder open_clip; leave it out")
     return ColorEncoder()
 
 
@@ -187,7 +187,7 @@ ENCODERS = Registry(
     "normlift_ns.encoders",
     {
         **{name: f"normlift_ns.encoders.registry:{name.upper()}" for name in ("open_clip", *MODEL_FAMILIES)},
-        "colour": "normlift_ns.encoders.registry:COLOR",
+        "color": "normlift_ns.encoders.registry:COLOR",
     },
     EncoderKind,
     "encoder",
@@ -197,9 +197,14 @@ ENCODERS = Registry(
 """Encoders by their `--encoder` names."""
 
 
+def canonical_name(encoder: str) -> str:
+    """Return the documented name of an encoder; commands accept the spelling "colour", which runs record."""
+    return "color" if encoder == "colour" else encoder
+
+
 def encoder_kind(name: str) -> EncoderKind:
     """Return the encoder kind of a name; raises as `Registry.load`."""
-    return ENCODERS.load(name)
+    return ENCODERS.load(canonical_name(name))
 
 
 def find_encoder_kind(name: object) -> EncoderKind | None:
@@ -225,7 +230,8 @@ def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
     """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
     from normlift_ns.encoders.text_files import TextEmbeddingFile  # noqa: PLC0415 (needs numpy)
 
-    return make_encoder(options, device) if options.text_vectors is None else TextEmbeddingFile(options.text_vectors)
+    file = options.text_embeddings
+    return make_encoder(options, device) if file is None else TextEmbeddingFile(file)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
@@ -241,6 +247,6 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)
 
     kind = encoder_kind(options.encoder)
-    if options.encoder in ENCODERS.built_in:
+    if canonical_name(options.encoder) in ENCODERS.built_in:
         return kind.make(options, device)
     return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))

@@ -132,10 +132,10 @@ class TextEmbeddingFile(LazyTextEncoder):
     def __post_init__(self) -> None:
         if not os.path.isfile(self.file):
             if os.path.lexists(self.file):
-                raise InputError(f"{self.file} is not a file of text vectors; give an NPZ file with --text-vectors")
+                raise InputError(f"{self.file} is not a file of text vectors; give an NPZ file with --text-embeddings")
             raise FileNotFoundError(
                 f"file of text vectors {self.file} does not exist; give an NPZ file with one vector per text with "
-                "--text-vectors"
+                "--text-embeddings"
             )
 
     @property

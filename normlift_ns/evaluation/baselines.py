@@ -89,7 +89,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     if options.get("consensus", False) == enabled:
         return lifted
     views = _observe_again(lifted, device, partial(_plain, power=options.get("weight_power", 1)))
-    names = ("beta", "unlabeled", "consensus_power", "consensus_sample", "consensus_least")
+    names = ("reliability_beta", "unlabeled", "consensus_power", "consensus_sample", "consensus_min_agreement")
     given: dict[str, Any] = {name: options[name] for name in names if options.get(name) is not None}
     relift, table = LiftOptions(consensus=enabled, **given), views.features
     if enabled:

@@ -156,7 +156,7 @@ CONSENSUS_VARIANTS: dict[str, Variant] = {
     "consensus_posterior": "posterior",
 }
 """Vote after the consensus, by variant name."""
-BETA = LiftOptions().beta
+BETA = LiftOptions().reliability_beta
 """Default beta."""
 
 
@@ -176,7 +176,7 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
     options = manifest.get("options", {})
     kind = {"vote": "paper"} if "vote" in options else {}  # the only one in version 0.1
     config = RefineConfig(**{**kind, **options.get("vote", {})})
-    return Vote(config.vote, config, options.get("beta", BETA), {})
+    return Vote(config.vote, config, options.get("reliability_beta", BETA), {})
 
 
 def voting_scalars(field: SemanticField) -> Scalars:
@@ -187,7 +187,7 @@ def voting_scalars(field: SemanticField) -> Scalars:
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False):
         return scalars
-    support = reliability(1.0, scalars.n_eff, options.get("beta", BETA))
+    support = reliability(1.0, scalars.n_eff, options.get("reliability_beta", BETA))
     return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))
 
 

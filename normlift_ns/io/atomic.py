@@ -520,7 +520,7 @@ def refuse_run_files(*paths: Path, instead: str) -> None:
     Raises:
         ValueError: a path, with links resolved, is a file of a run or inside one of its folders.
 
-    >>> refuse_run_files(Path("answers.json"), instead="--json")
+    >>> refuse_run_files(Path("answers.json"), instead="--output-json")
     """
     for path in paths:
         resolved = path.resolve()

@@ -21,7 +21,7 @@ from normlift_ns.io.atomic import (
     text_digest,
     write_text_file,
 )
-from normlift_ns.options import Storage
+from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
@@ -196,7 +196,8 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
     """Read and check a manifest.
 
     Returns:
-        Metadata, and the digests of files by path relative to the folder; None instead of digests for version 0.1.
+        Metadata with the option names of this version, and the digests of files by path relative to the
+        folder; None instead of digests for version 0.1.
     Raises:
         FileNotFoundError: the manifest does not exist.
         ValueError: the manifest is damaged or has an unknown schema version.
@@ -230,7 +231,13 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
             raise InputError(f"it has a digest of {outside[0]!r}, which is not a file of a run")
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {LIFT_AGAIN}") from error
-    return facts, digests
+    return facts | _new_names(facts), digests
+
+
+def _new_names(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a manifest that record options, with the names of this version."""
+    recorded = {"options": LiftOptions, "source": SourceOptions}
+    return {name: new_names(recorded[name], x) for name, x in facts.items() if name in recorded and isinstance(x, dict)}
 
 
 def read_text(path: Path) -> str:

@@ -8,11 +8,23 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+
+def _rename_flags(words: list[str]) -> list[str]:
+    """Return the command line of this process with the new names of options, if it is ns-train with our method."""
+    from normlift_ns.options import LiftOptions, SourceOptions, rename_flags, renamed_flags  # noqa: PLC0415 (may fail)
+
+    if Path("".join(words[:1])).stem != "ns-train" or not "".join(words[1:2]).startswith("normlift"):
+        return words
+    flags = renamed_flags(LiftOptions, "--pipeline.lift.") | renamed_flags(SourceOptions, "--pipeline.source.")
+    return rename_flags(words, flags)
 
 
 def _load_method(name: str) -> Any:
     try:
+        sys.argv[:] = _rename_flags(sys.argv)
         return getattr(import_module("normlift_ns.method_configs.normlift"), f"{name}_method")
     except Exception as error:  # any missing or broken dependency
         if sys.stderr is not None:

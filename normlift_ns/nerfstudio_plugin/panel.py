@@ -436,7 +436,7 @@ class SearchPanel(Controller):
     def _query_settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {"negatives": split_prompts(self._negatives)}
         if (widgets := self._widgets) is not None:
-            chosen = {"rule": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
+            chosen = {"relevancy": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
             settings |= {name: widget.value for name, widget in chosen.items()}
         return settings
 

@@ -108,8 +108,8 @@ def open_quick(
     *,
     means: Float32[np.ndarray, "n 3"] | None = None,
     device: str = "cpu",
-    text_vectors: Path | None = None,
-    text_template: str | None = None,
+    text_embeddings: Path | None = None,
+    prompt_template: str | None = None,
 ) -> QuickRun | None:
     """Open the field of a lifted run; return None if its files alone do not determine the scene.
 
@@ -120,7 +120,7 @@ def open_quick(
         load_config: path of the run's config.yml.
         means: centers of the Gaussians, from a scene that `open_run` has matched with the field.
         device: device of the text encoder's network.
-        text_vectors, text_template: as in `open_run`.
+        text_embeddings, prompt_template: as in `open_run`.
     Raises:
         FileNotFoundError, ValueError: the run has no semantic field, or is damaged.
     """
@@ -136,4 +136,4 @@ def open_quick(
     elif "means" not in field.arrays or not checkpoints <= field.digested_files:
         return None
     run = QuickRun(run_dir, field, resolve_manifest_paths(field.manifest, folder), device)
-    return with_text_source(run, text_embeddings=text_vectors, template=text_template)
+    return with_text_source(run, text_embeddings=text_embeddings, template=prompt_template)

@@ -20,7 +20,7 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import RelevancyRule, check_bool, check_number, short_repr
+from normlift_ns.options import RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
 
 
@@ -64,13 +64,14 @@ class Query:
         return {"relevancy": self.rule, "threshold": self.threshold, "min_reliability": self.min_reliability}
 
 
+@renamed(rule="relevancy")
 def make_query(
     field: HasManifest,
     encode: Callable[[Sequence[str]], Any],
     texts: Sequence[str],
     *,
     negatives: Sequence[str] | None = None,
-    rule: RelevancyRule | Literal["auto"] = "auto",
+    relevancy: RelevancyRule | Literal["auto"] = "auto",
     threshold: float | Literal["auto"] | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
@@ -81,7 +82,7 @@ def make_query(
         encode: encodes prompts as one embedding each, with an encoder that fits the field.
         texts: the prompts.
         negatives: negative prompts (default: those of the encoder, see `default_rule`).
-        rule: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
+        relevancy: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
         threshold: "auto" is the threshold that the histogram suggests. None is the threshold of the encoder for its own
             rule, and otherwise that of `RELEVANCY_RULES`. For the rule cosine with an encoder of another rule, None is
             "auto", because no threshold suits all encoders.
@@ -90,24 +91,24 @@ def make_query(
     Raises:
         ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
-    _check_rules(negatives, rule, threshold)
+    _check_rules(negatives, relevancy, threshold)
     threshold = threshold if threshold is None or isinstance(threshold, str) else check_number("threshold", threshold)
     min_reliability = check_number("min_reliability", min_reliability)
     check_bool("refined", refined)
     default = default_rule(field)
-    if rule == "auto":
-        rule = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
+    if relevancy == "auto":
+        relevancy = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
     if threshold is None:
-        general = RELEVANCY_RULES[rule].threshold if RELEVANCY_RULES[rule].needs_negatives else "auto"
-        threshold = default.threshold if rule == default.rule else general
+        general = RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
+        threshold = default.threshold if relevancy == default.rule else general
     negatives = tuple(default.negatives if negatives is None else negatives)
     return Query(
         texts=tuple(texts),
         embeddings=encode(texts),
         negatives=negatives,
         negative_embeddings=encode(negatives) if len(negatives) > 0 else None,
-        rule=rule,
-        threshold=RELEVANCY_RULES[rule].threshold if threshold == "auto" else threshold,
+        rule=relevancy,
+        threshold=RELEVANCY_RULES[relevancy].threshold if threshold == "auto" else threshold,
         suggest_threshold=threshold == "auto",
         min_reliability=min_reliability,
         refined=refined,
@@ -115,15 +116,15 @@ def make_query(
     )
 
 
-def _check_rules(negatives: object, rule: str, threshold: object) -> None:
+def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
     if negatives is not None and not isinstance(negatives, Sequence):
         raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
     if isinstance(negatives, str):
         raise InputError(
             f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
         )
-    if rule not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if relevancy not in ("auto", *RELEVANCY_RULES):
+        raise InputError(f"relevancy must be auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
     if isinstance(threshold, str) and threshold != "auto":
         raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
@@ -136,7 +137,7 @@ def _check_rules(negatives: object, rule: str, threshold: object) -> None:
 QUERIES_FILE = "queries.safetensors"
 """File in the folder of the field, with embeddings as tensors and everything else as JSON in its metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
-_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save True"
+_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
 NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 

@@ -21,10 +21,11 @@ from normlift_ns.encoders.registry import (
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
-from normlift_ns.options import RelevancyRule, SourceOptions
+from normlift_ns.options import RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that determine the encoder or the text embeddings of a field; its manifest records them."""
+"""Options that determine the encoder or the text embeddings of a field; its manifest records them by their
+names in version 0.2."""
 PRECOMPUTED = "given"
 """Value in the manifest instead of an encoder name, for features provided by the user."""
 _CHOSEN = "texts_chosen"
@@ -56,8 +57,9 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
     """Return the settings that `text_encoder_for` needs, as JSON types, with absolute paths."""
-    settings = {key: getattr(options, key) for key in ENCODER_KEYS} | absolute_paths(options)
-    vectors = options.text_vectors
+    stored = names_of_0_2(options)
+    settings = {key: stored[key] for key in ENCODER_KEYS} | absolute_paths(options)
+    vectors = options.text_embeddings
     return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
 
@@ -98,15 +100,15 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         FileNotFoundError: the weights or text embeddings no longer exist.
     """
     options = _options(field)
-    if options.text_vectors is not None:
+    if options.text_embeddings is not None:
         if not field.manifest.get(_CHOSEN):
-            _check_vectors(options.text_vectors, _identity(field.manifest.get("features")).get("content"))
-        vectors = TextEmbeddingFile(options.text_vectors)
+            _check_vectors(options.text_embeddings, _identity(field.manifest.get("features")).get("content"))
+        vectors = TextEmbeddingFile(options.text_embeddings)
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
                 f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
                 f"{field.manifest['dimension']}; give a file of text vectors from the encoder of these features "
-                "(--text-vectors)"
+                "(--text-embeddings)"
             )
         return vectors
     try:
@@ -114,7 +116,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     except InputError as error:
         raise InputError(
             f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
-            "a file of text vectors from that encoder (--text-vectors)"
+            "a file of text vectors from that encoder (--text-embeddings)"
         ) from None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
@@ -135,13 +137,13 @@ def _cached_texts(
             raise InputError(
                 f"the encoder {options.encoder} is not the one that the run was lifted with, so results would differ: "
                 f"it is {encoder.identity}, expected {dict(recorded)}. Restore its files; or give a file of text "
-                "vectors from the same network with --text-vectors; or lift again with: ns-normlift"
+                "vectors from the same network with --text-embeddings; or lift again with: ns-normlift"
             )
         return encoder
 
     def settings() -> dict[str, Any]:
         identity = recorded if len(recorded) > 0 else network().identity
-        return {"encoder": identity, "template": options.text_template}
+        return {"encoder": identity, "template": options.prompt_template}
 
     return CachedTextEncoder(settings, network, cache)
 
@@ -163,7 +165,7 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 def _check_vectors(path: Path, expected: object) -> None:
     """Raise if the content of a file of text embeddings has changed since the lift; this reads the whole file."""
     remedy = (
-        "restore the file; or give a file of text vectors from the same network with --text-vectors; or lift again "
+        "restore the file; or give a file of text vectors from the same network with --text-embeddings; or lift again "
         "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
@@ -185,10 +187,10 @@ def _options(field: HasManifest) -> SourceOptions:
     if stored["encoder"] == PRECOMPUTED and vectors is None:
         raise InputError(
             "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
-            "(--text-vectors), or lift again with texts"
+            "(--text-embeddings), or lift again with texts"
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
-    return SourceOptions(**{**stored, **placeholder})
+    return SourceOptions.stored({**stored, **placeholder})
 
 
 def encoder_name(field: HasManifest) -> str | None:

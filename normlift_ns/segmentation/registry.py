@@ -23,7 +23,7 @@ from normlift_ns.registry import Registry
 if TYPE_CHECKING:
     from normlift_ns.encoders.base import FeatureSource, Regions
 
-MASK_OPTIONS = ("sam_model", "sam_precision", "region_texts", "regions_dir", "level")
+MASK_OPTIONS = ("sam_model", "sam_precision", "sam3_prompts", "regions_dir", "level")
 """Options of `SourceOptions` that only some mask sources take."""
 
 
@@ -82,16 +82,16 @@ SAM_MASKS = MaskSource(
 
 _make_sam3 = _make(
     "segmentation.sam3:Sam3Masks",
-    lambda o, device: (o.region_texts, o.sam_model or DEFAULT_SAM3, device, o.sam_precision),
+    lambda o, device: (o.sam3_prompts, o.sam_model or DEFAULT_SAM3, device, o.sam_precision),
 )
 
 
 def _check_sam3(options: SourceOptions) -> None:
-    if len(options.region_texts) == 0:
+    if len(options.sam3_prompts) == 0:
         raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
 
 
-SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "region_texts"))
+SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "sam3_prompts"))
 """Masks of SAM 3 for text prompts."""
 
 
@@ -154,10 +154,10 @@ def _check_langsplat(options: SourceOptions) -> None:
         raise InputError(
             "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
         )
-    if not encoder_kind(options.encoder).learned and options.text_vectors is None:
+    if not encoder_kind(options.encoder).learned and options.text_embeddings is None:
         raise InputError(
             f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
-            "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
+            "that did with --encoder-model and --encoder-pretrained, or give --text-embeddings"
         )
 
 

@@ -70,12 +70,12 @@ class ObjectList:
     """Number of Gaussians in components too small to be objects."""
 
 
-def list_objects(state: State, *, max_objects: int = 12, min_size: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
+def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
     """Return the objects that are selected and drawn, of each prompt that selects or of the selection by hand.
 
     Args:
         max_objects: largest number of objects listed; each prompt gets its largest object before any gets a second.
-        min_size: fewest Gaussians of an object; those in smaller components are only counted.
+        min_gaussians: fewest Gaussians of an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
     if answer is None or not state.prompts_select:
@@ -88,7 +88,7 @@ def list_objects(state: State, *, max_objects: int = 12, min_size: int = OBJECT_
     for group, (text, color, mask) in enumerate(groups):
         labels = connected_components(state.space.means, mask)
         sizes = torch.bincount(labels[labels >= 0].long()).tolist()
-        count = sum(size >= min_size for size in sizes)
+        count = sum(size >= min_gaussians for size in sizes)
         small += sum(sizes[count:])
         rows += [(number, group, text, color, labels, size) for number, size in enumerate(sizes[:count])]
     listed = sorted(sorted(rows, key=lambda row: row[:2])[:max_objects], key=lambda row: (row[1], row[0]))

@@ -115,7 +115,7 @@ def build_query(
     read: EncodeTexts,
     *,
     negatives: Sequence[str] | None = None,
-    rule: RelevancyRule | Literal["auto"] = "auto",
+    relevancy: RelevancyRule | Literal["auto"] = "auto",
     threshold: float | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
@@ -136,8 +136,8 @@ def build_query(
     if len(clicks) == 0:
         raise InputError(rows[0].error if len(rows) > 0 else "Type a prompt, then press Ask.")
     if all(clicks):
-        negatives, rule, threshold = (), "cosine", CLICK_THRESHOLD if threshold is None else threshold
-    options = {"negatives": negatives, "rule": rule, "threshold": threshold}
+        negatives, relevancy, threshold = (), "cosine", CLICK_THRESHOLD if threshold is None else threshold
+    options = {"negatives": negatives, "relevancy": relevancy, "threshold": threshold}
     options |= {"min_reliability": min_reliability, "refined": refined}
     question = _question(field, rows, read, options)
     if any(clicks) and RELEVANCY_RULES[question.rule].needs_negatives:

@@ -72,6 +72,6 @@ def test_what_is_never_drawn_is_no_floater_and_nobodys_neighbour():
 def test_limits_and_lifts_that_do_not_fit():
     scene, known = wall_and_specks(0)
     assert find_floaters(scene, known, limit=100).mask.sum() == 0 < FLOATER_THRESHOLD
-    for other, limit, hint in ((known, float("nan"), "floater_limit"), (scalars(torch.ones(3)), 1.0, "3 .* 405")):
+    for other, limit, hint in ((known, float("nan"), "floater_threshold"), (scalars(torch.ones(3)), 1.0, "3 .* 405")):
         with pytest.raises(InputError, match=hint):
             find_floaters(scene, other, limit=limit)

@@ -55,18 +55,18 @@ def test_every_encoder_has_a_default_that_selects_something():
     for encoder, how, threshold, suggest in (
         ("open_clip", {}, 0.5, False),  # lerf, against four negatives
         ("open_clip", {"negatives": []}, 0.5, True),
-        ("open_clip", {"rule": "cosine"}, 0.5, True),
-        ("open_clip", {"rule": "cosine", "threshold": 0.3}, 0.3, False),
-        ("open_clip", {"rule": "margin"}, 0.02, False),
+        ("open_clip", {"relevancy": "cosine"}, 0.5, True),
+        ("open_clip", {"relevancy": "cosine", "threshold": 0.3}, 0.3, False),
+        ("open_clip", {"relevancy": "margin"}, 0.02, False),
         ("open_clip", {"threshold": "auto"}, 0.5, True),
-        ("colour", {}, 0.5, False),
-        ("colour", {"threshold": "auto"}, 0.5, True),
+        ("color", {}, 0.5, False),
+        ("color", {"threshold": "auto"}, 0.5, True),
         (None, {}, 0.5, True),
     ):
         question = asked(encoder, **how)
         assert (question.threshold, question.suggest_threshold) == (threshold, suggest), (encoder, how)
     with pytest.raises(InputError, match=r"threshold .*auto.*much"):
-        asked("colour", threshold="much")
+        asked("color", threshold="much")
 
 
 def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):

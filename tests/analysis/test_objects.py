@@ -39,15 +39,15 @@ def test_only_what_is_selected_connects():
     assert connected_components(line, selected).tolist() == [0] * 30
     selected[10:16] = False
     assert connected_components(line, selected).tolist() == [1] * 10 + [-1] * 6 + [0] * 14
-    assert connected_components(line, selected, reach=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
+    assert connected_components(line, selected, max_gap=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
 
 
 def test_parts_smaller_than_one_gaussian_are_refused():
     for min_size in (0, 1.5):
-        with pytest.raises(InputError, match="min_size"):
+        with pytest.raises(InputError, match="object_min_gaussians"):
             find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
-        with pytest.raises(InputError, match="min_size"):
-            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_size=min_size)
+        with pytest.raises(InputError, match="object_min_gaussians"):
+            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_gaussians=min_size)
 
 
 def test_scale_and_order_do_not_matter():

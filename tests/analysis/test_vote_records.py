@@ -24,8 +24,8 @@ def run(request, trained: Path, made_once) -> nl.LiftedRun:
 
     def make(folder: Path) -> None:
         options = nl.LiftOptions(storage=request.param, max_views=6, consensus=request.param == "float16")
-        source = nl.SourceOptions(encoder="colour")
-        nl.lift_run(trained, source=source, lift=options, output_dir=folder, timestamp="one", check=False)
+        source = nl.SourceOptions(encoder="color")
+        nl.lift_run(trained, source=source, lift=options, output_dir=folder, timestamp="one", check_alignment=False)
 
     return nl.open_run(next(made_once(f"votes-{request.param}", make).glob("*/normlift/one/config.yml")))
 
@@ -94,7 +94,7 @@ def test_photographs_that_are_gone_replaced_or_unknown_are_named(
     fewer = replace(run.field, manifest={**run.field.manifest, "views_lifted": names[:-1]})
     with pytest.raises(nl.InputError, match=r" 5 .* 6"):
         _ = RecordedVotes(run.scene, fewer, tmp_path).names
-    for option in ("beta", "unlabeled"):
+    for option in ("reliability_beta", "unlabeled"):
         wrong = replace(run.field, manifest={**run.field.manifest, "options": {option: [1]}})
         with pytest.raises(nl.InputError, match=f"damaged: .*{option} is"):
             RecordedVotes(run.scene, wrong, tmp_path).explain(run.ask("red").mask)

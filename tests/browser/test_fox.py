@@ -26,8 +26,8 @@ def test_a_person_finds_the_fox(tmp_path: Path, browser: Browser) -> None:
     from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
 
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    options, colour = LiftOptions(max_views=6, lift_downscale=4), SourceOptions(encoder="colour")
-    fox = NormLift(source, source=colour, lift=options, check=False, output_dir=tmp_path).main().config
+    options, colour = LiftOptions(max_views=6, lift_downscale=4), SourceOptions(encoder="color")
+    fox = NormLift(source, source=colour, lift=options, check_alignment=False, output_dir=tmp_path).main().config
     with Server(STOCK, fox, tmp_path / "viewer.log", cwd=tmp_path).running() as address:
         tab = Tab(browser, address)
         assert tab.typed("Prompts") == "" and tab.selected() == -1  # nothing is stored

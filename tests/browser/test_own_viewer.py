@@ -124,7 +124,7 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(own: Server, b
     three.selects(lambda count: count == red, "the link asks its question")
     three.sees(lambda seen: changed(seen, before) < 6, "from its camera")
 
-    own.start("--share-readonly", "True")
+    own.start("--read-only", "True")
     three.until(lambda: three.button("Save prompts in run").count() == 0, "the page finds the new server")
     three.selects(lambda count: count == red, "its link brings the question back")
     assert three.button("Save prompts in run").count() == 0

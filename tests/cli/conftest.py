@@ -20,9 +20,9 @@ from tests.conftest import make_lifted, make_trained
 if TYPE_CHECKING:
     from normlift_ns.demo.room import DemoRoom
 
-SMALL = ("--encoder", "colour", "--k", "12")
+SMALL = ("--encoder", "color", "--vote-k", "12")
 """Flags that lift the small demo room in a moment."""
-QUICK = (*SMALL, "--check", "False")
+QUICK = (*SMALL, "--check-alignment", "False")
 """The same without comparing the photographs first."""
 
 

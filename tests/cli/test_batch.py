@@ -221,10 +221,10 @@ def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     assert made.states() == ["done", "done", "failed", "done"]
     message = outcomes[captures[2].key].message
     assert "manifest.json" in message and f"delete {captures[2].run_dir}" in message
-    made.work("--encoder", "colour")  # other options: all of them
+    made.work("--encoder", "color")  # other options: all of them
     assert made.begun() == {"c00": 2, "c01": 3, "c02": 2, "c03": 3}
     shutil.rmtree(made.results)  # the runs themselves say that they are there
-    made.work("--encoder", "colour")
+    made.work("--encoder", "color")
     assert sum(made.begun().values()) == 10
     assert {outcome.state for outcome in read_jsonl(made.results, Outcome)} == {"skipped"}
 
@@ -275,17 +275,17 @@ def test_an_interrupt_ends_the_program(tmp_path):
 
 def test_lines_of_the_list(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lines = ["\ufeff# a list", "", "a/config.yml", '  "b c.ply" --colmap "b c" --beta 2  ']
+    lines = ["\ufeff# a list", "", "a/config.yml", '  "b c.ply" --colmap "b c" --reliability-beta 2  ']
     lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
     Path("list.txt").write_text("\r\n".join(lines), "utf8")
-    found = read_captures(Path("list.txt"), ("--encoder", "colour"))
+    found = read_captures(Path("list.txt"), ("--encoder", "color"))
     assert [capture.arguments[2:-2] for capture in found] == [
         ("--load-config", "a/config.yml"),
-        ("--load-ply", "b c.ply", "--colmap", "b c", "--beta", "2"),
+        ("--load-ply", "b c.ply", "--colmap", "b c", "--reliability-beta", "2"),
         ("--load-gsplat", "x#1.pt", "--transforms", "t.json"),
         ("--load-ply", "X.PLY"),
     ]
-    assert all(capture.arguments[:2] == ("--encoder", "colour") for capture in found)
+    assert all(capture.arguments[:2] == ("--encoder", "color") for capture in found)
     assert all(capture.arguments[-2:] == ("--timestamp", f"batch_{capture.key}") for capture in found)
     assert found[0].run_dir is None  # the config is not there
     assert found[1].run_dir == tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}"
@@ -303,12 +303,22 @@ def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
     path = str(tmp_path / "a.ply")
     first = key(path)
     assert key(f"--load-ply {path}") == key(f"{tmp_path}/./a.ply") == first
-    assert key(path, "--beta", "1") == key(f"{path} --beta 1.0", "--beta", "3") == first  # the default
+    assert (
+        key(path, "--reliability-beta", "1")
+        == key(f"{path} --reliability-beta 1.0", "--reliability-beta", "3")
+        == first
+    )  # the default
     assert key(path, "--device", "cpu", "--output-dir", "elsewhere") == first
-    others = [("--beta", "2"), ("--colmap", "x"), ("--queries", "red"), ("--encoder", "colour"), ("--refine", "False")]
+    others = [
+        ("--reliability-beta", "2"),
+        ("--colmap", "x"),
+        ("--queries", "red"),
+        ("--encoder", "color"),
+        ("--refine", "False"),
+    ]
     keys = [key(path, *options) for options in others]
     assert len({first, *keys}) == 1 + len(others)
-    assert key(f"{path} --beta 2") == keys[0]
+    assert key(f"{path} --reliability-beta 2") == keys[0]
     (tmp_path / "a.ply").write_bytes(b"12345")
     assert key(path) not in {first, *keys}
 
@@ -319,7 +329,7 @@ def test_lists_that_cannot_be(tmp_path, monkeypatch):
         ("# none\n\n", (), ("list.txt",)),
         ("a\nb 'c\n", (), ("list.txt, line 2", "b 'c")),
         ("a\n\nb --encodr x\n", (), ("list.txt, line 3", "--encodr")),
-        ("a --k 0\n", (), ("list.txt, line 1", "k must be at least 1, got 0")),
+        ("a --vote-k 0\n", (), ("list.txt, line 1", "k must be at least 1, got 0")),
         ("a\nb\n./a\n", (), ("list.txt, line 3", "line 1")),
         ("a --timestamp x", (), ("list.txt, line 1", "--timestamp")),
         ("a", ("--nothing",), ("After --", "--nothing")),
@@ -343,7 +353,7 @@ def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsy
         (("list.txt", "--shard", "2/1"), "--shard", "i/n"),
         (("list.txt", "--patience", "0"), "--patience must be in 1..86400, got 0"),
         (("list.txt", "--results", "file"), "file", "--results"),
-        (("list.txt", "--", "--k", "0"), "--k must be at least 1, got 0"),
+        (("list.txt", "--", "--vote-k", "0"), "--vote-k must be at least 1, got 0"),
     ):
         assert run_entry(monkeypatch, batch.entrypoint, *flags) == 1
         text = said(capsys)

@@ -22,7 +22,7 @@ def checked(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> C
     def run(*flags: object) -> tuple[int, dict]:
         file = tmp_path / "check.json"
         given = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--device", "cpu", *flags)
-        code = run_entry(monkeypatch, check.entrypoint, *given, "--json", file, "--overwrite", "True")
+        code = run_entry(monkeypatch, check.entrypoint, *given, "--output-json", file, "--overwrite", "True")
         return code, json.loads(file.read_text())
 
     return run
@@ -66,12 +66,12 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_p
     code, found = checked("--device", "cuda:7")
     assert code == 1 and states(found)["device"] == "error"
     monkeypatch.setattr(planning, "in_frustum", lambda means, camera: means[:, 0] > 1e9)
-    code, found = checked("--check", "False")
+    code, found = checked("--check-alignment", "False")
     assert code == 1 and states(found)["in view"] == "error" and found["plan"] is None
     assert "Correct the errors above" in said(capsys)
     file = tmp_path / "mine.json"
     file.write_text("mine")
-    assert run_entry(monkeypatch, check.entrypoint, "--load-config", trained, *SMALL, "--json", file) == 1
+    assert run_entry(monkeypatch, check.entrypoint, "--load-config", trained, *SMALL, "--output-json", file) == 1
     assert "mine.json" in said(capsys) and file.read_text() == "mine"
 
 
@@ -88,7 +88,7 @@ def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, tr
 
 def test_texts_of_sam3_are_those_of_the_lift(checked, monkeypatch, trained, tmp_path, capsys) -> None:
     (tmp_path / "sam3").mkdir()
-    for texts in (("--queries", "mug"), ("--region-texts", "mug")):
+    for texts in (("--queries", "mug"), ("--sam3-prompts", "mug")):
         flags = ("--regions", "sam3", "--sam-model", tmp_path / "sam3", *texts)
         code, found = checked(*flags)
         assert code == 1 and states(found)["2D features"] == "error" and "weights" not in states(found)

@@ -53,7 +53,11 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
 
 
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
-    places = {"--json": tmp_path / "a.json", "--output-path": tmp_path / "a.npz", "--render-dir": tmp_path / "pictures"}
+    places = {
+        "--output-json": tmp_path / "a.json",
+        "--output-npz": tmp_path / "a.npz",
+        "--render-dir": tmp_path / "pictures",
+    }
     outputs = [word for pair in places.items() for word in pair]
     flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
@@ -83,7 +87,7 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
 
 
 def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
-    for output in ("--objects-dir", "--json", "--output-path", "--render-dir"):
+    for output in ("--objects-dir", "--output-json", "--output-npz", "--render-dir"):
         folder = tmp_path / output
         folder.mkdir()
         pictures, objects = output == "--render-dir", output == "--objects-dir"
@@ -109,7 +113,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
 
 def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()}
-    for flag in ("--json", "--output-path"):
+    for flag in ("--output-json", "--output-npz"):
         flags = ("--load-config", lifted, "--text", "red", flag, lifted, "--overwrite", True)
         assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
@@ -159,7 +163,7 @@ def clip(tmp_path_factory) -> tuple[object, ...]:
 
     folder = tmp_path_factory.mktemp("clip")
     write_clip(folder)
-    return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check", "False")
+    return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check-alignment", "False")
 
 
 def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path, monkeypatch, capsys):
@@ -168,9 +172,9 @@ def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path,
     config = tmp_path / "room" / "normlift" / "t" / "config.yml"
     manifest = open_run(config).field.manifest
     assert (manifest["features"]["kind"], manifest["encoder"]["text_template"]) == ("patches", "{}")
-    ask = ("--load-config", config, "--text", "table", "--json")
+    ask = ("--load-config", config, "--text", "table", "--output-json")
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
-    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--prompt-template", "ensemble") == 0
     monkeypatch.setattr("normlift_ns.encoders.open_clip_network.load_open_clip", None)
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
     plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
@@ -207,7 +211,7 @@ def test_fewer_smaller_and_rendered_views(little, tmp_path, monkeypatch):
 
 
 def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, capsys):
-    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--json", tmp_path / "a.json")
+    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--output-json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--render-dir", tmp_path / "pictures") == 1
     shown = said(capsys)
     assert "'9999'" in shown and "12" in shown and "'0000'" in shown and "'0011'" in shown
@@ -230,8 +234,8 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 @pytest.mark.slow
 def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
-    output = ("--load-config", little, "--k", "12", "--output-dir", tmp_path / "out")
-    exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
+    output = ("--load-config", little, "--vote-k", "12", "--output-dir", tmp_path / "out")
+    exporting = ("--encoder", "color", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
     assert len(list((tmp_path / "features").iterdir())) == 2 * 6
     texts = ("red", "sky blue")
@@ -239,7 +243,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
 
     monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
     importing = ("--features", "langsplat", "--features-dir", tmp_path / "features")
-    vectors = ("--text-vectors", tmp_path / "texts.npz")
+    vectors = ("--text-embeddings", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
@@ -279,7 +283,7 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     printed = said(capsys)
     run_dir = tmp_path / "outputs" / "room" / "normlift" / "a"
-    assert "2 of 8 images" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
+    assert "2 of 8 images" in printed and "--gsplat-version" in printed and str(run_dir) in printed
     found = open_run(run_dir / "config.yml").ask_stored()
     assert found is not None and found["red"].peak > 0.8
     asked = ("--load-config", run_dir / "config.yml")
@@ -315,5 +319,5 @@ def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, litt
         text = said(capsys).replace("│", " ")
         assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text
         assert not (ply.parent / "outputs").exists()
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check", "False") == 0
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check-alignment", "False") == 0
     assert (ply.parent / "outputs" / "room" / "normlift" / "a" / "config.yml").is_file()

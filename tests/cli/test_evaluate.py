@@ -133,7 +133,7 @@ def test_scannet_with_stand_in_names(scored, little_room, tmp_path):
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
     colours = [*little_room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
     names = [*NYU40.values(), "shower curtain"]
-    vectors = ("--text-vectors", stand_ins(tmp_path / "names.npz", dict(zip(names, [*colours, "cyan"]))))
+    vectors = ("--text-embeddings", stand_ins(tmp_path / "names.npz", dict(zip(names, [*colours, "cyan"]))))
     document = scored("scannet", path, "--study", "signals", "ablation", *vectors)
     results, settings, studies = (document[name] for name in ("results", "settings", "studies"))
     assert settings["scenes"] == ["scene0000_00"] and len(settings["missing_scenes"]) == 9
@@ -171,7 +171,7 @@ def test_lerf_with_stand_in_words(scored, little_lifted, little_room, capture, t
     words = {**{name: name for name in WANTED}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
     words |= {"floor": "light brown", "object": "chocolate brown", "things": "grey"}
     assert set(CANONICAL_NEGATIVES) <= set(words)
-    vectors = ("--text-vectors", stand_ins(tmp_path / "words.npz", words))
+    vectors = ("--text-embeddings", stand_ins(tmp_path / "words.npz", words))
     found = {
         rule: scored("lerf", labels, "--masking", rule, *vectors, *(("--study", "signals") if rule == "auto" else ()))
         for rule in ("background", "langsplat", "langsplat_composited", "auto")

@@ -99,7 +99,7 @@ def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
 def test_selection_and_rest_make_up_the_scene(scene_ply, lifted, tmp_path, monkeypatch, capsys) -> None:
     rows = {}
     for part in ("selection", "rest"):
-        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--part", part, "--text", "red")
+        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--select", part, "--text", "red")
         assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-filename", f"{part}.ply") == 0
         rows[part] = np.load(tmp_path / f"{part}_rows.npy")
         assert PlyData.read(tmp_path / f"{part}.ply")["vertex"].count == len(rows[part])
@@ -126,7 +126,10 @@ def test_objects_of_the_room(lifted: Path, tmp_path: Path, monkeypatch) -> None:
 
 def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
-    for flags, fact in ((("red", "--threshold", "1.5", "--part", "selection"), "no Gaussian"), (("oragne",), "orange")):
+    for flags, fact in (
+        (("red", "--threshold", "1.5", "--select", "selection"), "no Gaussian"),
+        (("oragne",), "orange"),
+    ):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
         assert not list((tmp_path / "x").glob("*"))
@@ -137,7 +140,7 @@ def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_p
 
 def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_path: Path, monkeypatch) -> None:
     flags = ("--load-config", lifted, "--output-dir", tmp_path)
-    for rest in ((), ("--text", "red", "--part", "selection", "--overwrite", True)):
+    for rest in ((), ("--text", "red", "--select", "selection", "--overwrite", True)):
         assert run_entry(monkeypatch, export.entrypoint, *flags, *rest) == 0
     count = PlyData.read(tmp_path / "splat.ply")["vertex"].count
     assert count == len(np.load(tmp_path / "splat_rows.npy")) < len(open_run(lifted).scene.gaussians) / 2
@@ -189,7 +192,7 @@ def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, m
     true = torch.isin(room.labels, torch.tensor([room.names.index(name) for name in ("red", "yellow")]))
     wanted = view_mask(run.scene, camera, true).numpy()
     assert ((found > 0) & wanted).sum() / ((found > 0) | wanted).sum() > 0.6
-    rest = ("--part", "rest", "--masks-dir", tmp_path / "rest", "--output-filename", "rest.ply")
+    rest = ("--select", "rest", "--masks-dir", tmp_path / "rest", "--output-filename", "rest.ply")
     assert run_entry(monkeypatch, export.entrypoint, *flags[:4], *rest) == 0
     assert np.array_equal(np.array(Image.open(tmp_path / "rest" / "0003.png")), 255 - found)
     assert answer.mask.any()

@@ -15,6 +15,7 @@ import tyro
 
 import normlift_ns
 from normlift_ns.cli import common, start
+from normlift_ns.options import VOTE_FLAGS, RefineConfig
 from research.reference import COMMANDS
 from tests.cli.conftest import run_entry
 from tests.conftest import project
@@ -34,7 +35,8 @@ def options(command: Any) -> set[str]:
             assert not found & options(hint)
             found |= options(hint)
         elif tyro.conf.Suppress not in more and not any(getattr(part, "metavar", None) for part in more):
-            found.add(f"--{field.name.replace('_', '-')}")
+            name = VOTE_FLAGS[field.name] if command is RefineConfig and field.name != "vote" else field.name
+            found.add(f"--{name.replace('_', '-')}")
     return found
 
 

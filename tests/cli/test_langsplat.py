@@ -107,7 +107,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
         if not features.exists():
             write_features(tmp_path / "room", features, vectors, views=24, seed=seed)
         name = f"{level}_{seed}"
-        importing = ("--features", "langsplat", "--features-dir", features, "--text-vectors", tmp_path / "texts.npz")
+        importing = ("--features", "langsplat", "--features-dir", features, "--text-embeddings", tmp_path / "texts.npz")
         flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
         assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
         config = trained.parents[2] / "normlift" / name / "config.yml"
@@ -121,7 +121,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
     scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}
     monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)  # another level has its evidence
     config, summed = lifted(0, "sum")
-    asking = ("--text", "sofa", "--negatives", "box", "table", "--json", tmp_path / "a.json")
+    asking = ("--text", "sofa", "--negatives", "box", "table", "--output-json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
     (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
     before, after = np.mean(list(scores.values()), axis=0)
@@ -148,10 +148,10 @@ def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     relative = Path(os.path.relpath(source, tmp_path))
-    flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
+    flags = ("--encoder", "color", "--output-dir", "lifted", "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
     config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
-    asked = ("--load-config", config, "--text", "orange", "crimson", "--json", "a.json")
+    asked = ("--load-config", config, "--text", "orange", "crimson", "--output-json", "a.json")
     assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
     assert "reliability" in capsys.readouterr().out
     orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
@@ -168,7 +168,7 @@ def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
     captures = SHARED / "captures"
     source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
     regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
-    flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
+    flags = ("--encoder", "color", *regions, "--output-dir", tmp_path, "--timestamp", "t")
     monkeypatch.chdir(captures)
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
     run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)

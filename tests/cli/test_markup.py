@@ -89,7 +89,16 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     """From the flag to the table, the files and their names; the colour is what the encoder reads."""
     texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
     folder = tmp_path / "[x] :smile: [/red]"
-    flags = ("--load-config", lifted, "--json", folder / "a.json", "--render-dir", folder, "--render-views", "0003")
+    flags = (
+        "--load-config",
+        lifted,
+        "--output-json",
+        folder / "a.json",
+        "--render-dir",
+        folder,
+        "--render-views",
+        "0003",
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
     shown = capsys.readouterr().out
     for text in texts:

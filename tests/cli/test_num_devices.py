@@ -45,7 +45,7 @@ def alone(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(trained: Path, output: Path, count: int, *flags: str) -> list[str]:
-    given = ("--load-config", str(trained), "--encoder", "colour", "--device", "cpu", "--timestamp", "t")
+    given = ("--load-config", str(trained), "--encoder", "color", "--device", "cpu", "--timestamp", "t")
     return [*LIFT, *given, "--output-dir", str(output), "--num-devices", str(count), *flags]
 
 

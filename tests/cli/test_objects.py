@@ -1,4 +1,4 @@
-"""ns-normlift-query --objects and --why, honest answers in its table, and ns-normlift-export --part clean."""
+"""ns-normlift-query --objects and --explain, honest answers in its table, and ns-normlift-export --select clean."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def written(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("objects")
     flags = ("--load-config", lifted, "--text", "red", "yellow", "--objects", "--objects-dir", folder)
     with pytest.MonkeyPatch.context() as patch:
-        assert run_entry(patch, query.entrypoint, *flags, "--metres-per-unit", 0.5) == 0
+        assert run_entry(patch, query.entrypoint, *flags, "--meters-per-unit", 0.5) == 0
     return folder
 
 
@@ -120,8 +120,8 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
     assert (unnamed.text, unnamed.gaussians) == ("", found.objects[0].gaussians)
     assert run.catalogue(answer.mask & False).objects == ()
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="metres_per_unit"):
-            run.catalogue(answer, metres_per_unit=wrong)
+        with pytest.raises(InputError, match="meters_per_unit"):
+            run.catalogue(answer, meters_per_unit=wrong)
 
 
 def test_the_page_explains_every_column() -> None:
@@ -132,7 +132,7 @@ def test_the_page_explains_every_column() -> None:
 
 def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     pictures, table = tmp_path / "why", tmp_path / "table.json"
-    flags = ("--load-config", lifted, "--text", "red", "--why", "--why-dir", pictures, "--json", table)
+    flags = ("--load-config", lifted, "--text", "red", "--explain", "--explain-dir", pictures, "--output-json", table)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = said(capsys)
     assert "C_inter 0.9" in shown
@@ -150,7 +150,7 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
 
 
 def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    flags = ("--load-config", lifted, "--text", "red", "bright magenta", "--json", tmp_path / "x.json")
+    flags = ("--load-config", lifted, "--text", "red", "bright magenta", "--output-json", tmp_path / "x.json")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = said(capsys)
     assert "bright magenta: probably not in this scene" in shown
@@ -159,13 +159,13 @@ def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypa
     assert (there["stands_out"], absent["stands_out"]) == (True, False)
     assert absent["histogram"]["top"] < 0.9 < there["histogram"]["top"]
     assert sum(there["histogram"]["counts"]) == sum(absent["histogram"]["counts"]) > 1000
-    nothing = ("--load-config", lifted, "--text", "bright magenta", "--why")
+    nothing = ("--load-config", lifted, "--text", "bright magenta", "--explain")
     assert run_entry(monkeypatch, query.entrypoint, *nothing, "--threshold", "0.999") == 0
     assert "bright magenta: nothing is selected" in said(capsys)
 
 
 def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch) -> None:
-    flags = ("--load-config", lifted, "--text", "red", "--threshold", "auto", "--json", tmp_path / "x.json")
+    flags = ("--load-config", lifted, "--text", "red", "--threshold", "auto", "--output-json", tmp_path / "x.json")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     document = json.loads((tmp_path / "x.json").read_text())
     (row,) = document["queries"]
@@ -179,13 +179,22 @@ def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch)
 def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     rows = {}
     for part in ("scene", "clean"):
-        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", "--part", part)
+        flags = (
+            "--load-config",
+            lifted,
+            "--output-dir",
+            tmp_path,
+            "--output-filename",
+            f"{part}.ply",
+            "--select",
+            part,
+        )
         assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
         rows[part] = np.load(tmp_path / f"{part}_rows.npy")
     mask = open_run(lifted).floaters().mask
     assert np.array_equal(np.setdiff1d(rows["scene"], rows["clean"]), np.flatnonzero(mask.numpy()))
     assert 0 < int(mask.sum()) < 0.05 * len(mask)
     assert f"{int(mask.sum()):,} likely floaters are left out" in said(capsys)
-    limit = ("--floater-limit", "100", "--overwrite")
+    limit = ("--floater-threshold", "100", "--overwrite")
     assert run_entry(monkeypatch, export.entrypoint, *flags, *limit) == 0
     assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), rows["scene"])

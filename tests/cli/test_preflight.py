@@ -51,9 +51,9 @@ def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"normlift_ns.{name}", None)
 
 
-COLOUR = ("--encoder", "colour")
+COLOUR = ("--encoder", "color")
 LIFT = [
-    ("--encoder colour --beta nan", "--beta", "got nan"),
+    ("--encoder color --reliability-beta nan", "--reliability-beta", "got nan"),
     ("--encoder words", "'words'", "--encoder"),
     ("--queries oragne", "oragne", "orange"),
     ("--threshold 0.5", "--threshold"),
@@ -74,7 +74,7 @@ LIFT = [
     ("--features langsplat", "'langsplat'", "--features-dir"),
     ("--features langsplat --features-dir loop", "'loop', given with --features-dir"),
     ("--features langsplat --features-dir room --level x", "s, m, l, default, sum for langsplat, got 'x'"),
-    ("--features langsplat --features-dir room --text-vectors fifo", "fifo, given with --text-vectors", "pipe"),
+    ("--features langsplat --features-dir room --text-embeddings fifo", "fifo, given with --text-embeddings", "pipe"),
     ("--encoder open_clip --encoder-pretrained missing.pt", "missing.pt"),
     (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
 ]
@@ -100,36 +100,36 @@ QUERY = [
     (("--text", ""), "prompt 1 of 1 in --text"),
     (("--text", "a", "--negatives", "b", ""), "prompt 2 of 2 in --negatives"),
     ("--text a --min-reliability nan", "--min-reliability must be in 0..1, got nan"),
-    ("--text a --json room", "room exists", "--json"),
-    ("--text a --json room --overwrite True", "room, given with --json", "not a regular file"),
-    ("--text a --json file/x", "file, named with --json"),
-    ("--text a --json n --output-path n", "--json and --output-path", ", n"),
+    ("--text a --output-json room", "room exists", "--output-json"),
+    ("--text a --output-json room --overwrite True", "room, given with --output-json", "not a regular file"),
+    ("--text a --output-json file/x", "file, named with --output-json"),
+    ("--text a --output-json n --output-npz n", "--output-json and --output-npz", ", n"),
     ("--text a --render-dir file", "file, named with --render-dir"),
-    ("--text a --why --why-dir file", "file, named with --why-dir"),
+    ("--text a --explain --explain-dir file", "file, named with --explain-dir"),
     ("--text a --objects --objects-dir file", "file, named with --objects-dir"),
-    ("--text a --text-vectors none.npz", "none.npz, given with --text-vectors"),
-    ("--text a --render-views 9999 --json a.json", "--render-views", "--render-dir"),
+    ("--text a --text-embeddings none.npz", "none.npz, given with --text-embeddings"),
+    ("--text a --render-views 9999 --output-json a.json", "--render-views", "--render-dir"),
     ("--text a --objects-dir x", "--objects-dir", "--objects"),
-    ("--text a --metres-per-unit 2", "--metres-per-unit", "--objects"),
-    ("--text a --why-dir x", "--why-dir", "--why True"),
+    ("--text a --meters-per-unit 2", "--meters-per-unit", "--objects"),
+    ("--text a --explain-dir x", "--explain-dir", "--explain True"),
     ("--text a --segment-views 3", "--segment-views", "--segment sam3"),
-    ("--stdin --why", "--why", "--text", "--stdin"),
+    ("--stdin --explain", "--explain", "--text", "--stdin"),
     ("--text a --stdin", "--text and --stdin"),
     ("--interactive", "--interactive", "terminal"),
     ("", "no prompts"),
     ("--stdin --interactive True", "--stdin", "--interactive"),
-    ("--stdin --json a.json", "--json", "--text", "--stdin"),
-    ("--interactive --save", "--save", "--text", "--interactive"),
+    ("--stdin --output-json a.json", "--output-json", "--text", "--stdin"),
+    ("--interactive --save-query", "--save-query", "--text", "--interactive"),
 ]
 EXPORT = [
-    ("--part selection", "--part selection", "--text"),
+    ("--select selection", "--select selection", "--text"),
     ("--transfer file", "--transfer", "--text"),
-    ("--part nothing", "--part", "'nothing'"),
-    ("--reach nan", "--reach", "got nan"),
+    ("--select nothing", "--select", "'nothing'"),
+    ("--object-max-gap nan", "--object-max-gap", "got nan"),
     ("--output-dir file", "file, named with --output-dir"),
     ("--output-filename /", "--output-filename"),
     ("--text a --transfer none.ply", "none.ply, given with --transfer"),
-    ("--text a --part clean --masks-dir m", "--masks-dir"),
+    ("--text a --select clean --masks-dir m", "--masks-dir"),
 ]
 EVAL = [
     ("--protocol masks --labels none", "none, given with --labels"),
@@ -147,7 +147,7 @@ VIEW = [
     ("--device tpu", "--device", "'tpu'"),
     ("--host 192.0.2.1", "--host 192.0.2.1"),
     (f"--host {'a' * 70}", f"--host {'a' * 70}"),
-    ("--text-vectors none.npz", "none.npz, given with --text-vectors"),
+    ("--text-embeddings none.npz", "none.npz, given with --text-embeddings"),
 ]
 
 
@@ -243,10 +243,10 @@ def test_places_of_a_config_and_others_are_looked_at_without_harm(config, tmp_pa
 
 
 def test_options_of_what_is_off_are_refused():
-    for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_least": 0.0}.items():
+    for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_min_agreement": 0.0}.items():
         with pytest.raises(InputError, match=f"--{name.replace('_', '-')} is for --consensus True"):
             check_unused_options(LiftOptions(consensus=False, **{name: value}))
-    with pytest.raises(InputError, match="--prior is for --vote posterior"):
+    with pytest.raises(InputError, match="--vote-prior is for --vote posterior"):
         check_unused_options(LiftOptions(vote=RefineConfig(vote="paper", prior=2.0)))
     check_unused_options(
         LiftOptions(consensus=True, consensus_power=2.0, vote=RefineConfig(vote="posterior", prior=2.0))

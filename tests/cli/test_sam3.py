@@ -42,7 +42,18 @@ def in_copy(own: Path) -> Path:
 
 def test_sam3_answers_beside_the_run(own: Path, weights: Path, tmp_path, monkeypatch, capsys) -> None:
     table, arrays, lifted = tmp_path / "table.json", tmp_path / "arrays.npz", in_copy(own)
-    flags = ("--load-config", lifted, "--text", "red", "--json", table, "--output-path", arrays, "--segment", "sam3")
+    flags = (
+        "--load-config",
+        lifted,
+        "--text",
+        "red",
+        "--output-json",
+        table,
+        "--output-npz",
+        arrays,
+        "--segment",
+        "sam3",
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--segment-model", weights, "--segment-views", 4) == 0
     shown = said(capsys)
     assert "SAM 3" in shown and "50%" in shown
@@ -65,7 +76,7 @@ def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
     kept = lifted.parents[1] / ".cache" / "masks"
 
     def ask(*more: str) -> dict:
-        flags = ("--load-config", lifted, "--json", table, "--overwrite", "True", "--segment", "sam3")
+        flags = ("--load-config", lifted, "--output-json", table, "--overwrite", "True", "--segment", "sam3")
         flags = (*flags, "--segment-model", weights, "--segment-views", 4)
         assert run_entry(monkeypatch, query.entrypoint, *flags, *more) == 0
         return json.loads(table.read_text())["queries"][0]["segment"]
@@ -91,11 +102,11 @@ def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
 
 
 def test_what_sam3_finds_can_be_the_regions(little: Path, weights: Path, tmp_path) -> None:
-    source = SourceOptions(encoder="colour", regions="sam3", sam_model=str(weights))
+    source = SourceOptions(encoder="color", regions="sam3", sam_model=str(weights))
     how = LiftOptions(max_views=4, refine=False, consensus=False)
-    run = lift_run(little, source=source, lift=how, queries=["red"], output_dir=tmp_path, check=False)
+    run = lift_run(little, source=source, lift=how, queries=["red"], output_dir=tmp_path, check_alignment=False)
     manifest = run.field.manifest
-    assert manifest["source"]["region_texts"] == ["red"] or manifest["source"]["region_texts"] == ("red",)
+    assert manifest["source"]["sam3_prompts"] == ["red"] or manifest["source"]["sam3_prompts"] == ("red",)
     assert manifest["features"]["regions"]["texts"] == ["red"]
     seen = float((run.field.scalars.norm > 0).float().mean())
     assert 0 < seen < 0.7  # the rest is unlabelled

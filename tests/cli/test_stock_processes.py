@@ -46,7 +46,7 @@ def stranger(little: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ply = write_ply(folder / "splat.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
     world = little.parent / "dataparser_transforms.json"
     cameras = SplatOptions(transforms=folder / "room", world_transform=world, rasterize_mode="classic")
-    source = SourceOptions(encoder="colour", region_count=64)
+    source = SourceOptions(encoder="color", region_count=64)
     options = {"timestamp": "t", "queries": ("red",), "source": source, "output_dir": folder / "outputs"}
     config = NormLift(load_ply=ply, splat=cameras, **options).main().config
     ply.unlink()  # it is not needed any more
@@ -123,7 +123,7 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
 def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
     shutil.copytree(lifted.parent, copy.parent)
-    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save", "True")
+    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save-query", "True")
     rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
     stored = load_query(copy.parent / "normlift")

@@ -78,7 +78,7 @@ def test_words_for_another_command_stay() -> None:
     words = ["list.txt", "--quiet", "False", "--", "--quiet", "--log-file", "x"]
     assert split_output_flags(words) == (["list.txt", *words[3:]], OutputSettings())
     with pytest.raises(InputError):
-        split_output_flags(["--log-file", "--k"])
+        split_output_flags(["--log-file", "--vote-k"])
 
 
 def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
@@ -101,7 +101,10 @@ def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
     program = "from normlift_ns.cli.start import lift; lift()"
     config = tmp_path / ("long-" * 30) / "no.yml"
-    for flags, fact in ((("--load-config", str(config)), str(config)), (("--k", "many"), "--k cannot be 'many'.")):
+    for flags, fact in (
+        (("--load-config", str(config)), str(config)),
+        (("--vote-k", "many"), "--vote-k cannot be 'many'."),
+    ):
         master, slave = pty.openpty()
         words = [sys.executable, "-c", program, *flags]
         subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
@@ -135,8 +138,8 @@ CASES = (
     (lift, "--load-config x y", "Unknown options: y.", ALL),
     (lift, "--load-config", "--load-config needs a value.", ALL),
     (lift, "--refine perhaps", "--refine cannot be 'perhaps'.", "'True', 'False'", ALL),
-    (lift, "--k many", "--k cannot be 'many'. --k INT: "),
-    (lift, "--beta high", "--beta cannot be 'high'. --beta FLOAT: "),
+    (lift, "--vote-k many", "--vote-k cannot be 'many'. --vote-k INT: "),
+    (lift, "--reliability-beta high", "--reliability-beta cannot be 'high'. --reliability-beta FLOAT: "),
     (lift, "--max-views few", "--max-views cannot be 'few'. --max-views {None}|INT: "),
     (query, "--load-config x --threshold low", "--threshold cannot be 'low'. --threshold"),
     (export, "--load-config x", "command needs: --output-dir PATH: "),

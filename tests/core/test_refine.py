@@ -309,7 +309,9 @@ def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
     assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0))
-    manifest = {"options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "beta": 2.0}}
+    manifest = {
+        "options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "reliability_beta": 2.0}
+    }
     own = recorded_vote(manifest)
     assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1))
     assert recorded_vote({}).config == RefineConfig()

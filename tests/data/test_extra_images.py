@@ -96,7 +96,7 @@ def test_worlds_that_differ_are_refused_by_name(scene, larger) -> None:
 
 
 def test_a_lifted_run_knows_them(scene, larger, tmp_path: Path) -> None:
-    options = {"source": SourceOptions(encoder="colour", regions="grid", region_count=48), "device": "cpu"}
+    options = {"source": SourceOptions(encoder="color", regions="grid", region_count=48), "device": "cpu"}
     how = {"lift": LiftOptions(refine=False), "output_dir": tmp_path / "out", "check": False, **options}
     run = lift_run(add_extra_images(scene, larger(TURNED)), **how)
     again = open_run(run.config)

@@ -38,7 +38,7 @@ from tests.random_scenes import generator
 ROUNDED = 5e-4
 """Where the Gaussians themselves were moved to another world in float32, single pixels cross thresholds: 9e-5 seen."""
 OPTIONS = {
-    "source": SourceOptions(encoder="colour", regions="grid"),
+    "source": SourceOptions(encoder="color", regions="grid"),
     "lift": LiftOptions(storage="evidence", max_views=4, vote=RefineConfig(k=12)),
 }
 
@@ -104,7 +104,7 @@ def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_pa
 def given(native) -> SplatOptions:
     """Images and held-out names of the run."""
     return SplatOptions(
-        colmap=Path("p"), images=native.location.folder / "images", holdout=tuple(native.held_out.names),
+        colmap=Path("p"), images=native.location.folder / "images", eval_images=tuple(native.held_out.names),
         gsplat_normalize=False,
     )  # fmt: skip
 
@@ -130,7 +130,7 @@ def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, ki
         write_gsplat(tmp_path / "ckpt_29999_rank1.pt", rows_of(splat, slice(4000, None)))
     elif kind == "moved":  # the training turned and shifted the cameras a little; the project has them as they were
         moves = 0.05 * torch.randn(len(native.train), 9, generator=generator(0), dtype=torch.float64)
-        frames = _before(frames, moves, given.holdout)
+        frames = _before(frames, moves, given.eval_images)
         write_gsplat(path, splat, pose_adjust={"embeds.weight": moves, "identity": torch.zeros(6)})
     else:  # the project lies in another world, and the training normalized it
         matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
@@ -206,7 +206,7 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     run = lift_run(scene, timestamp="t", **OPTIONS)
     assert run.folder == tmp_path / "outputs" / "capture" / "normlift" / "t"
     path.unlink()  # the run holds its own copy
-    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check=False, **OPTIONS)
+    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check_alignment=False, **OPTIONS)
     expected = of_native.ask("red", "yellow")
     again = open_run(run.config)
     assert again.scene.train.names == scene.train.names
@@ -222,7 +222,7 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     assert np.abs(again.render("0003").numpy().astype(int) - photograph).mean() < 3
     rows = again.export(tmp_path / "again.ply", found["red"])
     assert 0.9 * int(found["red"].mask.sum()) < len(rows) <= int(found["red"].mask.sum())  # all but the faintest
-    second = lift_run(again.config, timestamp="second", check=False, **OPTIONS)  # and can be lifted again
+    second = lift_run(again.config, timestamp="second", check_alignment=False, **OPTIONS)  # and can be lifted again
     assert torch.equal(second.ask("red").selected, again.ask("red").selected)
 
     capture.rename(tmp_path / "elsewhere")
@@ -298,10 +298,10 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
-        ({**every, "test_every": 8, "holdout": ("0001",)}, "give only one of them"),
-        ({**every, "holdout": ("1.5",)}, r"1\.5 .* between 0 and 1"),
-        ({**every, "holdout": ("list.txt",)}, r"--holdout .*list\.txt"),
-        ({**every, "holdout": ("cat",)}, "--holdout .*cat"),
+        ({**every, "test_every": 8, "eval_images": ("0001",)}, "give only one of them"),
+        ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
+        ({**every, "eval_images": ("list.txt",)}, r"--eval-images .*list\.txt"),
+        ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
         ({"transforms": "t.json"}, "--colmap"),
         (every, "0 points"),
@@ -313,8 +313,8 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
 
 
 def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
-    options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), holdout=())
-    for count, hint in ((12, "--test-every 8"), (5, "--test-every or --holdout")):
+    options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), eval_images=())
+    for count, hint in ((12, "--test-every 8"), (5, "--test-every or --eval-images")):
         moves = {"embeds.weight": torch.zeros(count, 9)}
         path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
         with pytest.raises(InputError, match=f" {count} training views.*{hint}"):
@@ -325,7 +325,7 @@ def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_
 def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames, given, tmp_path: Path) -> None:
     project = write_colmap(tmp_path / "p", frames, "PINHOLE")
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    base = replace(given, colmap=project, holdout=())
+    base = replace(given, colmap=project, eval_images=())
     (tmp_path / "images_2").mkdir()
     for frame in frames:  # of other format, as gsplat's trainer makes them
         Image.open(frame.file).resize((81, 60)).save(tmp_path / "images_2" / f"{frame.file.stem}.webp")
@@ -340,8 +340,8 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
     shares = [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]  # as ns-train
     for more, expected in (
         ({"test_every": 8}, [names[0], names[8]]),  # as gsplat
-        ({"holdout": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
-        ({"holdout": ("0.1",)}, shares),
+        ({"eval_images": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
+        ({"eval_images": ("0.1",)}, shares),
     ):
         scene = open_splat(path, replace(base, **more))
         assert scene.held_out.names == expected
@@ -391,7 +391,7 @@ def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
     scene = open_scene(config)
     path = write_ply(tmp_path / "s.ply", ply_columns(SplatParameters(**scene.parameters)))
     folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
-    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
+    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, eval_images=("0.1",)))
     assert of_json.train.names == scene.train.names
     assert difference(scene, of_json, (0, -1)) < 1e-5
     rigid = []

@@ -16,7 +16,7 @@ def test_options_reach_the_regions(tmp_path):
     (tmp_path / "sam.pth").write_text("")
     sam, files = str(tmp_path / "sam.pth"), {"regions": "files", "regions_dir": tmp_path, "level": "2"}
     for options, expected in (
-        ({"encoder": "colour"}, Superpixels(256)),
+        ({"encoder": "color"}, Superpixels(256)),
         ({"regions_dir": tmp_path}, LabelFiles(tmp_path)),
         ({"regions": "superpixel", "region_count": 9}, Superpixels(9)),
         ({"regions": "grid", "region_count": 9}, Grid(9)),
@@ -32,7 +32,7 @@ def test_options_reach_the_regions(tmp_path):
     (tmp_path / "moved").mkdir()
     assert LabelFiles(tmp_path).identity == LabelFiles(tmp_path / "moved").identity  # names no place
     assert [x.identity["kind"] for x in (Superpixels(9), LabelFiles(tmp_path))] == ["superpixel", "files"]
-    source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", text_template="a {}"))
+    source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", prompt_template="a {}"))
     assert source == PatchFeatures(OpenClipEncoder("ViT-B-32", "openai", template="a {}"), 1024)
     assert make_source(SourceOptions(region_count=9)) == PatchFeatures(OpenClipEncoder(), 9)
 
@@ -43,19 +43,19 @@ def test_auto_takes_the_best_that_is_there(tmp_path, empty_hub):
 
     assert chosen() == chosen("cuda") == "patches"
     assert chosen(encoder_model="RN50") == "superpixel"
-    assert chosen(encoder="colour") == "superpixel"
+    assert chosen(encoder="color") == "superpixel"
     assert chosen(regions_dir=tmp_path) == "files"
     assert chosen(sam_model="weights") == "sam"
     assert chosen(regions="grid", regions_dir=tmp_path) == "grid"
     for name in ("config.json", "model.safetensors"):
         put(empty_hub, "facebook/sam-vit-huge", name)
-    assert chosen("cuda") == "sam" and chosen("cuda", encoder="colour") == "superpixel"
+    assert chosen("cuda") == "sam" and chosen("cuda", encoder="color") == "superpixel"
     assert chosen() == "patches"
 
 
 def test_bad_options_say_what_to_do(tmp_path):
     for options, parts in (
-        ({"regions": "patches"}, ["--regions patches", "--encoder colour"]),
+        ({"regions": "patches"}, ["--regions patches", "--encoder color"]),
         ({"regions": "patches", "level": "l"}, ["--level l", '"patches"']),
         ({"regions": "sam", "level": "2"}, ["s, m, l, default", "'2'"]),
         ({"regions": "sam", "regions_dir": Path()}, ["--regions-dir .", '"sam"']),
@@ -71,4 +71,4 @@ def test_bad_options_say_what_to_do(tmp_path):
         ({"features": "langsplat"}, ["--features langsplat", "--features-dir"]),
         ({"features_dir": Path("f")}, ["--features-dir f", "--features langsplat"]),
     ):
-        refused(lambda options=options: make_source(SourceOptions(**{"encoder": "colour", **options})), *parts)
+        refused(lambda options=options: make_source(SourceOptions(**{"encoder": "color", **options})), *parts)

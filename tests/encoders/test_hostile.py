@@ -177,7 +177,7 @@ def test_entries_of_text_vectors_are_checked_before_they_are_read(tmp_path: Path
     ):
         (tmp_path / "t.npz").write_bytes(content)
         refused(lambda: TextEmbeddingFile(tmp_path / "t.npz").text(["fox"]), "t.npz", *parts)
-    refused(lambda: TextEmbeddingFile(Path("nowhere.npz")), "nowhere.npz", "--text-vectors", error=FileNotFoundError)
+    refused(lambda: TextEmbeddingFile(Path("nowhere.npz")), "nowhere.npz", "--text-embeddings", error=FileNotFoundError)
 
 
 def test_vectors_of_any_length_become_unit_vectors(tmp_path: Path) -> None:

@@ -283,13 +283,13 @@ def test_flags_make_the_source(folder):
     assert found == LangSplat(folder, OpenClipEncoder(), "sum", "skip", resample=True)
     assert json.loads(json.dumps(found.identity)) == found.identity
     np.savez(folder / "texts.npz", cup=np.ones(D))
-    found = make_source(SourceOptions(**options, text_vectors=folder / "texts.npz"))
+    found = make_source(SourceOptions(**options, text_embeddings=folder / "texts.npz"))
     assert torch.allclose(found.text(["cup"]), torch.full((1, D), D**-0.5))
     for given, parts in (
         ({**options, "regions": "grid"}, ["--regions", "--regions-dir", "--features"]),
         ({**options, "regions_dir": folder}, ["leave one of them out"]),
-        ({**options, "encoder": "colour"}, ["--encoder colour", "--encoder-model"]),
-        ({"encoder": "colour", "text_vectors": folder / "texts.npz"}, ["--text-vectors", "--features langsplat"]),
+        ({**options, "encoder": "color"}, ["--encoder color", "--encoder-model"]),
+        ({"encoder": "color", "text_embeddings": folder / "texts.npz"}, ["--text-embeddings", "--features langsplat"]),
     ):
         refused(lambda given=given: make_source(SourceOptions(**given)), *parts)
 

@@ -168,7 +168,7 @@ def test_bad_weight_files_are_named_with_a_remedy(clip_weights, tmp_path):
         save(wrong, path)
         for content in (path.read_bytes(), whole[: len(whole) // 2], b"", pickle.dumps([1, 2])):
             path.write_bytes(content)
-            parts = (str(path), NAME, "--encoder-model", "--encoder colour")
+            parts = (str(path), NAME, "--encoder-model", "--encoder color")
             refused(lambda path=path: OpenClipEncoder(NAME, str(path)).text(["red"]), *parts)
     torch.save({"state_dict": Bomb(str(tmp_path / "ran"))}, tmp_path / "bad.pt")  # pickles run no code
     refused(lambda: OpenClipEncoder(NAME, str(tmp_path / "bad.pt")).text(["red"]), "bad.pt")
@@ -179,7 +179,7 @@ def test_absent_weights_give_one_message(empty_hub):
     encoder = make_encoder(SourceOptions())
     assert encoder.identity["pretrained"] == "laion2b_s34b_b88k"
     parts = ("'laion2b_s34b_b88k'", "ViT-B-16", "laion/CLIP-ViT-B-16-laion2B-s34B-b88K", "Name or service not known")
-    remedies = ("--encoder-pretrained FILE", "--encoder colour")
+    remedies = ("--encoder-pretrained FILE", "--encoder color")
     refused(lambda: encoder.text(["red"]), *parts, *remedies, error=FileNotFoundError)
 
 
@@ -213,9 +213,9 @@ def test_unknown_names_are_refused_before_loading(monkeypatch):
         ({"encoder_model": "ViT-B-16-SigLIP"}, ValueError, ["--encoder-model", f"timm {timm.__version__}", "ViT-L-14"]),
         ({"encoder_pretrained": "laion2b"}, ValueError, ["'laion2b'", "laion2b_s34b_b88k"]),
         ({"encoder_pretrained": "my/clip"}, FileNotFoundError, ["my/clip does not exist"]),
-        ({"encoder_pretrained": "clip.safetensors"}, FileNotFoundError, ["clip.safetensors does not exist", "colour"]),
-        ({"text_template": "a photo"}, ValueError, ["'a photo'", "{}"]),
-        ({"encoder": "colour", "text_template": "a {}"}, ValueError, ["--text-template 'a {}'", "--encoder open_clip"]),
+        ({"encoder_pretrained": "clip.safetensors"}, FileNotFoundError, ["clip.safetensors does not exist", "color"]),
+        ({"prompt_template": "a photo"}, ValueError, ["'a photo'", "{}"]),
+        ({"encoder": "color", "prompt_template": "a {}"}, ValueError, ["--prompt-template 'a {}'", "open_clip"]),
         ({"crop_fill": "grey"}, ValueError, ["crop_fill", "black, white", "'grey'"]),
     ):
         refused(lambda options=options: make_encoder(SourceOptions(**options)), *parts, error=error)

@@ -35,7 +35,7 @@ from tests.conftest import project
 from tests.encoders.tiny import refused
 
 ROOT = Path(__file__).parents[2]
-OURS = ["colour", "metaclip2", "open_clip", "siglip", "siglip2"]
+OURS = ["color", "metaclip2", "open_clip", "siglip", "siglip2"]
 
 
 def install(folder: Path, package: str, points: str, code: str = "") -> None:
@@ -70,7 +70,7 @@ def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
-        assert (kind.rule, kind.threshold) == (("cosine" if name == "colour" else "lerf"), 0.5)
+        assert (kind.rule, kind.threshold) == (("cosine" if name == "color" else "lerf"), 0.5)
         assert isinstance(kind, encoders.EncoderKind)  # where packages of others import it from
 
 
@@ -78,7 +78,7 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     install(tmp_path, "plug", points(other="plug:KIND", same="plug:KIND"))
     install(tmp_path, "two", points(same="two:KIND"))
     monkeypatch.syspath_prepend(tmp_path)
-    parts = ("'clip'", "--encoder", "colour, metaclip2, open_clip, other, same, siglip, siglip2")
+    parts = ("'clip'", "--encoder", "color, metaclip2, open_clip, other, same, siglip, siglip2")
     refused(lambda: encoder_kind("clip"), *parts)
     refused(lambda: check_source_options(SourceOptions(encoder="clip"), ()), *parts)
     assert find_encoder_kind("clip") is None and find_encoder_kind(3) is None
@@ -142,7 +142,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
     entry = f"[{MASK_SOURCES.group}]\nhalves = halves_plug:HALVES\nlangsplat = halves_plug:HALVES\n"
 
     def options(**more: Any) -> SourceOptions:
-        return SourceOptions(**{"encoder": "colour", "regions": "halves", **more})
+        return SourceOptions(**{"encoder": "color", "regions": "halves", **more})
 
     refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
     with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
@@ -204,11 +204,21 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
         program = [str(Path(sys.executable).with_name(command)), *map(str, words)]
         return subprocess.run(program, env=paths, capture_output=True, text=True, check=False)
 
-    few = ("--max-views", 4, "--lift-downscale", 2, "--k", 6, "--region-count", 200, "--timestamp", "rgb")
+    few = ("--max-views", 4, "--lift-downscale", 2, "--vote-k", 6, "--region-count", 200, "--timestamp", "rgb")
     lifted = trained.parents[2] / "normlift" / "rgb" / "config.yml"
     done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
     assert done.returncode == 0, done.stdout + done.stderr
-    asked = ("--load-config", lifted, "--json", tmp_path / "a.json", "--overwrite", "True", "--text", "red", "yellow")
+    asked = (
+        "--load-config",
+        lifted,
+        "--output-json",
+        tmp_path / "a.json",
+        "--overwrite",
+        "True",
+        "--text",
+        "red",
+        "yellow",
+    )
     done = run("ns-normlift-query", *asked)
     assert done.returncode == 0, done.stdout + done.stderr
     red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]
@@ -216,4 +226,4 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     done = run("ns-normlift-query", *asked[:2], "--text", "purple")
     assert done.returncode == 1 and "text 'purple' is none of red, green, blue, yellow" in done.stderr
     done = run("ns-normlift-query", *asked[:2], "--text", "red", here=False)
-    assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-vectors" in done.stderr
+    assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-embeddings" in done.stderr

@@ -35,7 +35,7 @@ from normlift_ns.rasterization.backend import RasterJob
 from tests.random_scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
-OPTIONS = SourceOptions(encoder="colour", regions="grid", region_count=12)
+OPTIONS = SourceOptions(encoder="color", regions="grid", region_count=12)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,9 @@ def lifted(tmp_path_factory) -> EvaluatedRun:
     masks = [torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 3 * i for i in range(VIEWS)]
     photographs = Photographs([f"{i}.png" for i in range(VIEWS)], orbit(VIEWS), masks=masks)
     scene = made_scene(random_scene(N, dtype=torch.float32, size=0.3), photographs)
-    options = LiftOptions(refine=False, max_views=4, consensus=False, consensus_least=0.0)  # cells count as things
+    options = LiftOptions(
+        refine=False, max_views=4, consensus=False, consensus_min_agreement=0.0
+    )  # cells count as things
     found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
     return EvaluatedRun(scene, replace(found, manifest=manifest), make_source(OPTIONS), False, folder)
@@ -151,7 +153,12 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
 def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     """As `lift_scene` lifts them, numbers that vote included."""
     options = LiftOptions(
-        refine=False, max_views=4, consensus=True, consensus_power=power, consensus_sample=9, consensus_least=0.0
+        refine=False,
+        max_views=4,
+        consensus=True,
+        consensus_power=power,
+        consensus_sample=9,
+        consensus_min_agreement=0.0,
     )
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}

@@ -80,7 +80,7 @@ def lifted(scene: Any, used: list[int], *, blank: tuple[int, ...] = ()) -> Seman
         "views_lifted": [scene.train.names[i] for i in used],
         "views_without_features": [scene.train.names[i] for i in blank],
         "cameras": camera_summary(scene.train.cameras),
-        "options": {"beta": 1.0, "weight_power": 1, "vote": {"k": 6}},
+        "options": {"reliability_beta": 1.0, "weight_power": 1, "vote": {"k": 6}},
     }
     return SemanticField.build(found, scene.gaussians.means, provenance=facts)
 

@@ -86,7 +86,7 @@ def test_without_a_truth_there_are_no_accuracies():
 
 def test_sweeps_contain_and_mark_the_default_and_the_run():
     config = replace(RefineConfig(), k=17, tau=0.123)
-    own = recorded_vote({"options": {"beta": 3.5, "vote": vars(config)}})
+    own = recorded_vote({"options": {"reliability_beta": 3.5, "vote": vars(config)}})
     labels = [each[0].label for each in sweeps([own])]
     for parameter, values in SWEEPS.items():
         some = [label for label in labels if label["parameter"] == parameter]

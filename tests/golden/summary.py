@@ -30,7 +30,20 @@ from safetensors.numpy import load_file
 
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
-VOTE = ("--vote", "paper", "--k", 36, "--sigma-d", 1, "--tau", 0.95, "--gamma", 0.4, "--delta", 0)
+VOTE = (
+    "--vote",
+    "paper",
+    "--vote-k",
+    36,
+    "--vote-sigma-d",
+    1,
+    "--vote-tau",
+    0.95,
+    "--vote-gamma",
+    0.4,
+    "--vote-delta",
+    0,
+)
 """Of version 0.1, which knew no consensus."""
 SINCE = {"stands_out", "nearest", "suggested_threshold", "histogram"}
 """What an answer tells since."""
@@ -45,13 +58,13 @@ def run_commands(scene: str, config: Path, folder: Path) -> None:
     """Lifts a run (8 views, half resolution, colour encoder, the method of version 0.1), asks it and exports what is
     found.
     """
-    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, "--consensus", False, *VOTE)
+    lift = ("--encoder", "color", "--max-views", 8, "--lift-downscale", 2, "--consensus", False, *VOTE)
     place = ("--queries", *TEXTS[scene], "--timestamp", "golden", "--output-dir", folder)
     _command("ns-normlift", "--load-config", config, *lift, *place)
     (lifted,) = folder.glob("*/normlift/golden/config.yml")
-    files = ("--json", folder / "answers.json", "--output-path", folder / "answers.npz")
+    files = ("--output-json", folder / "answers.json", "--output-npz", folder / "answers.npz")
     _command("ns-normlift-query", "--load-config", lifted, "--text", *TEXTS[scene], "brown", *files)
-    _command("ns-normlift-export", "--load-config", lifted, "--output-dir", folder / "export", "--part", "selection")
+    _command("ns-normlift-export", "--load-config", lifted, "--output-dir", folder / "export", "--select", "selection")
 
 
 def _command(name: str, *flags: object) -> None:

@@ -67,9 +67,9 @@ def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):
     assert path.read_text() == "first"
     write_text_file(path, "second", overwrite=True)
     assert path.read_text() == "second"
-    with pytest.raises(FileExistsError, match=r"b\.txt exists.* --json.*--overwrite"):
-        refuse_existing(tmp_path / "c.txt", path, overwrite=False, flags="--json")
-    refuse_existing(path, overwrite=True, flags="--json")
+    with pytest.raises(FileExistsError, match=r"b\.txt exists.* --output-json.*--overwrite"):
+        refuse_existing(tmp_path / "c.txt", path, overwrite=False, flags="--output-json")
+    refuse_existing(path, overwrite=True, flags="--output-json")
     path.unlink()
     path.symlink_to("nowhere")
     with pytest.raises(FileExistsError):

@@ -127,11 +127,11 @@ def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
         link.symlink_to(run / name)
         for path in (run / name, link, tmp_path / "other" / name, run / "normlift" / ".." / name):
             for overwrite in (True, False):
-                with pytest.raises(InputError, match=r"part of the run .* --json"):
-                    refuse_existing(path, overwrite=overwrite, flags="--json")
+                with pytest.raises(InputError, match=r"part of the run .* --output-json"):
+                    refuse_existing(path, overwrite=overwrite, flags="--output-json")
     for fine in (run / "answers.json", run / "ply" / "config.yml", tmp_path / "config.yml", run / "pictures" / "a.png"):
-        refuse_existing(fine, overwrite=False, flags="--json")
-        refuse_run_files(fine, instead="--json")
+        refuse_existing(fine, overwrite=False, flags="--output-json")
+        refuse_run_files(fine, instead="--output-json")
 
 
 def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:

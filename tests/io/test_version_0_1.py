@@ -32,7 +32,7 @@ def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 @pytest.mark.usefixtures("nerfstudio")
 def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, answers = config.parent.name, tmp_path / "answers.json"
-    flags = ("--load-config", config, *QUERIES[name], "--json", answers)
+    flags = ("--load-config", config, *QUERIES[name], "--output-json", answers)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     before = json.loads((tmp_path / "old" / f"answers_{name}.json").read_text())
     assert differences(without_news(json.loads(answers.read_text())), before, 1e-5) == []
@@ -46,7 +46,18 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert run_entry(monkeypatch, evaluate.entrypoint, *scored) == 0
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "normlift"
 
-    again = ("--load-config", config, "--encoder", "colour", "--region-count", 16, "--k", 6, "--timestamp", "again")
+    again = (
+        "--load-config",
+        config,
+        "--encoder",
+        "colour",
+        "--region-count",
+        16,
+        "--vote-k",
+        6,
+        "--timestamp",
+        "again",
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *again) == 0
     lifted = nl.open_run(config.parents[1] / "again" / "config.yml")
     assert lifted.ask("red").texts == ("red",)

@@ -20,7 +20,7 @@ from normlift_ns.data.open_scene import load_field
 from normlift_ns.io.run_dir import run_directory
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.question import Query
-from normlift_ns.query.text_encoder import ENCODER_KEYS
+from normlift_ns.query.text_encoder import encoder_settings
 from tests.captures import SHARED
 from tests.nerfstudio_plugin.stock_run import StockRun, relocate_config, train_splatfacto, write_dataset
 
@@ -68,7 +68,7 @@ def field(stock: StockRun) -> SemanticField:
 @pytest.fixture(scope="session")
 def stock_lifted(stock: StockRun, field: SemanticField, made_once: Callable[..., Path]) -> Path:
     """config.yml of a lifted copy of the stock run with two stored queries."""
-    encoder = {key: getattr(SourceOptions(encoder="colour"), key) for key in ENCODER_KEYS}
+    encoder = encoder_settings(SourceOptions(encoder="color"))
     colored = replace(field, manifest={**field.manifest, "encoder": encoder})
     question = Query(("left", "right"), torch.eye(8)[:2])
 

@@ -140,7 +140,7 @@ def hostile_values() -> dict[str, list[object]]:
         f"{model}.camera_optimizer.mode": ["on", False, None],
         "pipeline.lift": [None, {}],
         "pipeline.lift.max_views": [0, "all", 1.5],
-        "pipeline.lift.beta": ["x", nan],
+        "pipeline.lift.reliability_beta": ["x", nan],
         "pipeline.lift.vote": [None],
         "pipeline.lift.vote.k": [0, 1.5, None],
         "pipeline.source.encoder": [None, 5],

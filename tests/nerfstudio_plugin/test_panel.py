@@ -427,7 +427,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
         assert not panel._widgets.explain_button.disabled
     assert str(panel._folder.parent) in said(panel) and "Traceback" not in said(panel)  # no run is there
     assert panel._widgets.reasons.content == ""
-    how = {"source": SourceOptions(encoder="colour"), "lift": LiftOptions(storage="evidence")}
+    how = {"source": SourceOptions(encoder="color"), "lift": LiftOptions(storage="evidence")}
     run = nl.lift_run(stock.config, **how, output_dir=tmp_path, timestamp="one")
     reasons = explanation_of_run(run.folder / "normlift", run.field)
     device = panel.state.space.means.device

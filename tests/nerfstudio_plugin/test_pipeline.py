@@ -35,14 +35,14 @@ def methods() -> dict[str, Any]:
 
 @pytest.fixture
 def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
-    """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
+    """`ns-train normlift --pipeline.source.encoder color …`; keywords are those of the pipeline's config."""
     monkeypatch.setattr("normlift_ns.rasterization.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
 
     def train(timestamp, method="normlift", checkpoint=None, model=None, how=None, **pipeline: Any) -> StockRun:
         def configure(config: Any) -> None:
             vars(config.pipeline.model).update({"num_random": 60, **(model or {})})
             config.output_dir, config.load_checkpoint = Path("trained"), checkpoint
-            source = SourceOptions(encoder="colour", region_count=12)
+            source = SourceOptions(encoder="color", region_count=12)
             vars(config.pipeline).update({"source": source, "lift": LIFT, **pipeline})
 
         what: dict[str, Any] = {"configure": configure, "timestamp": timestamp, "steps": 2, **(how or {})}
@@ -82,7 +82,7 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     assert torch.equal(loaded.means.cpu(), model.means.cpu())
 
     stored, again = yaml.load(trained.config.read_text(), Loader=yaml.Loader).pipeline, run.config.pipeline
-    assert (stored.lift, stored.source.encoder) == (LIFT, "colour")
+    assert (stored.lift, stored.source.encoder) == (LIFT, "color")
     assert (again.lift, again.queries) == (LIFT, ("red", "sky blue"))
     assert not any("normlift" in name for name in trained.pipeline.state_dict())
     attributes = dict.fromkeys(("optimizers", "grad_scaler", "pipeline", "trainer"))
@@ -125,7 +125,7 @@ def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods:
     for how, error, message in (
         ({"queries": ("oragne",)}, ValueError, "orange"),
         ({"source": SourceOptions(encoder_pretrained="missing.pt")}, FileNotFoundError, r"missing\.pt"),
-        ({"source": SourceOptions(encoder="colour", regions="files")}, ValueError, "regions-dir"),
+        ({"source": SourceOptions(encoder="color", regions="files")}, ValueError, "regions-dir"),
         ({"lift": lift}, InputError, r"--pipeline\.lift: max_views .* 1"),
     ):
         with pytest.raises(error, match=message):
@@ -165,7 +165,7 @@ def test_the_features_of_lerf_ovs_lie_in_the_scene(train: Any, workspace: Path, 
         labels[:, WIDTH // 2 :] = 1
         np.save(folder / f"{image.stem}_s.npy", labels)
         np.save(folder / f"{image.stem}_f.npy", np.eye(16, dtype=np.float32)[:2])
-    given = replace(options, text_vectors=vectors)
+    given = replace(options, text_embeddings=vectors)
     field = field_of(opened(train("features", source=given, queries=("thing", "wall")).config))
     assert (field.dimension, field.manifest["features"]["kind"]) == (16, "langsplat")
     (folder / f"{images[0].stem}_s.npy").unlink()

@@ -24,7 +24,7 @@ from normlift_ns.planning import measure_capture, time_kernel_loading
 from normlift_ns.planning import make_plan
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
-source, options = make_source(SourceOptions(encoder="colour")), LiftOptions(max_views=9)
+source, options = make_source(SourceOptions(encoder="color")), LiftOptions(max_views=9)
 time_kernel_loading(scene, options)
 found = []
 for _ in range(2):

@@ -100,9 +100,9 @@ def test_answers_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
     """Neither can be imported by the command; its answers are those of the run opened with them."""
     lifted = shutil.copytree(lifted.parent, tmp_path / "run") / "config.yml"  # others ask what is stored, too
     np.savez(tmp_path / "t.npz", fox=np.ones(343, np.float32))
-    outputs = ("--json", tmp_path / "a.json", "--output-path", tmp_path / "a.npz", "--save")
-    for flags in (("sky blue", *outputs), ("--text-vectors", tmp_path / "t.npz")):
-        text = "red" if "--save" in flags else "fox"
+    outputs = ("--output-json", tmp_path / "a.json", "--output-npz", tmp_path / "a.npz", "--save-query")
+    for flags in (("sky blue", *outputs), ("--text-embeddings", tmp_path / "t.npz")):
+        text = "red" if "--save-query" in flags else "fox"
         words = [sys.executable, "-c", BLOCK, "--load-config", lifted, "--text", text, *flags]
         done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr

@@ -56,7 +56,7 @@ FACTS = {"texts": ["a"], "negatives": [], "form": "cosine", "threshold": 0.5, "m
 
 
 def damaged_question(message: str) -> Any:
-    return pytest.raises(InputError, match=rf"queries\.safetensors is damaged \(.*{message}.*--save True")
+    return pytest.raises(InputError, match=rf"queries\.safetensors is damaged \(.*{message}.*--save-query True")
 
 
 def test_a_damaged_file_says_what_to_do(tmp_path: Path) -> None:

@@ -63,14 +63,14 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         text_encoder_for(field, cache=tmp_path / "texts")
     expected = field.manifest["features"].get("encoder", field.manifest["features"].get("texts"))["pretrained"]
-    for part in (str(path), file_digest(path, compare_to=expected), expected, "--text-vectors", "lift again"):
+    for part in (str(path), file_digest(path, compare_to=expected), expected, "--text-embeddings", "lift again"):
         assert part in str(caught.value)
     assert "--encoder-pretrained" not in str(caught.value)  # ns-normlift-query has no such flag
     template = with_text_source(field, template="a {}")
     with pytest.raises(InputError, match="lifted with"):
         text_encoder_for(template)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=rf"{path}.* --text-vectors") as missing:
+    with pytest.raises(FileNotFoundError, match=rf"{path}.* --text-embeddings") as missing:
         text_encoder_for(field)
     assert "--encoder-pretrained" not in str(missing.value)
     np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))  # the user's choice needs no weights
@@ -82,7 +82,7 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
 def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("w.pt").write_bytes(b"a")
-    settings = encoder_settings(SourceOptions(encoder_pretrained="w.pt", text_vectors=Path("t.npz")))
+    settings = encoder_settings(SourceOptions(encoder_pretrained="w.pt", text_embeddings=Path("t.npz")))
     assert set(settings) == set(ENCODER_KEYS)
     assert settings["encoder_pretrained"] == str(tmp_path / "w.pt")
     assert settings["text_vectors"] == str(tmp_path / "t.npz")
@@ -119,11 +119,11 @@ def test_a_file_that_is_called_like_the_tag_is_not_taken_for_it(tmp_path, monkey
 def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path) -> None:
     path = tmp_path / "t.npz"
     np.savez(path, fox=np.ones(12, np.float32))
-    settings = encoder_settings(SourceOptions(features="langsplat", text_vectors=path))
+    settings = encoder_settings(SourceOptions(features="langsplat", text_embeddings=path))
     field = field_with(settings, {"kind": "langsplat", "level": "l", "texts": TextEmbeddingFile(path).identity})
     assert torch.is_tensor(text_encoder_for(field).text(["fox"]))
     np.savez(path, fox=np.arange(12, dtype=np.float32))
-    with pytest.raises(InputError, match=rf"{path} .*--text-vectors"):
+    with pytest.raises(InputError, match=rf"{path} .*--text-embeddings"):
         text_encoder_for(field)
     assert torch.is_tensor(text_encoder_for(with_text_source(field, text_embeddings=path)).text(["fox"]))
     path.unlink()

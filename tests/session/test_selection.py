@@ -191,7 +191,7 @@ def test_objects_are_listed_with_what_their_buttons_need():
     assert [row.size for row in list_objects(actions.hide(asked("red"), first.mask)).objects] == [64]
     few = list_objects(asked("red, blue"), max_objects=2)
     assert ([row.name for row in few.objects], few.left_out) == (["red 1", "blue 1"], 1)
-    assert list_objects(asked("red"), min_size=65).in_smaller_parts == 128
+    assert list_objects(asked("red"), min_gaussians=65).in_smaller_parts == 128
     assert [row.name for row in list_objects(actions.show_prompt(asked("red, blue"), 1)).objects] == ["blue 1"]
     by_hand = list_objects(actions.click(asked("red"), ray(0)))
     assert [row.name for row in by_hand.objects] == ["selected by hand 1"]

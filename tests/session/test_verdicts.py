@@ -9,7 +9,7 @@ import torch
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
-from normlift_ns.query.text_encoder import ENCODER_KEYS
+from normlift_ns.query.text_encoder import encoder_settings
 from normlift_ns.session import actions
 from normlift_ns.session.actions import carry_threshold, diagnose_prompts, threshold_suggestion
 from normlift_ns.session.prompts import build_query, encode_prompts
@@ -21,7 +21,7 @@ from tests.session.worlds import BLOCK, ray, read, rows, world
 @cache
 def coloured() -> SelectionContext:
     """The world with an encoder whose cosines have a threshold; that of the plain one nobody knows."""
-    encoder = {key: getattr(SourceOptions(encoder="colour"), key) for key in ENCODER_KEYS}
+    encoder = encoder_settings(SourceOptions(encoder="color"))
     return SelectionContext(
         replace(world().field, manifest={**world().field.manifest, "encoder": encoder}), world().means
     )

@@ -65,7 +65,7 @@ def _own_features(runs: Path) -> LiftedRun:
     (trained,) = runs.parent.glob("splatfacto/*/config.yml")
     left = (torch.arange(80).expand(60, 80) // 40, torch.eye(2))
     texts = {"red": torch.tensor([1.0, 0.0]), "yellow": torch.tensor([0.0, 1.0])}
-    return lift_run(trained, features=[left] * 5, texts=texts, timestamp="own", check=False, device="cpu")
+    return lift_run(trained, features=[left] * 5, texts=texts, timestamp="own", check_alignment=False, device="cpu")
 
 
 def _numbers(path: Path, runs: Path) -> Numbers:

@@ -126,7 +126,7 @@ def warm() -> None:
         folder = Path(name)
         make_room(folder)
         (trained,) = folder.glob("outputs/room/splatfacto/*/config.yml")
-        common = ("--encoder", "colour", "--k", "6", "--timestamp", "warm", "--queries", "red")
+        common = ("--encoder", "color", "--vote-k", "6", "--timestamp", "warm", "--queries", "red")
         assert work(("lift", "--load-config", str(trained), *common)) == 0
         config = str(folder / "outputs" / "room" / "normlift" / "warm" / "config.yml")
         assert work(("query", "--load-config", config, "--text", "red")) == 0

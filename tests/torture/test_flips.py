@@ -25,11 +25,22 @@ KINDS = {
 def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, record: Record) -> None:
     """Half of the runs came from a nerfstudio run, half from a PLY file, one has texts of its own."""
     place = Place(server, tmp_path)
-    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--k", 6))
+    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--vote-k", 6))
     splat = ("export", "--load-config", place.config, "--output-dir", place.folder / "out")
     server.command(*splat)
     cameras = ("--transforms", place.folder / "room", "--world-transform", place.trained.parent / TRANSFORMS)
-    common = ("--encoder", "colour", "--check", False, "--device", "cpu", "--k", 6, "--storage", "evidence")
+    common = (
+        "--encoder",
+        "color",
+        "--check-alignment",
+        False,
+        "--device",
+        "cpu",
+        "--vote-k",
+        6,
+        "--storage",
+        "evidence",
+    )
     output = ("--timestamp", "ply", "--output-dir", place.folder / "outputs")
     server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *common, *output)
     result = tmp_path / "flips.json"

@@ -51,7 +51,7 @@ class Place:
         self.config = self.runs / "one" / "config.yml"
 
     def lift(self, *flags: object) -> tuple[object, ...]:
-        common = ("--encoder", "colour", "--check", False, "--device", "cpu")
+        common = ("--encoder", "color", "--check-alignment", False, "--device", "cpu")
         return ("lift", "--load-config", self.trained, *common, *flags)
 
     def save(self) -> None:
@@ -66,7 +66,7 @@ class Place:
 @pytest.fixture(scope="module")
 def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Place:
     place = Place(server, tmp_path_factory.mktemp("kills"))
-    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--k", 6))
+    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--vote-k", 6))
     shutil.rmtree(place.runs / ".cache")
     out = place.folder / "out"
     server.command("export", "--load-config", place.config, "--output-dir", out)
@@ -77,7 +77,7 @@ def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Place:
 COMMANDS = {
     "ns-normlift --overwrite True": ("lift", "outputs/room/normlift"),
     "ns-normlift-export --overwrite True": ("export", "out"),
-    "ns-normlift-query --save True": ("query", "outputs/room/normlift/one"),
+    "ns-normlift-query --save-query True": ("query", "outputs/room/normlift/one"),
 }
 
 
@@ -85,10 +85,10 @@ COMMANDS = {
 def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record) -> None:
     command, below = COMMANDS[name]
     words = {
-        "lift": place.lift("--timestamp", "one", "--queries", "yellow", "--k", 9, "--overwrite", True),
-        "query": ("query", "--load-config", place.config, "--text", "yellow", "--save", True),
+        "lift": place.lift("--timestamp", "one", "--queries", "yellow", "--vote-k", 9, "--overwrite", True),
+        "query": ("query", "--load-config", place.config, "--text", "yellow", "--save-query", True),
         "export": (
-            *("export", "--load-config", place.config, "--text", "yellow", "--part", "selection"),
+            *("export", "--load-config", place.config, "--text", "yellow", "--select", "selection"),
             *("--output-dir", place.folder / "out", "--overwrite", True),
         ),
     }[command]
@@ -144,9 +144,9 @@ def look(place: Place, command: str) -> None:
         words = ("export", "--load-config", place.config, "--output-dir", place.folder / "out")
         assert place.server.run({"words": words})[0][0] == 1  # something is there
     else:
-        words = ("query", "--load-config", place.config, "--text", "red", "--json", answers)
+        words = ("query", "--load-config", place.config, "--text", "red", "--output-json", answers)
         if command == "lift":
-            words = (*words, "--save", False)
+            words = (*words, "--save-query", False)
         assert place.server.run({"words": words})[0][0] == 0
         answers.unlink()
         for left in place.runs.rglob(".normlift-*"):  # of the killed process; only who writes there removes it

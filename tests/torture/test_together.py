@@ -18,7 +18,7 @@ TEXTS = ("red", "yellow", "blue", "green", "white", "brown", "black", "orange")[
 @pytest.fixture(scope="module")
 def place(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Place:
     place = Place(server, tmp_path_factory.mktemp("together"))
-    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--k", 6))
+    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--vote-k", 6))
     place.save()
     return place
 
@@ -34,14 +34,14 @@ def answers(place: Place, run: Path) -> Any:
     """What a run says of its own query, which proves that it is whole; asked by a process of its own."""
     output = place.folder.parent / "answers.json"
     output.unlink(missing_ok=True)
-    place.server.command("query", "--load-config", run / "config.yml", "--text", "red", "--json", output)
+    place.server.command("query", "--load-config", run / "config.yml", "--text", "red", "--output-json", output)
     return json.loads(output.read_text())
 
 
 @pytest.mark.extra
 def test_lifts_with_default_names_all_succeed(place: Place, tmp_path: Path, record: Record) -> None:
     place.restore()
-    lifts = [place.lift("--queries", text, "--k", 6) for text in TEXTS]
+    lifts = [place.lift("--queries", text, "--vote-k", 6) for text in TEXTS]
     codes, logs = together(place, tmp_path, *lifts)
     assert codes == [0] * EIGHT, logs
     runs = [path for path in place.runs.iterdir() if path.name not in ("one", ".cache")]
@@ -68,7 +68,7 @@ def test_of_lifts_with_one_name_one_succeeds(place: Place, tmp_path: Path, recor
 
 @pytest.mark.extra
 def test_lifts_that_replace_one_run_leave_one_whole(place: Place, tmp_path: Path, record: Record) -> None:
-    replaced = [place.lift("--timestamp", "one", "--k", k, "--queries", text, "--overwrite", True)
+    replaced = [place.lift("--timestamp", "one", "--vote-k", k, "--queries", text, "--overwrite", True)
                 for k, text in ((6, "yellow"), (9, "blue"))]  # fmt: skip
     known = []
     for words in replaced:
@@ -84,7 +84,7 @@ def test_lifts_that_replace_one_run_leave_one_whole(place: Place, tmp_path: Path
 
 
 def export(place: Place, text: str, *flags: object) -> tuple[object, ...]:
-    words = ("export", "--load-config", place.config, "--text", text, "--part", "selection", "--threshold", 0.2)
+    words = ("export", "--load-config", place.config, "--text", text, "--select", "selection", "--threshold", 0.2)
     return (*words, "--output-dir", place.folder / "out", *flags)
 
 
@@ -115,7 +115,7 @@ def test_exports_never_mix(place: Place, tmp_path: Path, record: Record) -> None
 @pytest.mark.extra
 def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record: Record) -> None:
     def save(text: str) -> tuple[object, ...]:
-        return ("query", "--load-config", place.config, "--text", text, "--save", True)
+        return ("query", "--load-config", place.config, "--text", text, "--save-query", True)
 
     known = []
     for text in TEXTS:
@@ -127,7 +127,10 @@ def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record:
     assert codes == [0] * EIGHT, logs
     assert tree(place.config.parent) in known
     place.restore()
-    mixed = [*(place.lift("--k", 6) for _ in range(3)), *(export(place, "red", "--overwrite", True) for _ in range(3))]
+    mixed = [
+        *(place.lift("--vote-k", 6) for _ in range(3)),
+        *(export(place, "red", "--overwrite", True) for _ in range(3)),
+    ]
     codes, logs = together(place, tmp_path, *mixed, save(TEXTS[0]), save(TEXTS[1]))
     assert set(codes) == {0}, logs
     assert len(list(place.runs.glob("[!.]*"))) == 4
