@@ -333,10 +333,14 @@ def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     return _Name(name)
 
 
+def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}:", _construct_object)
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}/apply:", _construct_call)
 ConfigLoader.add_multi_constructor(_NAME_TAG, _construct_name)
-ConfigLoader.add_constructor(_TUPLE_TAG, lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)
 
 
 class _ConfigDumper(yaml.Dumper):
