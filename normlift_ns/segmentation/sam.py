@@ -297,8 +297,9 @@ class PromptedNetwork(ABC):
 
     def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Any]:
         """Return the embedding of each image, the input of `prompt`."""
-        batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
-        return [embedding for batch in batches for embedding in batch]
+        with torch.no_grad(), self._autocast():
+            batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
+            return [embedding for batch in batches for embedding in batch]
 
     @abstractmethod
     def _embed(self, pixels: Tensor) -> list[Any]:
@@ -395,10 +396,8 @@ class SamNetwork(PromptedNetwork):
         pixels = (scaled - _MEAN.to(self._device)) / _STD.to(self._device)
         return pad(pixels, (0, self._side - width, 0, self._side - height))
 
-    @torch.no_grad()
     def _embed(self, pixels: Tensor) -> list[Any]:
-        with self._autocast():
-            return list(self._model.get_image_embeddings(pixels).float().split(1))
+        return list(self._model.get_image_embeddings(pixels).float().split(1))
 
 
 @lru_cache(maxsize=64)
@@ -471,10 +470,8 @@ class Sam2Network(_LibraryNetwork):
         """Return logits at the size of the image, in float32, resized bilinearly."""
         return interpolate(logits[:, None].float(), size, mode="bilinear", align_corners=False)[:, 0]
 
-    @torch.no_grad()
     def _embed(self, pixels: Tensor) -> list[Any]:
-        with self._autocast():
-            levels = self._model.get_image_embeddings(pixels)
+        levels = self._model.get_image_embeddings(pixels)
         return [list(one) for one in zip(*(level.float().split(1) for level in levels))]
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:
@@ -497,10 +494,8 @@ class HqSamNetwork(_LibraryNetwork):
         square = {"height": self._side, "width": self._side}
         self._processor = import_transformers().SamImageProcessor(size={"longest_edge": self._side}, pad_size=square)
 
-    @torch.no_grad()
     def _embed(self, pixels: Tensor) -> list[Any]:
-        with self._autocast():
-            last, early = self._model.get_image_embeddings(pixels)
+        last, early = self._model.get_image_embeddings(pixels)
         return list(zip(last.float().split(1), early[0].float().split(1)))
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:

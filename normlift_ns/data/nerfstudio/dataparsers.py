@@ -82,9 +82,7 @@ def _orient_and_center(
         rotation = _rotation_between(_up_direction(poses, vertical=method == "vertical"), torch.tensor([0.0, 0.0, 1.0]))
         transform = torch.cat([rotation, rotation @ -translation[..., None]], dim=-1)
     elif method == "none":
-        transform = torch.eye(4)
-        transform[:3, 3] = -translation
-        transform = transform[:3, :]
+        transform = torch.cat([torch.eye(3), -translation[:, None]], dim=-1)
     else:
         raise InputError(f"unknown orientation method {method!r}")
     return transform @ poses, transform
@@ -206,6 +204,9 @@ def _exp_se3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
     return transform
 
 
+_ROUNDING = {"floor": torch.floor, "ceil": torch.ceil, "round": lambda sides: torch.floor(0.5 + sides)}
+
+
 @dataclass(frozen=True)
 class DatasetSplit:
     """One split of a dataset: V image files and their cameras, before undistortion."""
@@ -240,11 +241,7 @@ class DatasetSplit:
     def resized(self, factor: float, rounding: str = "floor") -> DatasetSplit:
         """Return the split with cameras for resized images, like nerfstudio's `rescale_output_resolution`."""
         scale = torch.tensor([factor])
-        sides = self.sizes * scale
-        if rounding == "round":
-            sides = torch.floor(0.5 + sides)
-        elif rounding == "ceil":
-            sides = torch.ceil(sides)
+        sides = _ROUNDING[rounding](self.sizes * scale)
         return replace(self, intrinsics=self.intrinsics * scale, sizes=sides.to(torch.int64))
 
 
