@@ -113,7 +113,8 @@ def lift_run(
         say: called with each status line and warning, for example `print`.
     Raises:
         FileExistsError: the run directory exists and `overwrite` is False.
-        FileNotFoundError, ValueError: as `open_scene`; also if an image, a label map or an option does not fit.
+        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if an image, a label map or an
+            option is not valid.
         MemoryError: the lift does not fit into GPU memory.
         TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
 
@@ -190,7 +191,7 @@ class PreparedLift:
     device: str
     run_dir: Path
     texts: Mapping[str, Float[Tensor, " d"]] | None
-    """Prompts of the user's own features, with their embeddings."""
+    """The user's own text embeddings by prompt; None if the encoder embeds prompts."""
     encoder: Mapping[str, Any]
     """Options that queries need to encode prompts as the features were encoded."""
 

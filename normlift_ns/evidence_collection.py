@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MAX_CHUNK = 16
 _READERS = 8
-"""Images that are read in parallel while one is processed or a network loads."""
+"""Number of images that are read in parallel while one is processed or a network loads."""
 _MIN_SIDE = 8
 """Minimum side of a downscaled image, in pixels; smaller ones show too little."""
 _CACHE_VERSION = "normlift_ns.block/6"
@@ -174,7 +174,7 @@ class ViewBatch(NamedTuple):
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Cells; -1 is unlabeled, -2 masked."""
+    """Cell of every pixel; -1 is unlabeled, -2 masked. The pixels of a cell share their region on every level."""
     regions: list[Int32[Tensor, "levels c"]]
     """Region of every cell, -1 for none."""
     features: list[Float[Tensor, "r d"]]

@@ -212,7 +212,7 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
 
 
 class CloudTransfer(NamedTuple):
-    """A point cloud to label, and the rule for it."""
+    """Point cloud to label, with the distance limit and the transform to its coordinates."""
 
     cloud: PlyData
     max_distance: float

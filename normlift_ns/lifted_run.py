@@ -95,7 +95,7 @@ class LiftedRun:
         """Text encoder that fits the field. It loads its network on first use.
 
         Raises:
-            ValueError, FileNotFoundError: as `text_encoder_for`.
+            ValueError, FileNotFoundError: for the same reasons as `text_encoder_for`.
         """
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
@@ -156,7 +156,7 @@ class LiftedRun:
             raise InputError(
                 f"the question has vectors of {question.embeddings.shape[1]} numbers, but the features of "
                 f"{self.folder} "
-                f"have {self.field.dimension}; ask this run, then save its answer"
+                f"have {self.field.dimension}; query this run, then save its answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
 
@@ -189,7 +189,7 @@ class LiftedRun:
             The row indices of the written Gaussians.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: no Gaussian of the part is ever drawn, the mask has another type or length, or the name is
+            ValueError: no Gaussian of `part` is ever drawn, the mask has another type or length, or the name is
                 reserved for a file of a run.
         """
         path = check_path("path", path)
@@ -267,8 +267,8 @@ class LiftedRun:
             part: an answer, or a finding, which stands for its answer.
             transfer_distance: maximum distance from a point to the center of its Gaussian, in units of the median
                 spacing of the Gaussians.
-            coordinates: coordinate system of the cloud, "capture" or "scene". "capture" is that of the cameras before
-                nerfstudio rotated and scaled them, "scene" that of the Gaussians.
+            coordinates: coordinate system of the cloud. "capture": the cameras' coordinates before nerfstudio rotated
+                and scaled them. "scene": the Gaussians' coordinates.
             overwrite: replace a file of that name.
         Raises:
             FileNotFoundError: the cloud does not exist.
@@ -363,15 +363,15 @@ class LiftedRun:
     def to_capture(self) -> SimilarityTransform:
         """Transform from the coordinates of the Gaussians to those of the capture.
 
-        It inverts the transform of the training.
+        It inverts the transform that training applied.
 
         Raises:
-            FileNotFoundError, ValueError: as `catalogue`.
+            FileNotFoundError, ValueError: for the same reasons as `catalogue`.
         """
         return similarity_to_capture(self.folder, self.scene.identity)
 
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
-        """Return the classes and objects of a part."""
+        """Return the classes and objects of an answer, a finding or a mask."""
         if isinstance(part, Answer):
             return exports.answer_instances(part)
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
@@ -395,10 +395,10 @@ class LiftedRun:
         return find_floaters(self.scene.gaussians, self.field.scalars, limit=limit)
 
     def _mask(self, part: Any) -> Bool[Tensor, " n"]:
-        """Return the mask of the Gaussians in a part.
+        """Return the Gaussians of an answer or finding as a mask, or a given mask after a check.
 
         Raises:
-            ValueError: `part` is not a part of this run.
+            ValueError: `part` does not belong to this run.
         """
         mask = part.mask if isinstance(part, Answer | Finding) else None
         if mask is None:
@@ -462,7 +462,7 @@ class LiftedRun:
 
 
 def _answer_of(part: Any) -> Answer | None:
-    """Return the answer of a part; None for a mask."""
+    """Return the answer that `part` is or belongs to; None for a mask."""
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
@@ -485,7 +485,8 @@ def open_run(
         prompt_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
             lift.
     Raises:
-        FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
+        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if the run has no semantics, or
+            those of other Gaussians.
 
     >>> run = open_run(config)
     >>> answer = run.ask("red", "yellow", min_reliability=0.3)

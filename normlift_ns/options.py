@@ -336,7 +336,7 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
 
 
 def _convert_union(name: str, value: Any, choices: Sequence[Any]) -> Any:
-    """Return the value in one of several types: None, words, and at most one other."""
+    """Convert a value to one of several types: None, literal words, and at most one other type."""
     if value is None and type(None) in choices:
         return None
     words = [word for choice in choices if get_origin(choice) is Literal for word in get_args(choice)]
@@ -554,7 +554,7 @@ class SplatOptions:
     dataparser_transforms.json of the run that exported the PLY file. Default: the coordinates are the same."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, as it does by default; the transform is computed again from
-    the COLMAP project. A PLY file counts as normalized only if the images match the splat that way."""
+    the COLMAP project. A PLY file counts as normalized only if the images then match the splat."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None
@@ -609,7 +609,7 @@ class RefineConfig(CheckedOptions):
     """Weight of a Gaussian's own evidence in the vote. posterior: the number of views that saw it, against --vote-prior
     views for all neighbors together. paper: one voter among its neighbors (equations 9 and 10 of the paper)."""
     k: int = 36
-    """Number of neighbors K in the vote, at least 1; larger values ask a wider neighborhood and take longer."""
+    """Number of neighbors K in the vote, at least 1; larger values use a wider neighborhood and take longer."""
     sigma_d: float | None = None
     """Width of the spatial decay of votes, > 0; larger values give distant neighbors more weight. In units of the
     scene's median distance from a Gaussian to the nearest one at another position, because scenes are rescaled.
@@ -677,7 +677,7 @@ class LiftOptions(CheckedOptions):
     are more exact and slower. Needs --consensus True."""
     consensus_min_agreement: float = 0.4
     """Agreement of regions across views, in 0..1, up to which overlaps count as chance and features stay unchanged;
-    larger values switch the consensus off in more scenes. Use 0 if your masks show objects, however badly. Needs
+    larger values switch the consensus off in more scenes. Use 0 if each mask shows one object, even roughly. Needs
     --consensus True."""
     refine: bool = True
     """Let neighboring Gaussians vote to repair directions: a Gaussian copies the direction that wins."""
@@ -719,7 +719,7 @@ class AskOptions:
     """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
     texture). color: none."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
-    """Relevancy formula. cosine: the cosine itself. lerf: the softmax against each negative, at its minimum. margin:
+    """Relevancy formula. cosine: the cosine itself. lerf: the smallest softmax against any negative. margin:
     the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of

@@ -142,7 +142,7 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
     """Return the gsplat version whose rasterization rules a lift follows.
 
     Raises:
-        ValueError: the options ask for the rules of the installed gsplat, but it is not installed.
+        ValueError: the options select the rules of the installed gsplat, but it is not installed.
     """
     return resolve_gsplat_rules(options.gsplat_version, scene.identity.get("gsplat_rules"))
 

@@ -46,9 +46,9 @@ from normlift_ns.progress import StageTimer, peak_gib
 
 
 _EVIDENCE_COPIES = 3
-"""Copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
+"""Number of copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
 _DIRECTION_COPIES = 2
-"""Copies of the directions in memory while the vote gathers them and a storage format is chosen."""
+"""Number of copies of the directions in memory while the vote gathers them and a storage format is chosen."""
 _OFFSET_BYTES = 16
 """Minimum bytes per Gaussian in an evidence file."""
 
@@ -82,7 +82,7 @@ class Measurements:
     dimension: int
     """Length of the feature vectors."""
     regions: float
-    """Regions per view."""
+    """Number of regions per view."""
     entries: float
     """Evidence entries per view."""
     entry_bytes: int
@@ -108,7 +108,7 @@ class Measurements:
     field_bytes: Rate
     """Size of the stored semantics."""
     run_bytes: int
-    """Size of the checkpoint that is stored with them."""
+    """Size of the checkpoint that is stored with the semantics."""
     write_bytes_s: float
     """Bytes written per second."""
     view_bytes: float
@@ -516,7 +516,7 @@ def measure_capture(
         before: seconds of the steps that precede the views, by name (start, open, kernels, check).
         clock: returns seconds; use `time.process_time` for the time of all cores.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
+        ValueError, FileNotFoundError, MemoryError: for the same reasons as `lift_scene`.
     """
     collection = pipeline.plan_collection(scene, source, options, cache, device=device, export=None)
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
@@ -595,7 +595,7 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views. Return them, with the seconds that it takes once networks are loaded, and the loading time."""
+    """Observe views; return them with the seconds for all views after loading, and the seconds for loading networks."""
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])

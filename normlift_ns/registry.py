@@ -1,4 +1,4 @@
-"""Plugins of this package and of others by name.
+"""Plugins of this package and of other packages, by name.
 
 Every plugin is an entry point. This module imports nothing heavy; a package is imported only when its plugin is
 requested.

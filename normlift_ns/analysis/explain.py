@@ -379,7 +379,7 @@ class RecordedVotes:
         return evidence
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
-        """Return labels, regions and features of some images of the lift, and the images at its resolution."""
+        """Return the labels, regions and features of some lifted images, and these images at the lift's resolution."""
         index_of = {name: index for index, name in enumerate(self.scene.train.names)}
         indices, images = [index_of[self.names[view]] for view in views], []
 

@@ -241,7 +241,7 @@ class Instances:
     or in a component that is too small.
     """
     classes: tuple[int, ...]
-    """Class of object 1, 2, …"""
+    """Class of each object; the first entry is for object 1."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the names of all classes and objects by id, as plain Python types."""

@@ -69,7 +69,7 @@ class NormLift(CheckedOptions):
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which are lifted too. It must also
-    contain training images, whose cameras must not have moved."""
+    contain training images, with the same cameras as in training."""
     check_alignment: bool = True
     """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
     dry_run: bool = False

@@ -508,7 +508,7 @@ def save_vote_images(
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
         OSError: A file cannot be written.
-        FileNotFoundError, ValueError: Same as in `Votes.pictures`.
+        FileNotFoundError, ValueError: for the same reasons as `Votes.pictures`.
     """
     from PIL import Image  # noqa: PLC0415 (the tables do not need it)
 

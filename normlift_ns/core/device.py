@@ -145,7 +145,7 @@ class AdaptiveBatches:
     """Splits work into batches. If GPU memory cannot hold a batch, it is split, and all later batches are smaller."""
 
     batch_size: int
-    """Items per batch."""
+    """Number of items per batch."""
 
     def __call__(self, function: Callable[[Items], Result], items: Items) -> Iterator[Result]:
         """Yield the results of the function on consecutive batches of items.

@@ -40,7 +40,7 @@ class Evidence:
     """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
 
     Columns s number the regions of all views consecutively, like the rows of the feature table. They ascend within a
-    row, so the order is the same in every run. The constructor raises ValueError if the arrays do not fit together.
+    row, so the order is the same in every run. The constructor raises ValueError if the arrays are inconsistent.
 
     >>> import torch
     >>> from normlift_ns import Evidence

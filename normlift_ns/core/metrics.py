@@ -22,7 +22,7 @@ class ClassScores(NamedTuple):
     iou: Float64[Tensor, " c"]
     """|truth and predicted| / |truth or predicted| over the points that count; NaN if the truth lacks the class."""
     accuracy: Float64[Tensor, " c"]
-    """Recall |truth and predicted| / |truth|; NaN if the truth lacks the class."""
+    """Recall |truth and predicted| / |truth|; NaN if the ground truth lacks the class."""
 
     @property
     def miou(self) -> float:

@@ -101,7 +101,7 @@ def _check_inputs(
     *,
     posterior: bool,
 ) -> None:
-    """Raise ValueError if the inputs of a vote do not fit together."""
+    """Raise ValueError if the inputs of a vote are inconsistent."""
     tensors = {"means": means, "reliability": reliability}
     tensors |= {} if callable(directions) else {"directions": directions}
     tensors |= {} if own is None else {"own": own}

@@ -124,7 +124,7 @@ def gaussian_relevancy(
     """Compute the relevancy of Gaussians; those without a direction (not `valid`) get the smallest value of the rule.
 
     Raises:
-        ValueError: as `relevancy`.
+        ValueError: for the same reasons as `relevancy`.
     """
     values = relevancy(positive, negative, rule=rule)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)

@@ -56,7 +56,7 @@ _NORMALIZED = "The splat does not fit its images in the world of its cameras, bu
 def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[tuple[str, WorldTransform]]:
     """Return possible maps from the cameras' world to the splat's, each with a message for its use.
 
-    There are several if only the images can tell. A PLY file may come from gsplat's trainer too, so its normalized
+    There are several if only the images can decide. A PLY file may come from gsplat's trainer too, so its normalized
     world is the alternative if that of the cameras does not fit.
     """
     if options.world_transform is not None:

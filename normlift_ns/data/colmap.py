@@ -276,7 +276,7 @@ def _cameras_text(lines: list[str]) -> Iterator[ColmapCamera]:
     for line in filter(None, lines):
         camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, {name} needs {counts[name]}")
+            raise InputError(f"camera {camera_id} has {len(parameters)} parameters; {name} needs {counts[name]}")
         yield ColmapCamera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
 
 

@@ -1,4 +1,4 @@
-"""Extra images: taken after the training and registered together with the training images."""
+"""Extra images that were taken after training and registered together with the training images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images and their cameras as camera files describe them, and image headers."""
+"""Frames (images with their cameras) of camera files, and image headers."""
 
 from __future__ import annotations
 

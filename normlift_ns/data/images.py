@@ -290,7 +290,7 @@ class SplitViews:
 class ImageViews(SplitViews):
     """Lazy `Views` of images on disk: indexing reads and undistorts one image.
 
-    Undistortion is that of nerfstudio's FullImageDatamanager, with which stock commands see the same images: OpenCV's
+    Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images: OpenCV's
     optimal new camera matrix without black borders, cropped to its region of interest.
 
     Args:

@@ -140,7 +140,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     try:
         saved = msgspec.convert(read_json_file(path, _EXPECTED), _Saved)
         if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
-            raise msgspec.ValidationError("name or photographs is empty")
+            raise msgspec.ValidationError("the value of name or photographs is empty")
     except msgspec.ValidationError as error:
         raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
@@ -298,7 +298,8 @@ def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> 
     Args:
         load_config, data: as in `open_scene`.
     Raises:
-        FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
+        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if the run has no semantics, or
+            those of other Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)

@@ -198,7 +198,7 @@ class CameraFile(NamedTuple):
     applied_transform: Float[np.ndarray, "4 4"] | None = None
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
     applied_scale: float = 1.0
-    """Scale of that transform."""
+    """Scale of `applied_transform`."""
 
 
 def read_transforms(

@@ -74,7 +74,7 @@ class Part(NamedTuple):
     name: str
     """Name of the class."""
     detail: float
-    """Gaussians per square meter, relative to the walls."""
+    """Density of Gaussians per square meter, relative to the walls."""
     shape: Distance
     paint: Callable[[Array], Array] | None = None
     """Factors [n, 3] or [n, 1] on the color of the class at points [n, 3] of the surface; None for a plain color."""

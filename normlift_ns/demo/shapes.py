@@ -18,7 +18,7 @@ Distance = Callable[[Array], Array]
 ON_SURFACE = 1e-3
 """Maximum distance in meters at which a point counts as lying on the surface."""
 _OVERLAP = 2.6
-"""Standard deviation of a Gaussian, in units of that of its patch; large enough to close the surface."""
+"""Standard deviation of a Gaussian relative to that of its patch; large enough to close the surface."""
 _SHELL = 0.02
 """Half the thickness of the layer whose points are projected onto the surface, in meters."""
 _MIN_SCALE = 1e-3

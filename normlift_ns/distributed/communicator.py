@@ -106,7 +106,7 @@ class TorchCommunicator(Communicator):
         return result
 
     def claim_chunks(self, count: int) -> Iterator[int]:
-        """Yield the items of this process's part, then those of others that nobody has claimed in the directory."""
+        """Yield the items of this process, then those of other processes that are unclaimed in the directory."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:

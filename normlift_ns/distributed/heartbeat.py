@@ -71,7 +71,7 @@ class Heartbeat:
         with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
             first = not well and self.store.add("failures", 1) == 1
             self.store.set(f"end/{self.rank}", "well" if well else "failed")
-            if well and self.rank == 0:  # the store may live in this process
+            if well and self.rank == 0:  # the store may be in this process
                 self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
             return first
         return self.rank == 0 or self.failure is not None

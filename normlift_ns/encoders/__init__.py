@@ -18,7 +18,7 @@ _MODULES = {
     "SourceOptions": "options",
     "read_image": "segmentation.regions",
 }
-"""Module of each name that packages of others may import from here."""
+"""Module of each name that other packages may import from here."""
 
 
 def __getattr__(name: str) -> Any:

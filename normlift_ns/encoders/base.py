@@ -274,7 +274,7 @@ def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, re
         other = owner.setdefault(os.path.realpath(file), name)
         if other != name:
             raise InputError(
-                f"images {other} and {name} would share the {description} {file}; give each its own, {remedy}"
+                f"images {other} and {name} would share the {description} {file}; give each its own file, {remedy}"
             )
 
 
@@ -361,7 +361,7 @@ class PatchFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """Return the regions and features of one image; raises as `features`."""
+        """Return the regions and features of one image; raises like `features`."""
         return ViewFeatures(self.labels(image), self.features(image, name))
 
     def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:

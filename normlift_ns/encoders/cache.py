@@ -158,7 +158,7 @@ class CachedTextMasks:
     is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
-        """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.segment`."""
+        """Return the union of the masks of each text; raises like `Sam3Network.load` and `Sam3Network.segment`."""
         size = (image.shape[0], image.shape[1])
         paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
         expected = torch.Size((size[0], -(-size[1] // 8)))  # packed bits

@@ -95,14 +95,14 @@ class NetworkEncoder(ABC):
     @cached_property
     @abstractmethod
     def network(self) -> JointNetwork:
-        """The network with its weights, loaded at its first use; raises as `encode`."""
+        """The network with its weights, loaded at its first use; raises like `encode`."""
 
     @abstractmethod
     def _width(self) -> int:
         """Return the embedding dimension D."""
 
     def _prepare(self, prompt: str, text: str) -> str:
-        """Return the text, which is the prompt in a template, as the tokenizer expects it."""
+        """Return a text in the form that the tokenizer expects; `text` is `prompt` in a template."""
         return text
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
@@ -146,7 +146,7 @@ class NetworkEncoder(ABC):
         return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
+        """Return one unit row per prompt; raises like `encode`, and ValueError if `prompts` or a prompt is empty."""
         check_prompts(prompts)
         templates = prompt_templates(self.template)
         texts = [self._prepare(prompt, template(prompt)) for prompt in prompts for template in templates]

@@ -74,7 +74,8 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
     Args:
         rows: Number of rows of the table.
     Raises:
-        ValueError: If ids are not integers, or may have been rounded by half precision; and as `open_segment_map`.
+        ValueError: If ids are not integers, or may have been rounded by half precision. Also for the same reasons as
+            `open_segment_map`.
     """
     segments = open_segment_map(path)
     values = segments.astype(np.float64)
@@ -117,7 +118,7 @@ def open_feature_table(path: Path) -> np.ndarray:
 
 
 def read_feature_table(path: Path) -> tuple[Float32[Tensor, "t d"], Bool[Tensor, " t"]]:
-    """Read the unit rows of a feature table, and which rows are valid; raises as `open_segment_map`.
+    """Read the unit rows of a feature table, and which rows are valid; raises like `open_segment_map`.
 
     Rows of unit length are kept bit for bit.
     """
@@ -250,7 +251,7 @@ class LangSplat:
         return list(files_of)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """Return the regions and features of an image; raises as `available`, and ValueError if ids are not
+        """Return the regions and features of an image; raises like `available`, and ValueError if ids are not
         integers."""
         files = self._files(name)
         table, valid = read_feature_table(files.features)
@@ -299,7 +300,7 @@ class LangSplat:
         return resample_nearest(maps, height, width)
 
     def size(self, name: str) -> tuple[Path, int, int]:
-        """Return the path, width and height of the segment map of an image; raises as `view`."""
+        """Return the path, width and height of the segment map of an image; raises like `view`."""
         files = self._files(name)
         _, height, width = open_segment_map(files.segments).shape
         return files.segments, width, height

@@ -203,7 +203,7 @@ def canonical_name(encoder: str) -> str:
 
 
 def encoder_kind(name: str) -> EncoderKind:
-    """Return the encoder kind of a name; raises as `Registry.load`."""
+    """Return the encoder kind of a name; raises like `Registry.load`."""
     return ENCODERS.load(canonical_name(name))
 
 
@@ -222,7 +222,7 @@ def absolute_paths(options: SourceOptions) -> dict[str, str]:
 
 
 def absolute_if_exists(name: str) -> str:
-    """Return a name, as an absolute path if it is one of an existing file or folder."""
+    """Return the absolute path if `name` is an existing file or folder, else `name` unchanged."""
     return os.path.abspath(name) if os.path.exists(name) else name
 
 

@@ -161,7 +161,8 @@ class TextEmbeddingFile(LazyTextEncoder):
         """Return one unit row per prompt.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `texts`.
+            ValueError: If `prompts` or a prompt is empty, or one is not in the file. Also for the same reasons as
+                `texts`.
         """
         check_prompts(prompts)
         return look_up_embeddings(prompts, self._vectors, str(self.file))
@@ -198,7 +199,8 @@ def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
     """Yield texts and vectors, unchecked. Declared sizes are compared with the limits before data is read.
 
     Raises:
-        ValueError: If two entries have the same name, or an entry is too large or not an array; and as zipfile.
+        ValueError: If two entries have the same name, or an entry is too large or not an array. Also for the same
+            reasons as zipfile.
     """
     entries = archive.infolist()
     if sum(entry.file_size for entry in entries) > _MAX_FILE_BYTES:

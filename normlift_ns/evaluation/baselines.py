@@ -49,7 +49,7 @@ BASELINES: dict[Baseline, str] = {
 }
 """Description of each baseline."""
 TOP = 10
-"""Gaussians per ray that count in the baseline of Dr.Splat."""
+"""Number of Gaussians per ray that count in the baseline of Dr.Splat."""
 VISIBLE = 0.1
 """Minimum weight of a view, relative to a Gaussian's heaviest view, for the baseline of VALA to use it."""
 _RAYS = 2**17
@@ -62,7 +62,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     """Lift a run again with another method; return its field on the CPU, unrefined.
 
     Raises:
-        ValueError, FileNotFoundError: as `lifted_batches`.
+        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
     """
     evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
@@ -82,7 +82,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     If it was lifted otherwise, it is lifted again from its regions and features.
 
     Raises:
-        ValueError, FileNotFoundError: as `lifted_batches`.
+        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
     """
     manifest = lifted.field.manifest
     options = manifest.get("options", {})
@@ -322,7 +322,7 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     of SFS's method is also extrapolated to all views of the lift.
 
     Raises:
-        ValueError, FileNotFoundError: as `lifted_batches`.
+        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)

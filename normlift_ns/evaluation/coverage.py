@@ -102,7 +102,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
     """Return the images of a scene according to the manifest of the lift; of very many, an evenly spaced selection.
 
     Raises:
-        ValueError: as `lifted_names`.
+        ValueError: for the same reasons as `lifted_names`.
     """
     used, unusable = lifted_names(scene, manifest)
     train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
@@ -603,7 +603,7 @@ def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
     """Return a camera path for `ns-render camera-path`, one second per pose.
 
-    It applies to the run of the poses, because it uses the coordinates of that run.
+    It is valid only for the run that the poses were computed for, because it uses the coordinates of that run.
     """
     width, height = (poses[0].camera.width, poses[0].camera.height)
     cameras = [

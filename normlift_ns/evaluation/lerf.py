@@ -226,7 +226,7 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
     """Apply LangSplat's box filter.
 
     Returns:
-        The mean over 30 x 30 pixels, which determines the peak, and its mean with the relevancy, for the threshold.
+        The mean over 30 x 30 pixels, for the peak; and the average of this mean and the relevancy, for the threshold.
     """
     image = relevancy.float().numpy()
     kernel = np.full((_BOX, _BOX), 1 / _BOX**2, np.float32)

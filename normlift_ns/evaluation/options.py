@@ -63,7 +63,7 @@ class LerfOptions(CheckedOptions):
     langsplat_composited: the same for composited scores, without division by the length of the pixel's feature."""
     margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine; larger values give smaller masks. SFS's
-    code has 0."""
+    code uses 0."""
     average: AveragingOrder = "frames"
     """Order of averaging within a scene; the scenes are averaged last. frames: categories of a frame, then frames.
     pairs: all pairs of frame and category equally. categories: frames of a category, then categories."""

@@ -242,7 +242,7 @@ class MaskTruth:
 def mask_truth(
     scene: Scene, folder: Path, options: MaskOptions, *, settings: RasterSettings | None = None
 ) -> MaskTruth:
-    """Derive the truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
+    """Derive the ground truth of Gaussians and of held-out pixels from instance masks.
 
     Args:
         settings: rasterizer settings, those of gsplat 1.4 if None.

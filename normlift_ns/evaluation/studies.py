@@ -157,7 +157,7 @@ CONSENSUS_VARIANTS: dict[str, Variant] = {
 }
 """Vote after the consensus, by variant name."""
 BETA = LiftOptions().reliability_beta
-"""Default beta."""
+"""Default of `LiftOptions.reliability_beta`."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
     The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
     has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
-    `.views` that see them. It also has `.accuracy_unrefined` and `.accuracy_refined`, over Gaussians of known truth.
+    `.views` that see them. It also has `.accuracy_unrefined` and `.accuracy_refined`, over Gaussians with ground truth.
 
     For Gaussians with R > 0, R is compared with opacity. There are `opacity.spearman` and `opacity.kendall` with their
     p-values `…_p`, and `opacity.jaccard` of the lowest fifths. `opacity.quintile1` … are mean opacities by ascending R.
@@ -331,7 +331,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
 
 def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
-    """Return the Gaussians of known truth, and those for which each kind of prediction is correct."""
+    """Return the Gaussians with ground truth, and those for which each kind of prediction is correct."""
     truths = [scene.truth for scene in scenes if scene.truth is not None]
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
@@ -411,7 +411,7 @@ _MARKS: dict[str, dict[str, Any]] = {
 def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Plot accuracy and reliability, one line of panels per row of the study (that is, per scene).
 
-    The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, if there is a truth. The
+    The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, given ground truth. The
     right panel shows the histogram of R, with R = 0 as a separate bar.
     """
     figure, axes = make_figure((9, 3.5 * len(rows)), len(rows), 2)
@@ -533,7 +533,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
     """Evaluate the protocol for the runs and for `BASELINES` on the same features. Baselines are not refined.
 
     Raises:
-        ValueError, FileNotFoundError: as `lifted_batches`.
+        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
     """
     rows: list[Row] = []
     for name, what, refined in (("normlift", "the run, refined", True), ("unrefined", "the run, unrefined", False)):

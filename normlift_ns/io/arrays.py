@@ -238,7 +238,7 @@ def read_npy_bytes(data: bytes) -> np.ndarray:
 
 
 def _check_npy(file: IO[bytes]) -> None:
-    """Raise InputError unless a file holds numbers, and exactly as many bytes of them as its header says."""
+    """Raise InputError unless a file holds numbers, and exactly as many bytes of them as its header declares."""
     try:
         shape, _, dtype = _HEADER_READERS[np.lib.format.read_magic(file)](file)
     except Exception as error:  # a header is a Python literal; its parsers raise any kind of exception

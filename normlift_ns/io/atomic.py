@@ -46,8 +46,8 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
     One core reads about 10 GB/s.
 
     Args:
-        compare_to: digest to compare the result with. For one of version 0.1, the result uses the hash of that version,
-            at a tenth of the speed.
+        compare_to: digest to compare the result with. If version 0.1 wrote it, the result uses the hash of version
+            0.1, at a tenth of the speed.
     Raises:
         OSError: a file cannot be read.
 

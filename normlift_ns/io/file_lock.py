@@ -24,7 +24,7 @@ import msgspec
 ABANDONED = "left"
 """Outcome of an abandoned attempt; any process may claim the task again immediately."""
 BEATS_PER_TIMEOUT = 6
-"""Heartbeats per timeout: after one timeout without a heartbeat, an owner counts as dead."""
+"""Number of heartbeats per timeout: after one timeout without a heartbeat, an owner counts as dead."""
 _CLAIM_NAME = re.compile(r"([0-9a-z_-]+)\.([1-9][0-9]*)(?:\.([a-z]+))?")
 _PULSE_DIGITS = 12
 _MAX_POLL_INTERVAL = 5.0

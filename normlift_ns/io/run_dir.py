@@ -126,8 +126,8 @@ def check_run(run_dir: Path) -> None:
     first, _, rest = text.partition("\n")
     if first.startswith(_SEAL) and first != add_digest_comment(rest).partition("\n")[0]:
         warnings.warn(
-            f"{path} is not as normlift_ns wrote it: it was edited, or is damaged. If you edited it, delete its first "
-            "line; otherwise copy the whole run again",
+            f"{path} has changed since normlift_ns wrote it: it was edited, or is damaged. If you edited it, "
+            "delete its first line; otherwise copy the whole run again",
             stacklevel=2,
         )
     if (run_dir / FIELD_FOLDER / MANIFEST_FILE).exists():

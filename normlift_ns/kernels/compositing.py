@@ -198,9 +198,9 @@ UNROLL = 4
 _MOST_SLOTS = 2**26
 """Largest number of slots in a chunk, of 8 or 12 bytes each."""
 _COPIED = 128
-"""Sums that a program moves in one step."""
+"""Number of sums that a program copies in one step."""
 _PLACES = 512
-"""Sums per program that decodes keys."""
+"""Number of sums per program that decodes keys."""
 
 
 class AlphaLimits(NamedTuple):

@@ -20,14 +20,14 @@ from torch import Tensor
 LEAF = 32
 SLOTS = 64
 SPARE = 4
-"""Candidates kept in addition to K, because float32 may confuse the last few."""
+"""Number of candidates kept in addition to K, because float32 may confuse the last few."""
 MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
-"""Distances per chunk, each of 8 bytes plus the same for its components."""
+"""Number of distances per chunk, each of 8 bytes plus the same for its components."""
 _SORTED_IN_A_BLOCK = 4096
-"""Points that torch sorts in one GPU block, without passes over memory."""
+"""Number of points that torch sorts in one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Leaves per launch: half a million points, 320 bytes each at K = 36."""
+"""Number of leaves per launch: half a million points, 320 bytes each at K = 36."""
 
 
 class GatheringProcesses(Protocol):

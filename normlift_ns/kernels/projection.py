@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 CAMERA = 16
-"""Values per camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
+"""Number of values per camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
 SPLAT = 8
-"""Values per splat, read as four pairs.
+"""Number of values per splat, read as four pairs.
 
 These are the center u, v in pixels; half of xx, half of yy, and xy of the inverse covariance; the opacity; half width
 and half height of the rectangle.

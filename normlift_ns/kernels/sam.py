@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 
 _ROWS = 64
-"""Rows per program."""
+"""Number of rows per program."""
 
 
 @triton.jit
@@ -119,7 +119,7 @@ def measure_masks(
 
 
 _BLOCK = 64
-"""Positions per program."""
+"""Number of positions per program."""
 _WARPS = 4
 
 

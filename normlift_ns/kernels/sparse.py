@@ -251,7 +251,7 @@ def unit_sums(
 
 _PRODUCT_ROWS = 128
 _WIDTH = 64
-"""Entries of a row that are added in one step."""
+"""Number of entries of a row that are added in one step."""
 
 
 class SparseRowsLike(Protocol):

@@ -29,9 +29,9 @@ class LaunchConfig(NamedTuple):
     """Launch parameters of one program."""
 
     columns: int
-    """Columns of the rows loaded per step."""
+    """Number of columns of the rows loaded per step."""
     columns_later: int
-    """Columns loaded per step when both halves of the rows are loaded."""
+    """Number of columns loaded per step when both halves of the rows are loaded."""
     stages: int
     """Pipeline stages of the loads."""
     warps: int

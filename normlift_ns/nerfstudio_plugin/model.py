@@ -238,8 +238,8 @@ class NormLiftModel(SplatfactoModel):
 def find_field_folder(semantics: Path) -> Path:
     """Return the folder of the semantic field next to the config.yml that nerfstudio's `eval_setup` reads.
 
-    The config of a copied run still names the folder of the original run, and nerfstudio does not tell a model where
-    its config is. The path of the config is therefore read from the call stack.
+    The config of a copied run still names the folder of the original run, and nerfstudio does not pass a model the path
+    of its config. The path is therefore read from the call stack.
 
     Args:
         semantics: the folder that the config names; returned if there is no folder next to config.yml.

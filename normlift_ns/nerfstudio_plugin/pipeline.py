@@ -88,7 +88,7 @@ def check_before_training(trainer: Trainer) -> None:
     """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
-        ValueError, FileNotFoundError: the data parser or model cannot be lifted, an option is out of range, or
+        ValueError, FileNotFoundError: the lift does not support the data parser or model, an option is out of range, or
             nerfstudio misreads the pixel values of an image.
         PermissionError: the folder of the run or of the lift's caches is not writable.
     """
@@ -120,7 +120,7 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
     """Make the feature source of a config; without a folder of features, LangSplat's are read from the dataset.
 
     Raises:
-        ValueError, FileNotFoundError: as `make_source`; the message names the options of ns-train.
+        ValueError, FileNotFoundError: for the same reasons as `make_source`; the message names the options of ns-train.
     """
     options = _source_options(config)
     try:

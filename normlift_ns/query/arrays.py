@@ -26,7 +26,7 @@ from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
 _BLOCK_ELEMENTS = 2**21
-"""Elements converted to float32 at a time, few enough for a processor's cache."""
+"""Number of elements converted to float32 at a time, few enough for a processor's cache."""
 
 
 class ArrayField(FieldArrays):
@@ -34,7 +34,7 @@ class ArrayField(FieldArrays):
 
     @property
     def scalars(self) -> SimpleNamespace:
-        """Numbers of the Gaussians, as in `core.lift.Scalars`."""
+        """Scalars per Gaussian, as in `core.lift.Scalars`."""
         return SimpleNamespace(**{name: self.arrays[name] for name in SCALAR_NAMES})
 
     def valid(self, *, refined: bool = True) -> Bool[np.ndarray, " n"]:

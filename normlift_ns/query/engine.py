@@ -35,7 +35,7 @@ class QueryField(HasManifest, Protocol):
 
     @property
     def scalars(self) -> Any:
-        """Numbers of the Gaussians, with `reliability` and `weight`, as in `core.lift.Scalars`."""
+        """Scalars per Gaussian, at least `reliability` and `weight`, as in `core.lift.Scalars`."""
         ...
 
     def valid(self, *, refined: bool = True) -> Any:
@@ -270,7 +270,7 @@ class SelectionStats(NamedTuple):
 def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     """Compute relevancy and selection of every Gaussian for each prompt.
 
-    If the query asks for a suggested threshold, the query in the result has that threshold.
+    If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
 
     Args:
         means: centers of the Gaussians, as tensor or array like the field.
@@ -291,7 +291,7 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
 def apply_threshold(answer: Answer, question: Query) -> Answer:
     """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
 
-    If the query asks for a suggested threshold, the query in the result has that threshold.
+    If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
     """
     if question.suggest_threshold:
         suggested = answer.suggested_threshold

@@ -207,8 +207,8 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     """Return the query with this metadata and these embeddings.
 
     Raises:
-        ValueError: the metadata or an embedding is not valid, or they do not fit together, or not the field in the
-            folder.
+        ValueError: the metadata or an embedding is not valid, they are inconsistent, or they do not match the field in
+            the folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)
     if not math.isfinite(metadata.threshold):

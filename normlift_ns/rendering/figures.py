@@ -1,4 +1,4 @@
-"""Rendered outputs of an answer, and figures of the training images with it."""
+"""Semantic outputs of a render, and figures that show an answer next to the training images."""
 
 from __future__ import annotations
 

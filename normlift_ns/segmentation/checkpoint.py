@@ -349,7 +349,7 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)
-        raise InputError(f"it has no image_encoder.pos_embed, expected a file published by Meta for {_FIRST}")
+        raise InputError(f"it lacks image_encoder.pos_embed; expected a file published by Meta for {_FIRST}")
     return config_from_weights(state), {transformers_name(name): value for name, value in state.items()}
 
 

@@ -29,7 +29,7 @@ class Suppression:
     outer: float = 0.5
     """A mask lies inside another one if it covers less than this share of the other one and meets `inner`."""
     inner: float = 0.85
-    """Least share of a mask that must lie in the other one. Masks inside others are dropped, whatever their score."""
+    """Smallest share of a mask that must lie in the other one. Masks inside others are dropped at any score."""
 
 
 class MaskMeasurements(NamedTuple):

@@ -80,7 +80,7 @@ _WORKERS = min(4, os.cpu_count() or 1)
 
 
 class RegionDefaults:
-    """The members of `Regions` of methods with one level and without files, which segment one image at a time."""
+    """Members of `Regions` for mask sources with one level and no files that segment one image at a time."""
 
     at_once = 1
 
@@ -226,7 +226,7 @@ class LabelFiles(RegionDefaults):
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
 
     def size(self, name: str) -> tuple[Path, int, int]:
-        """Return the path, width and height of the label map of an image; raises as `values`."""
+        """Return the path, width and height of the label map of an image; raises like `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
             with _open_image(path, self.description, _MAP_FORMATS) as image:

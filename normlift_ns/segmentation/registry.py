@@ -207,7 +207,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
 
 
 def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
-    """Return a mask source whose options can work, as far as this is known without torch.
+    """Return a mask source after the checks of its options that do not need torch.
 
     Raises:
         ValueError: If the name is unknown, an option is set that only other mask sources take, or the mask source

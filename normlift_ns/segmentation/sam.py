@@ -227,7 +227,7 @@ class _Upscaling(NamedTuple):
     side: int
     """Side of the image, in positions."""
     weights: tuple[Tensor, Tensor]
-    """Matrices [4 O, C]: a position becomes four, row by row, with O channels."""
+    """Matrices [4 O, C], which map a position with C channels to 2 x 2 positions, row by row, with O channels each."""
     biases: tuple[Tensor, Tensor]
     """Biases [O]."""
     norm: _Norm
@@ -552,7 +552,7 @@ class MaskRules:
     """Prompts and thresholds of the automatic masks; the defaults are LangSplat's settings."""
 
     points_per_side: int = 32
-    """Prompts along each side of the image and of each crop."""
+    """Number of prompts along each side of the image and of each crop."""
     crop_overlap: float = 512 / 1500
     """Overlap of neighboring crops, as a share of the shorter side of the image."""
     predicted_iou: float = 0.7
@@ -736,7 +736,7 @@ def crop_boxes(height: int, width: int, overlap: float) -> list[CropBox]:
 
 
 def near_crop_edge(boxes: Int64[Tensor, "n 4"], crop: CropBox, size: tuple[int, int], edge: int) -> Bool[Tensor, " n"]:
-    """Return a mask of the boxes with a side within `edge` pixels of that side of the crop, but not of the image.
+    """Return a mask of the boxes with a side within `edge` pixels of the same side of the crop, but not of the image.
 
     Args:
         boxes: Boxes in the image, as `masks_to_boxes` returns them.

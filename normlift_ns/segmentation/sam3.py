@@ -42,7 +42,7 @@ _MASK_THRESHOLD = 0.5
 _TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
 _MAX_TOKENS = 32
 _TOGETHER = 16
-"""Masks per batch at the size of the image."""
+"""Number of masks per batch at the size of the image."""
 
 
 class TextMasks(NamedTuple):

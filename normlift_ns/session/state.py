@@ -40,7 +40,7 @@ class State:
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     grow_steps: int = 0
-    """Steps of growth over the neighbor graph; negative: steps of shrinking."""
+    """Number of steps of growth over the neighbor graph; negative: steps of shrinking."""
     box: SelectionBox | None = None
     hidden: Bool[Tensor, " n"] | None = None
     """Gaussians that are not drawn."""

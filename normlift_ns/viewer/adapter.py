@@ -158,7 +158,7 @@ def guarded() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded_one() -> Iterator[None]:
-    """Do the same for viser 1.x, which already rejects paths outside its folder and does not compress."""
+    """Guard the file server of viser 1.x, which already rejects paths outside its folder and does not compress."""
     from viser.infra import _infra  # noqa: PLC0415
 
     one: Any = _infra
@@ -391,7 +391,7 @@ class BrowserPage:
         return self._client.atomic()
 
     def notice(self, text: str) -> None:
-        """Show a text in the panel in place of the previous one; empty: show none."""
+        """Show a text in the panel in place of the previous one; an empty text removes it."""
         if self._notice is not None:
             self._notice.remove()
         self._notice = self._client.gui.add_markdown(text) if text else None

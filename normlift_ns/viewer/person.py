@@ -226,13 +226,13 @@ _GLANCE = 0.02
 
 
 class Painter:
-    """Begins to work when it is first told that something has `changed`.
+    """Renderer of a page, which starts at the first call of `changed`.
 
     Args:
         state: what to draw.
-        drawn: called with a state that was sent.
-        rested: called with it again once nothing has changed for a while, for what takes longer.
-        failed: called with whatever was raised.
+        drawn: called with each state after it was sent.
+        rested: called with the state again after a while without changes, for slower work.
+        failed: called with each exception.
     """
 
     def __init__(
@@ -252,7 +252,7 @@ class Painter:
         threading.Thread(target=self._work, daemon=True).start()
 
     def changed(self) -> None:
-        """There is something new to draw."""
+        """Request a new render."""
         self._changed.set()
 
     def end(self) -> None:
@@ -291,12 +291,12 @@ class Painter:
 
 
 class Panel(ActionWidgets):
-    """The widgets of one page.
+    """Widgets of one page.
 
     Args:
         gui: viser's `GuiApi` of the page.
-        act: called with what a person does; returns at once.
-        readonly: without what writes to the disk of the server.
+        act: called with each action of the user; returns immediately.
+        readonly: omit widgets that write to the server's disk.
     """
 
     def __init__(self, gui: Any, act: Act, facts: str, *, readonly: bool) -> None:

@@ -39,7 +39,7 @@ BYTES = 32
 _THINNEST = 1e-4
 """Least standard deviation, as a share of the largest: what is thinner is not to be seen."""
 _EXTENT = 3.0
-"""Half the size that a scene gets in the browser, whose cameras see from 0.01 to 1000."""
+"""Half the size of the scene in the browser, whose cameras have clipping planes at 0.01 and 1000."""
 
 
 @dataclass(frozen=True)
@@ -225,8 +225,9 @@ def scale(state: State) -> tuple[float, float]:
 
 
 def legend(state: State) -> str:
-    """As MDX: a bar of the colours with the numbers at its ends; empty where colours are those of the scene, or
-    say only that something is selected.
+    """Return the color bar with the values at its ends, as MDX.
+
+    It is empty if the scene keeps its own colors, or if colors only mark the selection.
     """
     by_hand = state.answer is None or not state.prompts_select
     if state.color_mode in ("colours", "prompts") or (state.color_mode == "overlay" and by_hand):
@@ -365,10 +366,10 @@ def read_link(query: str) -> Link | None:
 
 
 def read_hello(text: str) -> Hello:
-    """What the page says when it opens.
+    """Return the first message of a page.
 
     Raises:
-        ValueError: something else.
+        ValueError: the text is not such a message.
     """
     try:
         return msgspec.json.decode(text, type=Hello)
@@ -468,4 +469,4 @@ class Memory(Session):
     link: str = ""
     """The last link that was followed or made here; it says nothing new."""
     page: int | None = None
-    """Connection that shows it now."""
+    """Connection that currently shows this session."""

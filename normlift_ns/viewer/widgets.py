@@ -64,7 +64,7 @@ class Action(Enum):
 Act = Callable[[Action, Any, Any], None]
 """Called with an action, its value, and the browser that sent it."""
 SLIDERS = (Action.THRESHOLD, Action.RELIABILITY, Action.GROW)
-"""Actions of which successive ones are one step of the history."""
+"""Actions whose successive calls count as one step of the history."""
 ALL_PROMPTS = "all prompts"
 
 
@@ -402,7 +402,7 @@ class Explanation:
         """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
 
         Raises:
-            ValueError, FileNotFoundError: as `explanation_mdx`, unless the request is stale.
+            ValueError, FileNotFoundError: for the same reasons as `explanation_mdx`, unless the request is stale.
         """
         content = ""
         try:

@@ -1,7 +1,7 @@
 """Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
 
 A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because each
-imports the class that it configures, its `_target`; of that the mirrors know only the name.
+imports the class that it configures, its `_target`; the mirrors store only its name.
 """
 
 from __future__ import annotations

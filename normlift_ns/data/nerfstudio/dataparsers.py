@@ -263,7 +263,7 @@ def split_files(
 
     Raises:
         ValueError: if only one of the train and test lists exists, a listed file is missing, or eval_mode is filename
-            and a file name does not tell its split.
+            and a file name does not contain its split.
     """
     if any(names is not None for names in lists.values()):
         return _listed_files(files, lists["train"], "train"), _listed_files(files, lists["test"], "test")
@@ -437,7 +437,7 @@ def _lenses(rows: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "v 4"], Int6
 def _downscale_factor(
     file: Path, parser: config_classes.PosedDataParserConfig, has_copies: Callable[[int], bool] = lambda factor: True
 ) -> int:
-    """Return the factor by which nerfstudio downscales images, which depends on one of them if the config has none."""
+    """Return nerfstudio's downscale factor for images; if the config has none, it depends on the size of one image."""
     if parser.downscale_factor is not None:
         return parser.downscale_factor
     longest, factor = max(_image_size(file, parser.data)), 1
