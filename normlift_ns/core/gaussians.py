@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
 
 MIN_OPACITY = 1 / 255
@@ -27,7 +28,7 @@ or silently the identity."""
 
 
 @dataclass(frozen=True)
-class GaussianScene:
+class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
     A Gaussian with parameters that are not finite or out of range keeps its row, but is never drawn (see `drawable`).
@@ -78,10 +79,6 @@ class GaussianScene:
 
     def __len__(self) -> int:
         return self.means.shape[0]
-
-    def to(self, device: torch.device | str) -> GaussianScene:
-        """Return a copy on another device."""
-        return GaussianScene(*(x.to(device) for x in (self.means, self.quats, self.scales, self.opacities)))
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:

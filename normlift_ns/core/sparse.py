@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from normlift_ns.core.device import can_use_triton
+from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
 
 CANCELLATION_RATIO = 1e-3
@@ -44,7 +44,7 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
 
 
 @dataclass(frozen=True)
-class SparseRows:
+class SparseRows(TensorRecord):
     """A sparse matrix in CSR format.
 
     Row i holds columns column[offsets[i]:offsets[i + 1]], in ascending order, with their weights.
@@ -120,10 +120,6 @@ class SparseRows:
         if low < 0:
             raise InputError(f"columns must be 0 or more, found {low}")
         return high + 1
-
-    def to(self, device: torch.device | str) -> SparseRows:
-        """Return a copy on another device."""
-        return SparseRows(self.offsets.to(device), self.column.to(device), self.weight.to(device))
 
     def row_index(self) -> Int64[Tensor, " nnz"]:
         """Return the row of every entry."""

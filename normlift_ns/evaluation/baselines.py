@@ -66,7 +66,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     """
     evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
-    scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.map(Tensor.cpu)
+    scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.to("cpu")
     own, manifest = torch.arange(evidence.num_gaussians, dtype=torch.int32), {"dimension": features.shape[1]}
     if name != "vala":
         return SemanticField(scalars, own, StoredEvidence(evidence.to("cpu"), features.cpu()), manifest)
@@ -98,7 +98,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     own = torch.arange(views.evidence.num_gaussians, dtype=torch.int32)
     store = StoredEvidence(views.evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": enabled}}
-    return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
+    return replace(lifted, field=SemanticField(result.scalars.to("cpu"), own, store, manifest), refined=False)
 
 
 def _observe_again(

@@ -775,7 +775,7 @@ def coverage_of(
     check_number("min_reliability", min_reliability)
     images = study_images(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)
-    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).map(lambda x: x.to(device))
+    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).to(device)
     drawn = RasterInputs(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
     weights, count = view_weights(drawn, images.cameras), len(images.cameras)
     surface = max_weights(weights)
