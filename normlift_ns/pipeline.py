@@ -342,11 +342,7 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
-            evidence = rasterize_evidence(
-                sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
-                rasterize_mode=config.rasterize_mode, settings=config.settings, dtype=config.dtype,
-                weight_power=config.weight_power,
-            )  # fmt: skip
+            evidence = rasterize_evidence(sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], **config.options)
             features = torch.eye(_WARM_UP_REGIONS, _WARM_UP_DIMENSION, dtype=config.dtype, device=sample.means.device)
             if options.consensus:
                 consensus(evidence, features)

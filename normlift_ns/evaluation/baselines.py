@@ -133,9 +133,8 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
     used = [usable[i] for i in sample_evenly(len(usable), options.get("max_views"))]
     used = [used[i] for i in sample_evenly(len(used), max_views)]
     rendered = lifted.settings if options.get("image_source") == "render" else None
-    kwargs = {"render_settings": rendered, "downscale": options.get("lift_downscale", 1), "on_view": lambda view: None}
     for chunk in chunk_views(used):
-        yield observe_views(scene, chunk, source, **kwargs)
+        yield observe_views(scene, chunk, source, render_settings=rendered, downscale=options.get("lift_downscale", 1))
 
 
 def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch, *, power: int = 1) -> Evidence:

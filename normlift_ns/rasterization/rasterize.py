@@ -308,12 +308,8 @@ def _zip_views(
 
 
 def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
-    if (
-        not isinstance(labels, Tensor)
-        or labels.dtype.is_floating_point
-        or labels.dtype in (torch.bool, torch.complex64)
-    ):
-        kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
+    kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
+    if isinstance(kind, str) or kind.is_floating_point or kind.is_complex or kind == torch.bool:
         raise InputError(f"labels of view {index} must be an integer tensor, got {kind}")
     if tuple(labels.shape) != (camera.height, camera.width):
         raise InputError(
@@ -449,8 +445,8 @@ def ray_weights(
     scales = scales.clamp(min=1e-12).maximum(_MIN_SCALE_RATIO * scales.amax(dim=1, keepdim=True))
     forward = torch.nn.functional.normalize(direction.to(means), dim=0)
     quats = torch.nn.functional.normalize(quats, dim=1)
-    start = _to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
-    step = _to_axes(forward.expand_as(means), quats) / scales
+    start = to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
+    step = to_axes(forward.expand_as(means), quats) / scales
     distance = -(start * step).sum(1) / (step * step).sum(1)
     square = (start + distance[:, None] * step).square().sum(1)
     alpha = (scene.opacities[rows].double() * torch.exp(-square / 2)).clamp(max=_MAX_ALPHA)
@@ -462,7 +458,7 @@ def ray_weights(
     return out
 
 
-def _to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+def to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
     """Rotate world vectors into the axes of Gaussians with unit quaternions (w, x, y, z): the inverse rotation."""
     real, imaginary = quats[:, :1], -quats[:, 1:]
     turn = 2 * torch.linalg.cross(imaginary, vectors)
