@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.device import TensorRecord
-from normlift_ns.core.sparse import SparseRows, segment_sum
+from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
@@ -146,9 +146,7 @@ class Evidence(TensorRecord):
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
             raise InputError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
-        bounds = torch.searchsorted(
-            self.region_view, torch.arange(self.num_views + 1, dtype=torch.int32, device=self.region_view.device)
-        ).tolist()
+        bounds = row_offsets(self.region_view, self.num_views).tolist()
         parts = [torch.arange(bounds[v], bounds[v + 1]) for v in chosen]
         return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 

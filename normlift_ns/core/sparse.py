@@ -133,9 +133,7 @@ class SparseRows(TensorRecord):
         """Return the given rows in the given order."""
         start, length = self.offsets[:-1][rows], self.offsets.diff()[rows]
         offsets = torch.cat([length.new_zeros(1), length.cumsum(0)])
-        entry = torch.arange(int(offsets[-1]), device=offsets.device) + torch.repeat_interleave(
-            start - offsets[:-1], length
-        )
+        entry = torch.arange(int(offsets[-1]), device=offsets.device) + (start - offsets[:-1]).repeat_interleave(length)
         return SparseRows(offsets, self.column[entry], self.weight[entry])
 
     def select_columns(self, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:

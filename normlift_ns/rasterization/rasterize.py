@@ -17,6 +17,7 @@ from normlift_ns.core.device import has_triton, retry_in_halves
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene
+from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.errors import InputError
 from normlift_ns.options import BackendName, RasterizeMode
 from normlift_ns.rasterization.backend import Backend, RasterBatch, RasterJob, TileBackend
@@ -184,16 +185,13 @@ def rasterize_evidence(
     return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
-def resolve_backend(
-    scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
-) -> BackendName:
+def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpack[RasterOptions]) -> BackendName:
     """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
         ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
     """
-    job = _job(scene, "classic", settings, dtype, weight_power)
-    return cast(BackendName, choose_backend(backend, job)[0])
+    return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
 
 def render(
@@ -396,11 +394,9 @@ def contributors(
     gaussian, column = rows.row_index(), rows.column.long()
     order = depth[gaussian].argsort(stable=True)
     order = order[column[order].argsort(stable=True)]
-    bounds = torch.searchsorted(column[order], torch.arange(len(position) + 1, device=device))
-    start, count = bounds[:-1][region], bounds.diff()[region]
-    offsets = torch.cat([count.new_zeros(1), count.cumsum(0)])
-    entry = torch.arange(int(offsets[-1]), device=device) + (start - offsets[:-1]).repeat_interleave(count)
-    return Contributors(offsets, gaussian[order[entry]], rows.weight[order[entry]])
+    by_position = SparseRows(row_offsets(column, len(position)), gaussian[order].int(), rows.weight[order])
+    by_pixel = by_position.select_rows(region)
+    return Contributors(by_pixel.offsets, by_pixel.column.long(), by_pixel.weight)
 
 
 def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
