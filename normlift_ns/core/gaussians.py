@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -173,3 +173,18 @@ class Camera:
         width, height = (max(1, round(min(1.0, factor) * side)) for side in (self.width, self.height))
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)
+
+    def project(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Return row and column of the pixel of every point, its depth, and whether it lies in the image.
+
+        Points outside the image have a pixel at its border.
+        """
+        pose = self.world_to_camera.to(points)
+        seen = points @ pose[:3, :3].T + pose[:3, 3]
+        depth = seen[:, 2]
+        pixel = (seen @ self.K.to(points).T)[:, :2] / depth[:, None].clamp(min=1e-9)
+        inside = (depth > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < self.width) & (pixel[:, 1] < self.height)
+        column, row = (pixel[:, i].long().clamp(0, size - 1) for i, size in enumerate((self.width, self.height)))
+        return row, column, depth, inside

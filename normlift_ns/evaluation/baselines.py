@@ -171,11 +171,7 @@ def center_evidence(
     rows, views, points = row.cpu(), view.cpu(), means.cpu().double()
     for v, (camera, pixel_columns) in enumerate(zip(cameras, columns)):
         entries = (views == v).nonzero().squeeze(1)
-        pose = camera.world_to_camera.cpu().double()
-        projected = (points[rows[entries]] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.cpu().double().T
-        x, y = (projected[:, i] / projected[:, 2].clamp(min=1e-6) for i in (0, 1))
-        inside = (projected[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        x, y = (c.clamp(0, size - 1).long() for c, size in ((x, camera.width), (y, camera.height)))
+        y, x, _, inside = camera.project(points[rows[entries]])
         column[entries] = torch.where(inside, pixel_columns.cpu()[y, x].long(), -1)
     column = column.to(row.device)
     valid = column >= 0

@@ -320,13 +320,12 @@ def view_figure(
         selected: mask of the selected pixels, which are outlined.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
-    panels, captions = [panel], ["answer"]
-    if image is not None:
-        panels.insert(0, Image.fromarray(image.cpu().numpy()).resize(panel.size))
-        captions.insert(0, "training image")
+    panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
+    panels["answer"] = panel
     share = float(selected.float().mean())
     summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
-    return _page(sheet, [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary], panels, captions, 2)
+    titles = [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary]
+    return _page(sheet, titles, list(panels.values()), list(panels), 2)
 
 
 def contact_sheet(
