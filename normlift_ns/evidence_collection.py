@@ -64,6 +64,12 @@ class RasterConfig:
         return RasterSettings.of_gsplat(self.gsplat_version)
 
     @property
+    def options(self) -> dict[str, Any]:
+        """Keywords of `rasterize_evidence`."""
+        names = ("backend", "rasterize_mode", "weight_power", "settings", "dtype")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def key(self) -> list[Any]:
         """Part of every cache key, as JSON types."""
         return [self.rasterize_mode, self.weight_power, str(self.dtype), asdict(self.settings), self.backend]
@@ -213,7 +219,7 @@ def observe_views(
     *,
     render_settings: RasterSettings | None,
     downscale: int,
-    on_view: Callable[[View], None],
+    on_view: Callable[[View], None] = lambda view: None,
 ) -> ViewBatch:
     """Compute labels and features of some training views.
 
@@ -290,12 +296,8 @@ def batch_evidence(
             [block.cameras[view] for view in missing],
             [block.labels[view] for view in missing],
             num_regions=[block.regions[view].shape[1] for view in missing],
-            backend=config.backend,
-            rasterize_mode=config.rasterize_mode,
-            weight_power=config.weight_power,
-            settings=config.settings,
-            dtype=config.dtype,
             progress=lambda *_: on_view(),
+            **config.options,
         )
         cache_views(evidence, folder, [keys[view] for view in missing])
         cached.update((view, (evidence, index)) for index, view in enumerate(missing))

@@ -44,7 +44,6 @@ from normlift_ns.options import (
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
-from normlift_ns.rasterization.settings import RasterSettings
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features below which to warn: something is wrong, or almost no pixel was labeled."""
@@ -149,12 +148,10 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
 
 def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> RasterConfig:
     """Choose how to rasterize, and raise before any image is read if that is impossible."""
-    rules = resolve_gsplat_version(scene, options)
+    rules, mode = resolve_gsplat_version(scene, options), scene.rasterize_mode
     dtype = torch.float64 if options.precision == "double" else torch.float32
-    settings = RasterSettings.of_gsplat(rules)
-    power = options.weight_power
-    backend = resolve_backend(gaussians, options.backend, settings=settings, dtype=dtype, weight_power=power)
-    return RasterConfig(rules, backend, dtype, scene.rasterize_mode, power)
+    config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power)
+    return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
@@ -343,11 +340,7 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
-            evidence = rasterize_evidence(
-                sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], backend=config.backend,
-                rasterize_mode=config.rasterize_mode, settings=config.settings, dtype=config.dtype,
-                weight_power=config.weight_power,
-            )  # fmt: skip
+            evidence = rasterize_evidence(sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], **config.options)
             features = torch.eye(_WARM_UP_REGIONS, _WARM_UP_DIMENSION, dtype=config.dtype, device=sample.means.device)
             if options.consensus:
                 consensus(evidence, features)

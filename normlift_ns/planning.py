@@ -526,7 +526,7 @@ def measure_capture(
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
-        kwargs = {"render_settings": rendered, "downscale": options.lift_downscale, "on_view": lambda view: None}
+        kwargs = {"render_settings": rendered, "downscale": options.lift_downscale}
         seconds, block = timed(lambda: evidence_collection.observe_views(scene, indices, source, **kwargs))
         return _Observed(block, seconds)
 

@@ -119,7 +119,7 @@ def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float])
     if len(powers) == 0:
         return {}
     chosen, chance = sample_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
-    rows, total = evidence.rows.select_rows(chosen), total_view_weights(evidence, chosen)
+    rows, total = evidence.rows.select_rows(chosen), total_view_weights(evidence.select_gaussians(chosen))
     overlaps = region_overlaps(rows, evidence.region_view, chance, total)
     return {power: apply_consensus(features, overlaps, power) for power in powers}
 

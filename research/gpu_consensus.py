@@ -96,7 +96,7 @@ def main(quick: bool, output: Path) -> None:
     size, features = evidence.num_regions, table(evidence.num_regions).to(device)
     chosen, chance = sample_gaussians(evidence.rows, size, 50)
     rows = evidence.rows.select_rows(chosen)
-    total = total_view_weights(evidence, chosen)
+    total = total_view_weights(evidence.select_gaussians(chosen))
     overlaps = region_overlaps(rows, evidence.region_view, chance, total)
     sampled, whole = (consensus(evidence, features, sample=k) for k in (50, 1000))
     distance = float((1 - (sampled.features * whole.features).sum(1)).mean())
@@ -108,7 +108,7 @@ def main(quick: bool, output: Path) -> None:
     tasks = {
         "sample": lambda: sample_gaussians(evidence.rows, size, 50),
         "select": lambda: evidence.rows.select_rows(chosen),
-        "weights": lambda: total_view_weights(evidence, chosen),
+        "weights": lambda: total_view_weights(evidence.select_gaussians(chosen)),
         "overlaps": lambda: region_overlaps(rows, evidence.region_view, chance, total),
         "sum": partial(apply_consensus, features, overlaps),
         "all": lambda: consensus(evidence, features),

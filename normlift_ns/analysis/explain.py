@@ -32,7 +32,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.scene import Scene
-from normlift_ns.core.sparse import SparseRows
+from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import REMEDY, cached
@@ -212,8 +212,7 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
     gap = torch.where(gap > 1e-12 * length, gap, 0.0)  # ignore rounding errors
     disagreement = gap / gap.sum() if float(gap.sum()) > 0 else gap
     agreement = torch.where(length > 0, along / length.clamp(min=1e-300), 0.0).clamp(-1, 1)
-    views = torch.arange(joined.num_views, dtype=torch.int32, device=joined.region_view.device)
-    cosine, first = table @ direction, torch.searchsorted(joined.region_view.contiguous(), views)  # columns of images
+    cosine, first = table @ direction, row_offsets(joined.region_view, joined.num_views)  # columns of images
     votes = []
     for v in total.argsort(descending=True, stable=True).tolist():
         if not float(total[v]) > 0:

@@ -167,7 +167,7 @@ def sampled_consensus(
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
     out, agreement = features.to(device, copy=True), []
     levels = level.unique().tolist()
-    total = total_view_weights(sampled, torch.arange(len(rows), device=device), max(1, len(levels)))
+    total = total_view_weights(sampled, max(1, len(levels)))
     for number in levels:
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
@@ -235,14 +235,13 @@ def sample_gaussians(
         share = torch.where(lacking, (2 * share).clamp(max=1), share)
 
 
-def total_view_weights(evidence: Evidence, gaussians: Int64[Tensor, " m"], levels: int = 1) -> SparseRows:
-    """Return W_jv of some Gaussians, [M, views], including pixels without a region.
+def total_view_weights(evidence: Evidence, levels: int = 1) -> SparseRows:
+    """Return W_jv of all Gaussians, [M, views], including pixels without a region.
 
     Args:
         levels: number of levels, by which weights are divided because the evidence counts a pixel once per level.
     """
-    rows, blank = evidence.rows.select_rows(gaussians), evidence.unlabeled.select_rows(gaussians)
-    total = SparseRows.add(replace(evidence, rows=rows, unlabeled=blank).view_weights(), blank)
+    total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
     return replace(total, weight=total.weight / levels)
 
 

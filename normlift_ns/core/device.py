@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import islice
 from threading import Thread
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -24,6 +24,17 @@ MIN_TRITON_VERSION = 3
 Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Record = TypeVar("Record")
+
+
+class TensorRecord:
+    """Base of dataclasses whose fields are tensors, other such dataclasses, or values without a device."""
+
+    def to(self: Record, device: torch.device | str) -> Record:
+        """Return a copy on another device."""
+        record = cast(Any, self)  # the subclasses are dataclasses
+        values = {field.name: getattr(record, field.name) for field in fields(record)}
+        return replace(record, **{name: x.to(device) for name, x in values.items() if hasattr(x, "to")})
 
 
 @cache

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.sparse import SparseRows, segment_sum
+from normlift_ns.core.device import TensorRecord
+from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
@@ -36,7 +37,7 @@ class Entries(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(TensorRecord):
     """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
 
     Columns s number the regions of all views consecutively, like the rows of the feature table. They ascend within a
@@ -138,27 +139,25 @@ class Evidence:
         """Return the columns of the given views, in their order.
 
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
-        """
-        bounds = torch.searchsorted(
-            self.region_view, torch.arange(self.num_views + 1, dtype=torch.int32, device=self.region_view.device)
-        ).tolist()
-        parts = [torch.arange(bounds[v], bounds[v + 1]) for v in self._checked_views(views)]
-        return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 
-    def _checked_views(self, views: Sequence[int] | Tensor) -> list[int]:
+        Raises:
+            ValueError: if a view does not exist or is given twice.
+        """
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
             raise InputError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
-        return chosen
+        bounds = row_offsets(self.region_view, self.num_views).tolist()
+        parts = [torch.arange(bounds[v], bounds[v + 1]) for v in chosen]
+        return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 
     def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
         """Return the evidence of some views, renumbered in the given order.
 
         Raises:
-            ValueError: if a view does not exist or is given twice.
+            ValueError: as `columns_of`.
         """
         columns = self.columns_of(views)
-        chosen = torch.tensor(self._checked_views(views), dtype=torch.int64, device=columns.device)
+        chosen = torch.as_tensor(views, dtype=torch.int64, device=columns.device)
         rows = self.rows.select_columns(columns, self.num_regions)
         unlabeled = self.unlabeled.select_columns(chosen, self.num_views)
         new_view = torch.full((self.num_views,), -1, dtype=torch.int32, device=columns.device)
@@ -231,15 +230,6 @@ class Evidence:
         unlabeled = SparseRows.append_columns([part.unlabeled for part in parts], views)
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
-
-    def to(self, device: torch.device | str) -> Evidence:
-        """Return a copy on another device."""
-        return replace(
-            self,
-            rows=self.rows.to(device),
-            region_view=self.region_view.to(device),
-            unlabeled=self.unlabeled.to(device),
-        )
 
     def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
         """Write a safetensors file atomically, replacing an earlier one, and return its digest.

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import (
@@ -36,7 +37,7 @@ from normlift_ns.options import RelevancyRule, Storage
 
 
 @dataclass(frozen=True)
-class SemanticField:
+class SemanticField(TensorRecord):
     """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three storage forms.
 
     >>> import torch
@@ -62,12 +63,6 @@ class SemanticField:
 
     def __len__(self) -> int:
         return self.source.numel()
-
-    def to(self, device: torch.device | str) -> SemanticField:
-        """Return a copy on another device."""
-        scalars = self.scalars.map(lambda x: x.to(device))
-        means = None if self.means is None else self.means.to(device)
-        return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest, means)
 
     @property
     def dimension(self) -> int:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
 
 MIN_OPACITY = 1 / 255
@@ -27,7 +28,7 @@ or silently the identity."""
 
 
 @dataclass(frozen=True)
-class GaussianScene:
+class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
     A Gaussian with parameters that are not finite or out of range keeps its row, but is never drawn (see `drawable`).
@@ -78,10 +79,6 @@ class GaussianScene:
 
     def __len__(self) -> int:
         return self.means.shape[0]
-
-    def to(self, device: torch.device | str) -> GaussianScene:
-        """Return a copy on another device."""
-        return GaussianScene(*(x.to(device) for x in (self.means, self.quats, self.scales, self.opacities)))
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
@@ -176,3 +173,18 @@ class Camera:
         width, height = (max(1, round(min(1.0, factor) * side)) for side in (self.width, self.height))
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)
+
+    def project(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Return row and column of the pixel of every point, its depth, and whether it lies in the image.
+
+        Points outside the image have a pixel at its border.
+        """
+        pose = self.world_to_camera.to(points)
+        seen = points @ pose[:3, :3].T + pose[:3, 3]
+        depth = seen[:, 2]
+        pixel = (seen @ self.K.to(points).T)[:, :2] / depth[:, None].clamp(min=1e-9)
+        inside = (depth > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < self.width) & (pixel[:, 1] < self.height)
+        column, row = (pixel[:, i].long().clamp(0, size - 1) for i, size in enumerate((self.width, self.height)))
+        return row, column, depth, inside

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.device import can_use_triton
+from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
 from normlift_ns.errors import InputError
@@ -35,7 +35,7 @@ _LENGTH_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True)
-class Scalars:
+class Scalars(TensorRecord):
     """Scalars of every Gaussian.
 
     Without evidence (W_j < 1e-15 or f_j = 0), all but `view_count` and `weight` are 0.

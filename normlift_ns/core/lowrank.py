@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float16, Float64, Int, Int64
 from torch import Tensor
 
+from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.partition import PARTITION_BLOCK, Communicator, Partition
@@ -98,15 +99,11 @@ fast."""
 
 
 @dataclass(frozen=True)
-class StoredEvidence:
+class StoredEvidence(TensorRecord):
     """E and F themselves: exact, and E can be reused with another encoder."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
-
-    def to(self, device: torch.device | str) -> StoredEvidence:
-        """Return a copy on another device."""
-        return StoredEvidence(self.evidence.to(device), self.features.to(device))
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
         """Return cosines to unit vectors, 0 without evidence: E (F t) / (W_j ||f_j||), computed in float64."""
@@ -123,7 +120,7 @@ class StoredEvidence:
 
 
 @dataclass(frozen=True)
-class StoredDirections:
+class StoredDirections(TensorRecord):
     """Directions of the M Gaussians with evidence, in float16, either directly or as coordinates in a basis."""
 
     coordinates: Float16[Tensor, "m r"]
@@ -133,10 +130,6 @@ class StoredDirections:
     def dimension(self) -> int:
         """D, the length of the directions."""
         return (self.coordinates if self.basis is None else self.basis).shape[1]
-
-    def to(self, device: torch.device | str) -> StoredDirections:
-        """Return a copy on another device."""
-        return StoredDirections(self.coordinates.to(device), None if self.basis is None else self.basis.to(device))
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
         """Return cosines to unit vectors, 0 without evidence."""

@@ -30,9 +30,10 @@ class Communicator(ABC):
     def all_gather(self, rows: Tensor) -> Tensor:
         """Return the concatenated rows of all processes, in every process."""
 
-    @abstractmethod
     def gather(self, rows: Tensor) -> list[Tensor] | None:
         """Return the rows of every process in process 0, and None in the others."""
+        parts = self.all_to_all([rows if r == 0 else rows[:0] for r in range(self.world_size)])
+        return parts if self.rank == 0 else None
 
     @abstractmethod
     def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
@@ -46,9 +47,9 @@ class Communicator(ABC):
     def broadcast(self, values: Tensor) -> Tensor:
         """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
 
-    @abstractmethod
     def broadcast_object(self, value: Any) -> Any:
         """Return the JSON-ready object of process 0 in every process."""
+        return self.all_gather_object(value if self.rank == 0 else None)[0]
 
     @abstractmethod
     def all_gather_object(self, value: Any) -> list[Any]:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from normlift_ns.core.device import can_use_triton
+from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
 
 CANCELLATION_RATIO = 1e-3
@@ -44,7 +44,7 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
 
 
 @dataclass(frozen=True)
-class SparseRows:
+class SparseRows(TensorRecord):
     """A sparse matrix in CSR format.
 
     Row i holds columns column[offsets[i]:offsets[i + 1]], in ascending order, with their weights.
@@ -121,10 +121,6 @@ class SparseRows:
             raise InputError(f"columns must be 0 or more, found {low}")
         return high + 1
 
-    def to(self, device: torch.device | str) -> SparseRows:
-        """Return a copy on another device."""
-        return SparseRows(self.offsets.to(device), self.column.to(device), self.weight.to(device))
-
     def row_index(self) -> Int64[Tensor, " nnz"]:
         """Return the row of every entry."""
         return torch.repeat_interleave(torch.arange(len(self), device=self.offsets.device), self.offsets.diff())
@@ -137,9 +133,7 @@ class SparseRows:
         """Return the given rows in the given order."""
         start, length = self.offsets[:-1][rows], self.offsets.diff()[rows]
         offsets = torch.cat([length.new_zeros(1), length.cumsum(0)])
-        entry = torch.arange(int(offsets[-1]), device=offsets.device) + torch.repeat_interleave(
-            start - offsets[:-1], length
-        )
+        entry = torch.arange(int(offsets[-1]), device=offsets.device) + (start - offsets[:-1]).repeat_interleave(length)
         return SparseRows(offsets, self.column[entry], self.weight[entry])
 
     def select_columns(self, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:

@@ -182,8 +182,5 @@ def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
     """Return the mask of the Gaussians whose centers lie inside the image and in front of the camera."""
-    world_to_camera = camera.world_to_camera.to(means)
-    points = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    pixels = points @ camera.K.to(means).T
-    x, y, depth = (pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2], points[:, 2])
-    return (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    _, _, depth, inside = camera.project(means)
+    return inside & (depth > 0.01)

@@ -63,11 +63,6 @@ class TorchCommunicator(Communicator):
                 dist.broadcast(part, r)
         return _like(torch.cat(parts), rows)
 
-    def gather(self, rows: Tensor) -> list[Tensor] | None:
-        """See the base class."""
-        parts = self.all_to_all([rows if r == 0 else rows[:0] for r in range(self.world_size)])
-        return parts if self.rank == 0 else None
-
     def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """See the base class."""
         sent_counts = torch.tensor([len(part) for part in parts], device=self.device)
@@ -90,10 +85,6 @@ class TorchCommunicator(Communicator):
         if data.numel() > 0:
             dist.broadcast(data, 0)
         return _like(data, values).reshape(values.shape)
-
-    def broadcast_object(self, value: Any) -> Any:
-        """See the base class."""
-        return self.all_gather_object(value if self.rank == 0 else None)[0]
 
     def all_gather_object(self, value: Any) -> list[Any]:
         """See the base class."""

@@ -66,7 +66,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     """
     evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
-    scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.map(Tensor.cpu)
+    scalars = lift(evidence, features, unlabeled=options.get("unlabeled", "ignore")).scalars.to("cpu")
     own, manifest = torch.arange(evidence.num_gaussians, dtype=torch.int32), {"dimension": features.shape[1]}
     if name != "vala":
         return SemanticField(scalars, own, StoredEvidence(evidence.to("cpu"), features.cpu()), manifest)
@@ -98,7 +98,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     own = torch.arange(views.evidence.num_gaussians, dtype=torch.int32)
     store = StoredEvidence(views.evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": enabled}}
-    return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
+    return replace(lifted, field=SemanticField(result.scalars.to("cpu"), own, store, manifest), refined=False)
 
 
 def _observe_again(
@@ -133,9 +133,8 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
     used = [usable[i] for i in sample_evenly(len(usable), options.get("max_views"))]
     used = [used[i] for i in sample_evenly(len(used), max_views)]
     rendered = lifted.settings if options.get("image_source") == "render" else None
-    kwargs = {"render_settings": rendered, "downscale": options.get("lift_downscale", 1), "on_view": lambda view: None}
     for chunk in chunk_views(used):
-        yield observe_views(scene, chunk, source, **kwargs)
+        yield observe_views(scene, chunk, source, render_settings=rendered, downscale=options.get("lift_downscale", 1))
 
 
 def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch, *, power: int = 1) -> Evidence:
@@ -172,11 +171,7 @@ def center_evidence(
     rows, views, points = row.cpu(), view.cpu(), means.cpu().double()
     for v, (camera, pixel_columns) in enumerate(zip(cameras, columns)):
         entries = (views == v).nonzero().squeeze(1)
-        pose = camera.world_to_camera.cpu().double()
-        projected = (points[rows[entries]] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.cpu().double().T
-        x, y = (projected[:, i] / projected[:, 2].clamp(min=1e-6) for i in (0, 1))
-        inside = (projected[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        x, y = (c.clamp(0, size - 1).long() for c, size in ((x, camera.width), (y, camera.height)))
+        y, x, _, inside = camera.project(points[rows[entries]])
         column[entries] = torch.where(inside, pixel_columns.cpu()[y, x].long(), -1)
     column = column.to(row.device)
     valid = column >= 0

@@ -465,13 +465,8 @@ class FreeSpace:
         """Return whether a camera could be at each position."""
         free = (torch.cdist(positions, self.camera_positions) <= self.spacing + 1e-9).any(1)
         for camera, depth in zip(self.cameras, self.depths):
-            pose, K = camera.world_to_camera.double().cpu(), camera.K.double().cpu()
-            points = positions @ pose[:3, :3].T + pose[:3, 3]
-            z = points[:, 2]
-            pixel = (points @ K.T)[:, :2] / z[:, None].clamp(min=1e-9)
-            inside = (z > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
-            x, y = (pixel[:, i].long().clamp(0, size - 1) for i, size in ((0, camera.width), (1, camera.height)))
-            free |= inside & (depth[y, x] > (1 + _NEAR_SHARE) * z)
+            row, column, z, inside = camera.project(positions)
+            free |= inside & (depth[row, column] > (1 + _NEAR_SHARE) * z)
         return free
 
 
@@ -775,7 +770,7 @@ def coverage_of(
     check_number("min_reliability", min_reliability)
     images = study_images(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)
-    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).map(lambda x: x.to(device))
+    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).to(device)
     drawn = RasterInputs(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
     weights, count = view_weights(drawn, images.cameras), len(images.cameras)
     surface = max_weights(weights)

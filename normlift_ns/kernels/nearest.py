@@ -88,17 +88,12 @@ def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcess
     index[:n] = torch.arange(n, device=device)
     padded = torch.full((size, 3), torch.inf, device=device)
     padded[:n] = points
-    shared = (
-        0
-        if communicator is None or communicator.world_size == 1
-        else min(depth, (communicator.world_size - 1).bit_length())
-    )
+    processes = 1 if communicator is None else communicator.world_size
+    shared = min(depth, (processes - 1).bit_length())
     for level in range(shared):
         index, padded = _split(index, padded, 1 << level)
     if communicator is not None and shared > 0:
-        first, last = (
-            rank * (1 << shared) // communicator.world_size for rank in (communicator.rank, communicator.rank + 1)
-        )
+        first, last = (rank * (1 << shared) // processes for rank in (communicator.rank, communicator.rank + 1))
         width = size >> shared
         own = slice(first * width, last * width)
         index, padded = index[own], padded[own]

@@ -30,7 +30,6 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.base import joint_partition
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
-from normlift_ns.options import BackendName, RasterizeMode
 from normlift_ns.query.engine import SelectionStats
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
@@ -118,9 +117,7 @@ def mask_evidence(
     masks: Sequence[Bool[Tensor, "q h w"]],
     *,
     valid_pixels: Sequence[Bool[Tensor, "h w"] | None] | None = None,
-    rasterize_mode: RasterizeMode = "classic",
-    settings: RasterSettings | None = None,
-    backend: BackendName = "auto",
+    **options: Any,
 ) -> MaskEvidence:
     """Rasterize the evidence of the masks of Q prompts, once for all prompts.
 
@@ -128,7 +125,7 @@ def mask_evidence(
         cameras: one per view.
         masks: for each view, one mask per prompt; empty if the prompt was not found.
         valid_pixels: for each view, the pixels to use; None for all.
-        rasterize_mode, settings, backend: as in `rasterize_evidence`.
+        options: rasterize_mode and settings of `rasterize_evidence`.
     Raises:
         ValueError: there are no views, or the masks do not match the number or size of the cameras.
     """
@@ -149,15 +146,8 @@ def mask_evidence(
         pixels = None if valid_pixels is None else valid_pixels[index]
         labels.append(cells if pixels is None else cells.where(pixels.to(cells.device), MASKED))
         inside.append(cell_values == 1)
-    evidence = rasterize_evidence(
-        scene,
-        list(cameras),
-        labels,
-        num_regions=[part.shape[1] for part in inside],
-        rasterize_mode=rasterize_mode,
-        settings=settings,
-        backend=backend,
-    )
+    counts = [part.shape[1] for part in inside]
+    evidence = rasterize_evidence(scene, list(cameras), labels, num_regions=counts, **options)
     return MaskEvidence(evidence, torch.cat(inside, dim=1).to(scene.means.device))
 
 

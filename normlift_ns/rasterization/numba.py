@@ -15,7 +15,6 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
 from normlift_ns.rasterization import numba_kernels as kernels
-from normlift_ns.rasterization import numba_kernels as lists
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import ProjectedGaussians, project
 from normlift_ns.rasterization.settings import RasterSettings
@@ -84,7 +83,7 @@ def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettin
     max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
     radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
     sizes = (camera.width, camera.height, settings.tile_size)
-    tile_lists = lists.list_tiles(
+    tile_lists = kernels.list_tiles(
         means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
     )
     return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
@@ -115,7 +114,7 @@ def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
     tile_lists = (integers, members, table, table, numbers, numba.float64[:, ::1])
     image = number[:, :, ::1]
     return [
-        (lists.list_tiles, (table, table, numbers, table, integer, integer, integer, number, integer)),
+        (kernels.list_tiles, (table, table, numbers, table, integer, integer, integer, number, integer)),
         (kernels.composite_tiles, (*tile_lists, table, image, table, integer, limits, integer)),
         (kernels.count_labels, (labels, integer)),
         (

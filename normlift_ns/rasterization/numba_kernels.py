@@ -1,7 +1,7 @@
 """Kernels of the CPU rasterizer, compiled with numba.
 
 numba caches a compiled function until its own file changes, and ignores changes to functions that it calls in other
-files. After a change here or to `numba_lists.extent`, delete the .nbi files in the `__pycache__` of this folder.
+files. After a change to such a function, delete the .nbi files in the `__pycache__` of this folder.
 """
 
 from __future__ import annotations
@@ -417,10 +417,8 @@ def sum_tiles(  # pragma: no cover (compiled)
             continue
         local, ranges = np.zeros((size, wide, LANES), np.int32), np.empty((size, 2), np.int32)
         distinct = np.empty(size * size, np.int32)
-        transmittance, weights = (
-            np.empty((size, wide, LANES), means2d.dtype),
-            np.empty((size, wide, LANES), means2d.dtype),
-        )
+        transmittance = np.empty((size, wide, LANES), means2d.dtype)
+        weights = np.empty_like(transmittance)
         box = _tile_box(tile, labels.shape[0], labels.shape[1], size)
         count = _tile_labels(labels, box, local, distinct)
         _label_ranges(local, box, ranges)
@@ -506,10 +504,8 @@ def composite_tiles(  # pragma: no cover (compiled)
         tile = interleaved_index(position, tiles, threads)
         if tile >= tiles:
             continue
-        transmittance, weights = (
-            np.empty((size, wide, LANES), means2d.dtype),
-            np.empty((size, wide, LANES), means2d.dtype),
-        )
+        transmittance = np.empty((size, wide, LANES), means2d.dtype)
+        weights = np.empty_like(transmittance)
         box = _tile_box(tile, image.shape[0], image.shape[1], size)
         top, left, bottom, right = box
         _reset_transmittance(box, transmittance)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED, Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.core.sparse import row_offsets, sum_duplicates
 from normlift_ns.rasterization.settings import RasterSettings
 
 _ENORMOUS = 2.0**60
@@ -171,8 +171,7 @@ def assign_tiles(projected: ProjectedGaussians, width: int, height: int, tile_si
     step = torch.arange(member.numel(), device=count.device) - (count.cumsum(0) - count)[member]
     tile = ((y0[member] + step // wide[member]) * columns + x0[member] + step % wide[member]).int()
     tile, order = tile.sort(stable=True)
-    bounds = torch.arange(rows * columns + 1, dtype=tile.dtype, device=tile.device)
-    return TileLists(torch.searchsorted(tile, bounds), member[order].int())
+    return TileLists(row_offsets(tile, rows * columns), member[order].int())
 
 
 # Reference rasterizer in plain torch: tile by tile, on any device and in any precision.

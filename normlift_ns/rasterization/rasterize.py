@@ -17,6 +17,7 @@ from normlift_ns.core.device import has_triton, retry_in_halves
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene
+from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.errors import InputError
 from normlift_ns.options import BackendName, RasterizeMode
 from normlift_ns.rasterization.backend import Backend, RasterBatch, RasterJob, TileBackend
@@ -184,16 +185,13 @@ def rasterize_evidence(
     return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
-def resolve_backend(
-    scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
-) -> BackendName:
+def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpack[RasterOptions]) -> BackendName:
     """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
         ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
     """
-    job = _job(scene, "classic", settings, dtype, weight_power)
-    return cast(BackendName, choose_backend(backend, job)[0])
+    return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
 
 def render(
@@ -308,12 +306,8 @@ def _zip_views(
 
 
 def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
-    if (
-        not isinstance(labels, Tensor)
-        or labels.dtype.is_floating_point
-        or labels.dtype in (torch.bool, torch.complex64)
-    ):
-        kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
+    kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
+    if isinstance(kind, str) or kind.is_floating_point or kind.is_complex or kind == torch.bool:
         raise InputError(f"labels of view {index} must be an integer tensor, got {kind}")
     if tuple(labels.shape) != (camera.height, camera.width):
         raise InputError(
@@ -400,11 +394,9 @@ def contributors(
     gaussian, column = rows.row_index(), rows.column.long()
     order = depth[gaussian].argsort(stable=True)
     order = order[column[order].argsort(stable=True)]
-    bounds = torch.searchsorted(column[order], torch.arange(len(position) + 1, device=device))
-    start, count = bounds[:-1][region], bounds.diff()[region]
-    offsets = torch.cat([count.new_zeros(1), count.cumsum(0)])
-    entry = torch.arange(int(offsets[-1]), device=device) + (start - offsets[:-1]).repeat_interleave(count)
-    return Contributors(offsets, gaussian[order[entry]], rows.weight[order[entry]])
+    by_position = SparseRows(row_offsets(column, len(position)), gaussian[order].int(), rows.weight[order])
+    by_pixel = by_position.select_rows(region)
+    return Contributors(by_pixel.offsets, by_pixel.column.long(), by_pixel.weight)
 
 
 def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
@@ -449,8 +441,8 @@ def ray_weights(
     scales = scales.clamp(min=1e-12).maximum(_MIN_SCALE_RATIO * scales.amax(dim=1, keepdim=True))
     forward = torch.nn.functional.normalize(direction.to(means), dim=0)
     quats = torch.nn.functional.normalize(quats, dim=1)
-    start = _to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
-    step = _to_axes(forward.expand_as(means), quats) / scales
+    start = to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
+    step = to_axes(forward.expand_as(means), quats) / scales
     distance = -(start * step).sum(1) / (step * step).sum(1)
     square = (start + distance[:, None] * step).square().sum(1)
     alpha = (scene.opacities[rows].double() * torch.exp(-square / 2)).clamp(max=_MAX_ALPHA)
@@ -462,7 +454,7 @@ def ray_weights(
     return out
 
 
-def _to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+def to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
     """Rotate world vectors into the axes of Gaussians with unit quaternions (w, x, y, z): the inverse rotation."""
     real, imaginary = quats[:, :1], -quats[:, 1:]
     turn = 2 * torch.linalg.cross(imaginary, vectors)

@@ -320,13 +320,12 @@ def view_figure(
         selected: mask of the selected pixels, which are outlined.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
-    panels, captions = [panel], ["answer"]
-    if image is not None:
-        panels.insert(0, Image.fromarray(image.cpu().numpy()).resize(panel.size))
-        captions.insert(0, "training image")
+    panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
+    panels["answer"] = panel
     share = float(selected.float().mean())
     summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
-    return _page(sheet, [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary], panels, captions, 2)
+    titles = [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary]
+    return _page(sheet, titles, list(panels.values()), list(panels), 2)
 
 
 def contact_sheet(
@@ -361,7 +360,7 @@ def _page(
     sheet: FigureStyle, titles: Sequence[str], panels: Sequence[Image.Image], captions: Sequence[str], columns: int
 ) -> Image.Image:
     """Lay out panels in rows of `columns`, with titles above and the color bar below."""
-    columns, line = min(columns, len(panels)), round(1.5 * _FONT_SIZE)
+    columns, line, small = min(columns, len(panels)), round(1.5 * _FONT_SIZE), colors.load_font(_FONT_SIZE - 4)
     width, height = (max(panel.size[i] for panel in panels) for i in (0, 1))
     rows = math.ceil(len(panels) / columns)
     inner = max(columns * (width + _MARGIN) - _MARGIN, 560)
@@ -370,19 +369,15 @@ def _page(
     page = Image.new("RGB", (inner + 2 * _MARGIN, bottom + 3 * line), _BACKGROUND)
     draw = ImageDraw.Draw(page)
     for i, title in enumerate(titles):
-        typeface, color = (
-            colors.load_font(_FONT_SIZE if i == 0 else _FONT_SIZE - 2),
-            _TEXT_COLOR if i == 0 else _CAPTION_COLOR,
-        )
+        size, color = (_FONT_SIZE, _TEXT_COLOR) if i == 0 else (_FONT_SIZE - 2, _CAPTION_COLOR)
+        typeface = colors.load_font(size)
         fitting = next(n for n in range(len(title), -1, -1) if typeface.getlength(title[:n]) <= inner)
         draw.text((_MARGIN, _MARGIN // 2 + i * line), title[:fitting], fill=color, font=typeface)
     for i, (panel, caption) in enumerate(zip(panels, captions)):
         x, y = _MARGIN + (i % columns) * (width + _MARGIN), top + (i // columns) * (height + line + _MARGIN)
         page.paste(panel, (x, y + line))
         most = max(4, int(width / (0.6 * (_FONT_SIZE - 4))))
-        draw.text(
-            (x, y + 4), colors.clip_text(caption, most), fill=_CAPTION_COLOR, font=colors.load_font(_FONT_SIZE - 4)
-        )
+        draw.text((x, y + 4), colors.clip_text(caption, most), fill=_CAPTION_COLOR, font=small)
     _draw_color_bar(draw, page, sheet, (_MARGIN, bottom, inner))
     return page
 

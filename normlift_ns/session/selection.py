@@ -20,6 +20,7 @@ from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.options import OBJECT_MAX_GAP
 from normlift_ns.query.engine import Answer, apply_threshold, run_query
 from normlift_ns.query.question import Query
+from normlift_ns.rasterization.rasterize import to_axes
 from normlift_ns.session.prompts import CLICK_THRESHOLD
 
 _NEIGHBORS = 8
@@ -189,11 +190,7 @@ class SelectionBox:
         >>> SelectionBox((0, 0, 0), (2, 2, 2)).mask(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
         [True, False]
         """
-        w, *imaginary = torch.nn.functional.normalize(torch.tensor(self.wxyz, dtype=torch.float64), dim=0)
-        axis = -torch.stack(imaginary).to(means.device)
-        offset = means.double() - torch.tensor(self.center, dtype=torch.float64, device=means.device)
-        turn = 2 * torch.linalg.cross(axis.expand_as(offset), offset)
-        local = offset + w.to(means.device) * turn + torch.linalg.cross(axis.expand_as(offset), turn)
-        half = torch.tensor(self.size, dtype=torch.float64, device=means.device) / 2
-        inside = (local.abs() <= half).all(dim=1)
+        center, size, quat = (means.new_tensor(x, dtype=torch.float64) for x in (self.center, self.size, self.wxyz))
+        quats = torch.nn.functional.normalize(quat, dim=0).expand(len(means), 4)
+        inside = (to_axes(means.double() - center, quats).abs() <= size / 2).all(dim=1)
         return inside if self.keeps_inside else ~inside

@@ -32,10 +32,6 @@ class Threads(Communicator):
     def all_gather(self, rows: Tensor) -> Tensor:
         return torch.cat(self._all(rows))
 
-    def gather(self, rows: Tensor) -> list[Tensor] | None:
-        found = self._all(rows)
-        return found if self.rank == 0 else None
-
     def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
         return [given[self.rank] for given in self._all(list(parts))]
 
@@ -44,9 +40,6 @@ class Threads(Communicator):
 
     def broadcast(self, values: Tensor) -> Tensor:
         return self._all(values)[0]
-
-    def broadcast_object(self, value: Any) -> Any:
-        return self._all(value)[0]
 
     def all_gather_object(self, value: Any) -> list[Any]:
         return self._all(value)

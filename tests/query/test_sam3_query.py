@@ -22,7 +22,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
     masks = [torch.stack([upper, lower]) ^ (torch.rand(2, 24, 40, generator=g) < 0.1) for _ in cameras]
     masks[1] = torch.stack([~upper, torch.zeros_like(lower)])  # another thing, and nothing
     counted = [None, torch.rand(24, 40, generator=g) < 0.7, None]
-    found = mask_evidence(scene, cameras, masks, valid_pixels=counted, backend="torch")
+    found = mask_evidence(scene, cameras, masks, valid_pixels=counted)
     for text in range(2):
         labels = [(~mask[text]).int() for mask in masks]
         labels[1] = labels[1].where(counted[1], -2)
