@@ -128,8 +128,6 @@ class Person:
 
     top = 0
     """Height in pixels of what stands over the picture."""
-    panel = PANEL
-    """Width in pixels of the panel to the right of the picture."""
     drawn = ""
     """What the page says once the picture is as fine as it gets, a pattern."""
 
@@ -250,7 +248,7 @@ class Person:
         return shots[-1]
 
     def shot(self) -> np.ndarray:
-        width = max(self.size[0] - self.panel, 70)
+        width = max(self.size[0] - PANEL, 70)
         box = {"x": 0, "y": self.top, "width": width, "height": self.size[1] - self.top}
         shot = self.page.screenshot(clip=box, animations="disabled")  # type: ignore[arg-type]
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
@@ -268,7 +266,7 @@ class Person:
 
     def drag(self, x: float, y: float, button: Any = "left") -> None:
         """Drags from the middle of the picture: turns the camera, with the right button moves it."""
-        middle = ((self.size[0] - self.panel) / 2, (self.top + self.size[1]) / 2)
+        middle = ((self.size[0] - PANEL) / 2, (self.top + self.size[1]) / 2)
         self.page.mouse.move(*middle)
         self.page.mouse.down(button=button)
         self.page.mouse.move(middle[0] + x, middle[1] + y, steps=8)

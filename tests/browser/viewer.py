@@ -53,7 +53,6 @@ class Tab(Person):
     """A browser tab with nerfstudio's viewer in it, whose panel all tabs share."""
 
     top = TITLE
-    panel = 372
     drawn = r"\b512(x\d+)?px"
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1300, 1000), **how: Any) -> None:
