@@ -109,6 +109,7 @@ def test_a_person_clicks_hides_downloads_grows_and_undoes(tab: Tab, tmp_path: Pa
     tab.says(HIDDEN)
     tab.asks("red", answered=1)
     tab.selects(lambda count: count != alike, "asked")
+    tab.until(lambda: tab.output() == "overlay", "the answer is shown")
     tab.press("Hide")
     tab.show("rgb")
 
