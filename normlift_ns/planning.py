@@ -32,6 +32,7 @@ from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
+from normlift_ns.encoders.package_files import IMAGENET
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.evidence_collection import (
     EvidenceCollection,
@@ -419,6 +420,8 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     model, weights = options.encoder_model, options.encoder_pretrained
     if options.encoder == "open_clip" and has_local_clip_weights(model, weights) is False:
         missing.append(f"those of OpenCLIP, {model} {weights}")
+    if options.encoder == "imagenet" and not IMAGENET.is_here:
+        missing.append(f"those of --encoder imagenet ({IMAGENET.command})")
     return missing
 
 
@@ -427,7 +430,12 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
     message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
-    return Diagnostic("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+    return Diagnostic(
+        "weights",
+        "warning",
+        message,
+        "fetch them now: ns-normlift-weights; or give local files: --encoder-pretrained FILE, --sam-model FILE",
+    )
 
 
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:

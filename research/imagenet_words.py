@@ -24,7 +24,7 @@ SOURCE = "Made from WordNet 3.0 by research/imagenet_words.py; the license of Wo
 
 
 def read_synsets(folder: Path) -> tuple[dict[str, list[str]], dict[str, list[str]], str]:
-    """Return the lemmas and the hypernyms of every noun synset by its offset, and the license at the top of the file."""
+    """Return the lemmas and the hypernyms of every noun synset by its offset, and the license at the top."""
     lemmas, above, license_lines = {}, {}, []
     for line in (folder / "data.noun").read_text("utf8").splitlines():
         if line.startswith("  "):
@@ -39,8 +39,8 @@ def read_synsets(folder: Path) -> tuple[dict[str, list[str]], dict[str, list[str
 
 
 def read_senses(folder: Path) -> dict[str, tuple[list[str], int]]:
-    """Return, for every noun in lower case, the offsets of its synsets, the most frequent sense first, and the number of
-    senses that occur in WordNet's annotated texts."""
+    """Return, for every noun in lower case, the offsets of its synsets, the most frequent sense first, and the number
+    of senses that occur in WordNet's annotated texts."""
     senses = {}
     for line in (folder / "index.noun").read_text("utf8").splitlines():
         if not line.startswith(" "):
