@@ -1,8 +1,9 @@
 """EfficientNet-Lite2 as an encoder: its dense features inside regions, and its class vectors as texts.
 
 The network is a classifier: it averages 1,280 feature maps over the image and multiplies the mean with one vector per
-class. Here the maps are averaged over a region instead, so that its cosine with a class vector says how much the region
-looks like the class. One feature covers 32 pixels; the image is therefore encoded at twice its size.
+class. Here the features are normalized and averaged over a region instead, so that the cosine of the mean with a class
+vector says how much the region looks like the class, with every pixel counted alike. One feature covers 32 pixels; the
+image is therefore encoded at twice its size.
 
 Convolutions are padded on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image of 32 m + 1
 rows has m + 1 features, the first and last on its first and last row. TensorFlow, which trained the network, pads more
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor, nn
-from torch.nn.functional import relu6
+from torch.nn.functional import normalize, relu6
 
 from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import resize_image
@@ -150,15 +151,15 @@ class ImageNetEncoder:
         """
         check_prompts(prompts)
         classes = [find_classes(prompt) for prompt in prompts]
-        vectors = nn.functional.normalize(self.network.fc.weight.double(), dim=1).cpu()
-        return nn.functional.normalize(torch.stack([vectors[found].sum(0) for found in classes]), dim=1).float()
+        vectors = normalize(self.network.fc.weight.double(), dim=1).cpu()
+        return normalize(torch.stack([vectors[found].sum(0) for found in classes]), dim=1).float()
 
     @torch.no_grad()
     def _feature_maps(self, images: UInt8[Tensor, "1 h w 3"]) -> Float32[Tensor, "1280 rows columns"]:
         height, width = images.shape[1:3]
         scale = min(_SCALE, _MAX_SIDE / max(height, width))
         size = [max(1, round(scale * side / _STRIDE)) * _STRIDE + 1 for side in (height, width)]
-        return self.network(resize_image(images[0].to(self.device), *size))[0]
+        return normalize(self.network(resize_image(images[0].to(self.device), *size))[0], dim=0)
 
     @cached_property
     def _images(self) -> AdaptiveBatches:
@@ -183,7 +184,7 @@ def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, 
             weights += np.bincount(cell, row_share[y] * column_share[x], len(weights))
     pixels = np.maximum(np.bincount(region, minlength=count), 1)
     shares = torch.from_numpy(weights.reshape(count, -1) / pixels[:, None]).float().to(maps.device)
-    return nn.functional.normalize(shares @ maps.flatten(1).T, dim=1).cpu()
+    return normalize(shares @ maps.flatten(1).T, dim=1).cpu()
 
 
 def _positions(pixels: int, features: int) -> tuple[np.ndarray, np.ndarray]:
