@@ -37,19 +37,23 @@ def find_classes(prompt: str) -> list[int]:
     Raises:
         InputError: If it names none.
     """
-    words = re.findall(r"[^\W_]+(?:['.-][^\W_]+)*", prompt.lower())
-    text = " ".join(words)
+    text = _normalized(prompt)
     head = _AFTER_HEAD.sub("", text).split()
     for phrase in (text, *(" ".join(head[start:]) for start in range(len(head)))):
         for word in _singulars(phrase):
             if word in _vocabulary():
                 return list(_vocabulary()[word])
-    near = [name for word in (text, *words) for name in difflib.get_close_matches(word, _vocabulary())]
+    near = [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
     raise InputError(
         f"text {truncate_text(prompt)!r} names none of the 1,000 classes of ImageNet, nor a group of them; close words "
         f"are {suggestions}: use one of them, or lift with --encoder open_clip for other words"
     )
+
+
+def _normalized(text: str) -> str:
+    """Return the words in lower case, without hyphens and other signs between them."""
+    return " ".join(re.findall(r"[^\W_]+(?:['.][^\W_]+)*", text.lower()))
 
 
 def _singulars(phrase: str) -> Iterator[str]:
@@ -68,15 +72,15 @@ def _table() -> dict[str, Any]:
 
 @cache
 def _vocabulary() -> dict[str, tuple[int, ...]]:
-    """Return the classes of every word in lower case."""
+    """Return the classes of every word, normalized."""
     known: dict[str, set[int]] = {}
     heads: dict[str, set[int]] = {}
     for number, names in enumerate(_table()["classes"].values()):
-        for name in names.lower().split(", "):
+        for name in map(_normalized, names.split(", ")):
             known.setdefault(name, set()).add(number)
             heads.setdefault(name.split()[-1], set()).add(number)
     for names, groups in _table()["hypernyms"].items():
-        for name in names.lower().split(", "):
+        for name in map(_normalized, names.split(", ")):
             for group in groups.split():
                 first, _, last = group.partition("-")
                 known.setdefault(name, set()).update(range(int(first), int(last or first) + 1))

@@ -183,7 +183,7 @@ def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, 
             cell = region * (rows * columns) + i[y] * columns + j[x]
             weights += np.bincount(cell, row_share[y] * column_share[x], len(weights))
     pixels = np.maximum(np.bincount(region, minlength=count), 1)
-    shares = torch.from_numpy(weights.reshape(count, -1) / pixels[:, None]).float().to(maps.device)
+    shares = torch.from_numpy(weights.reshape(count, rows * columns) / pixels[:, None]).float().to(maps.device)
     return normalize(shares @ maps.flatten(1).T, dim=1).cpu()
 
 
