@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu6
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import resize_image
@@ -37,6 +38,9 @@ _STAGES = ((1, 3, 1, 1, 16), (3, 3, 2, 6, 24), (3, 5, 2, 6, 48), (4, 3, 2, 6, 88
            (1, 3, 1, 6, 352))  # fmt: skip
 """Blocks, kernel size, stride of the first block, expansion and channels of each stage of EfficientNet-Lite2."""
 _STEM = 32
+_LAYERS = (("conv_stem", "bn0"), ("expand_conv", "bn0"), ("depthwise_conv", "bn1"), ("project_conv", "bn2"),
+           ("conv_head", "bn1"))  # fmt: skip
+"""Convolutions and the normalizations that follow them."""
 _EPSILON = 1e-3
 _STRIDE = 32
 """Pixels per feature."""
@@ -93,13 +97,22 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Return the network with the weights in a file of PyTorch, whose names begin with underscores."""
+    """Return the network with the weights in a file of PyTorch, whose names begin with underscores.
+
+    Normalizations become part of the convolutions before them, which halves the time on a CPU.
+    """
     state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     with torch.device("meta"):
         network = EfficientNetLite2()
     names = {".".join(part.removeprefix("_") for part in name.split(".")): value for name, value in state.items()}
     network.load_state_dict(names, assign=True)
-    return network.eval().requires_grad_(False).to(device)
+    parts: list[Any] = [network.eval().requires_grad_(False), *network.blocks]
+    for part in parts:
+        for layer, norm in _LAYERS:
+            if hasattr(part, layer):
+                setattr(part, layer, fuse_conv_bn_eval(getattr(part, layer), getattr(part, norm)))
+                setattr(part, norm, nn.Identity())
+    return network.to(device, memory_format=torch.channels_last)
 
 
 @dataclass(frozen=True)

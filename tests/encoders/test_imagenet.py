@@ -68,12 +68,16 @@ def state() -> dict[str, torch.Tensor]:
     }
 
 
+def saved(state: dict[str, torch.Tensor]) -> bytes:
+    file = io.BytesIO()
+    torch.save(state, file)
+    return file.getvalue()
+
+
 @pytest.fixture
 def encoder(state: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ImageNetEncoder:
     """The encoder with random weights."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    content = file.getvalue()
+    content = saved(state)
     described = replace(IMAGENET, size=len(content), sha256=hashlib.sha256(content).hexdigest())
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(imagenet_network, "IMAGENET", described)
@@ -87,11 +91,13 @@ def test_the_network_is_that_of_the_published_file(state: dict) -> None:
     assert len(state) == 386 and sum(value.numel() for value in state.values()) == 6_150_232
     names = list(state)
     assert (names[0], names[-1]) == ("_conv_stem.weight", "_fc.bias") and "_blocks.20._bn2.weight" in names
+    network = EfficientNetLite2().eval()
+    network.load_state_dict({name.replace("._", ".").removeprefix("_"): value for name, value in state.items()})
+    pixels = IMAGE.permute(2, 0, 1)[None].float()
+    torch.testing.assert_close(load_network(saved(state), "cpu")(pixels), network(pixels), atol=1e-4, rtol=0)
     damaged = {**state, "_fc.weight": state["_fc.weight"][:, :-1]}
-    file = io.BytesIO()
-    torch.save(damaged, file)
     with pytest.raises(RuntimeError):
-        load_network(file.getvalue(), "cpu")
+        load_network(saved(damaged), "cpu")
 
 
 def test_the_mean_of_interpolated_features_and_zeros_without_any() -> None:
