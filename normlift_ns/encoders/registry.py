@@ -175,16 +175,12 @@ SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("sig
 def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
     from normlift_ns.encoders.imagenet_network import ImageNetEncoder  # noqa: PLC0415 (needs torch)
 
-    return ImageNetEncoder(device)
-
-
-def _check_imagenet_options(options: SourceOptions) -> None:
     default = SourceOptions()
     for name in ("encoder_model", "encoder_pretrained", "text_template"):
         value = getattr(options, name)
         if value != getattr(default, name):
             raise InputError(f"--{name.replace('_', '-')} {value} has no effect on --encoder imagenet; leave it out")
-    IMAGENET.check()
+    return ImageNetEncoder(device)
 
 
 IMAGENET_CLASSES = EncoderKind(
@@ -192,7 +188,7 @@ IMAGENET_CLASSES = EncoderKind(
     rule="cosine",
     negatives=(),
     threshold="auto",
-    check=_check_imagenet_options,
+    check=lambda options: IMAGENET.check(),
     has_patches=lambda options: True,
 )
 """Dense features of a classifier, compared with the vectors of its classes."""

@@ -146,7 +146,7 @@ def test_options_without_effect_and_missing_weights_are_refused(encoder: ImageNe
     kind, options = encoders.encoder_kind("imagenet"), SourceOptions(encoder="imagenet")
     kind.check(options)
     assert isinstance(make_encoder(options), ImageNetEncoder)
-    refused(lambda: kind.check(replace(options, encoder_model="ViT-L-14")), "--encoder-model", "ViT-L-14")
+    refused(lambda: make_encoder(replace(options, encoder_model="ViT-L-14")), "--encoder-model", "ViT-L-14")
     path = imagenet_network.IMAGENET.path
     path.write_bytes(bytes(len(path.read_bytes())))
     refused(lambda: encoder.text(["fox"]), str(path), "ns-normlift-weights --get imagenet")
