@@ -22,7 +22,7 @@ _ENDINGS = (("ches", "ch"), ("shes", "sh"), ("ses", "s"), ("xes", "x"), ("zes", 
             ("s", ""))  # fmt: skip
 """Endings of plurals and of their singulars, as in WordNet."""
 _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|that|which)\b.*")
-"""What follows the noun that a phrase is about."""
+"""End of a phrase, after the noun that it is about."""
 
 
 def find_classes(prompt: str) -> list[int]:

@@ -112,7 +112,7 @@ def load_network(content: bytes, device: str) -> EfficientNetLite2:
             if hasattr(part, layer):
                 setattr(part, layer, fuse_conv_bn_eval(getattr(part, layer), getattr(part, norm)))
                 setattr(part, norm, nn.Identity())
-    return network.to(device, memory_format=torch.channels_last)
+    return network.to(device).to(memory_format=torch.channels_last)
 
 
 @dataclass(frozen=True)
