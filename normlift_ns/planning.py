@@ -32,7 +32,6 @@ from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
-from normlift_ns.encoders.package_files import IMAGENET
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.evidence_collection import (
     EvidenceCollection,
@@ -420,8 +419,6 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     model, weights = options.encoder_model, options.encoder_pretrained
     if options.encoder == "open_clip" and has_local_clip_weights(model, weights) is False:
         missing.append(f"those of OpenCLIP, {model} {weights}")
-    if options.encoder == "imagenet" and not IMAGENET.is_here:
-        missing.append(f"those of --encoder imagenet ({IMAGENET.command})")
     return missing
 
 

