@@ -209,12 +209,9 @@ COLOR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_mak
 ENCODERS = Registry(
     "normlift_ns.encoders",
     {
-        "open_clip": "normlift_ns.encoders.registry:OPEN_CLIP",
-        "siglip": "normlift_ns.encoders.registry:SIGLIP",
-        "siglip2": "normlift_ns.encoders.registry:SIGLIP2",
-        "metaclip2": "normlift_ns.encoders.registry:METACLIP2",
-        "imagenet": "normlift_ns.encoders.registry:IMAGENET_CLASSES",
+        **{name: f"normlift_ns.encoders.registry:{name.upper()}" for name in ("open_clip", *MODEL_FAMILIES)},
         "colour": "normlift_ns.encoders.registry:COLOR",
+        "imagenet": "normlift_ns.encoders.registry:IMAGENET_CLASSES",
     },
     EncoderKind,
     "encoder",
