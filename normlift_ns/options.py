@@ -459,8 +459,9 @@ class SourceOptions:
 
     encoder: str = "open_clip"
     """Encoder of regions and prompts. open_clip: CLIP, on masked crops or on patches. siglip, siglip2, metaclip2: the
-    same with networks of the transformers library. color: mean colors compared with color names, without learned
-    weights. Any other name: an encoder from an installed plugin."""
+    same with networks of the transformers library. imagenet: a small classifier of 1,000 things, whose weights
+    ns-normlift-weights --get imagenet fetches; prompts are names of these things or of groups, such as dog. color: mean
+    colors compared with color names, without learned weights. Any other name: an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
     defaults are google/siglip-base-patch16-224, google/siglip2-base-patch16-224 and

@@ -423,7 +423,12 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
     message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
-    return Diagnostic("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+    return Diagnostic(
+        "weights",
+        "warning",
+        message,
+        "fetch them now: ns-normlift-weights; or give local files: --encoder-pretrained FILE, --sam-model FILE",
+    )
 
 
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:

@@ -21,7 +21,8 @@ from normlift_ns.encoders.huggingface import (
     check_transformers_version,
     resolve_model_name,
 )
-from normlift_ns.encoders.weights import check_hub_access, is_local_path, third_party_errors
+from normlift_ns.encoders.package_files import IMAGENET
+from normlift_ns.encoders.weights import CONNECT_ONCE, check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
 from normlift_ns.registry import Registry
@@ -131,7 +132,7 @@ def _check_weights(options: SourceOptions) -> None:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
     if open_clip.has_local_clip_weights(model, pretrained) is False:
         problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
-        with third_party_errors(problem, f"connect to the internet once, {remedy}", FileNotFoundError):
+        with third_party_errors(problem, f"{CONNECT_ONCE}, {remedy}", FileNotFoundError):
             check_hub_access()
 
 
@@ -171,6 +172,28 @@ def _make_kind(family: ModelFamily) -> EncoderKind:
 SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))
 
 
+def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
+    from normlift_ns.encoders.imagenet_network import ImageNetEncoder  # noqa: PLC0415 (needs torch)
+
+    default = SourceOptions()
+    for name in ("encoder_model", "encoder_pretrained", "prompt_template"):
+        value = getattr(options, name)
+        if value != getattr(default, name):
+            raise InputError(f"--{name.replace('_', '-')} {value} has no effect on --encoder imagenet; leave it out")
+    return ImageNetEncoder(device)
+
+
+IMAGENET_CLASSES = EncoderKind(
+    _make_imagenet_encoder,
+    rule="cosine",
+    negatives=(),
+    threshold="auto",
+    check=lambda options: IMAGENET.check(),
+    has_patches=lambda options: True,
+)
+"""Dense features of a classifier, compared with the vectors of its classes."""
+
+
 def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
 
@@ -187,6 +210,7 @@ ENCODERS = Registry(
     "normlift_ns.encoders",
     {
         **{name: f"normlift_ns.encoders.registry:{name.upper()}" for name in ("open_clip", *MODEL_FAMILIES)},
+        "imagenet": "normlift_ns.encoders.registry:IMAGENET_CLASSES",
         "color": "normlift_ns.encoders.registry:COLOR",
     },
     EncoderKind,

@@ -35,7 +35,7 @@ from tests.conftest import project
 from tests.encoders.tiny import refused
 
 ROOT = Path(__file__).parents[2]
-OURS = ["color", "metaclip2", "open_clip", "siglip", "siglip2"]
+OURS = ["color", "imagenet", "metaclip2", "open_clip", "siglip", "siglip2"]
 
 
 def install(folder: Path, package: str, points: str, code: str = "") -> None:
@@ -70,7 +70,8 @@ def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
-        assert (kind.rule, kind.threshold) == (("cosine" if name == "color" else "lerf"), 0.5)
+        expected = {"color": ("cosine", 0.5), "imagenet": ("cosine", "auto")}.get(name, ("lerf", 0.5))
+        assert (kind.rule, kind.threshold) == expected
         assert isinstance(kind, encoders.EncoderKind)  # where packages of others import it from
 
 
@@ -78,7 +79,7 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     install(tmp_path, "plug", points(other="plug:KIND", same="plug:KIND"))
     install(tmp_path, "two", points(same="two:KIND"))
     monkeypatch.syspath_prepend(tmp_path)
-    parts = ("'clip'", "--encoder", "color, metaclip2, open_clip, other, same, siglip, siglip2")
+    parts = ("'clip'", "--encoder", "color, imagenet, metaclip2, open_clip, other, same, siglip, siglip2")
     refused(lambda: encoder_kind("clip"), *parts)
     refused(lambda: check_source_options(SourceOptions(encoder="clip"), ()), *parts)
     assert find_encoder_kind("clip") is None and find_encoder_kind(3) is None
