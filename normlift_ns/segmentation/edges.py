@@ -5,8 +5,8 @@ of its five blocks, and a weighted sum of these. Its weights were trained on BSD
 
 The hierarchy is the watershed by area (Cousty and Najman, "Incremental Algorithm for Hierarchical Minimum Spanning
 Forests and Saliency of Watershed Cuts", ISMM 2011). Basins of the edge map are flooded together across their passes,
-the lowest first. The persistence of a pass is the smaller of the two areas that meet there. A level of N regions keeps the
-N - 1 most persistent passes closed, so levels nest.
+the lowest first. The persistence of a pass is the smaller of the two areas that meet there. A level of N regions keeps
+the N - 1 most persistent passes closed, so levels nest.
 """
 
 from __future__ import annotations
@@ -143,8 +143,9 @@ def _persistent_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray
         return basin
 
     for first, second in _lowest_passes(basins, edges).tolist():
-        small, large = sorted((root(first), root(second)), key=lambda basin: (area[basin], basin))
-        if small != large:
+        one, other = root(first), root(second)
+        if one != other:
+            small, large = sorted((one, other), key=lambda basin: (area[basin], basin))
             found.append((area[small], first, second))
             parent[small] = large
             area[large] += area[small]
