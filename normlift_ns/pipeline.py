@@ -206,8 +206,8 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
         raise InputError(
             f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
             f"{_describe(source)}). Likely causes: every value in the label maps is negative or the background "
-            "(--regions-background), the level has no regions (--level), masks exclude everything, or the cameras do "
-            "not see the scene"
+            "(--regions-background), the level has no regions (--level), masks exclude everything, all features are "
+            "zero, or the cameras do not see the scene"
         )
     if lifted == 0:
         raise InputError(

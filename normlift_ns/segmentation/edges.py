@@ -35,7 +35,7 @@ WORKING_PIXELS = 2**18
 of objects rather than their texture at a similar size."""
 EdgeLevel = Literal["s", "m", "l"]
 EDGE_LEVELS: tuple[EdgeLevel, ...] = get_args(EdgeLevel)
-EDGE_COUNTS = (300, 120, 40)
+EDGE_COUNTS: tuple[int, ...] = (300, 120, 40)
 """Regions per image of the levels s, m and l."""
 _CHANNELS, _DEPTHS = (64, 128, 256, 512, 512), (2, 2, 3, 3, 3)
 """Channels and convolutions of each block."""
@@ -52,14 +52,16 @@ class EdgeNetwork(nn.Module):
         channels: Channels of the five blocks.
     """
 
+    mean: Tensor
+
     def __init__(self, channels: Sequence[int] = _CHANNELS) -> None:
         super().__init__()
         inputs = (3, *channels)
-        self.blocks = nn.ModuleList(
+        self.blocks: Any = nn.ModuleList(
             nn.ModuleList(nn.Conv2d(inputs[number + (i > 0)], outputs, 3, padding=1) for i in range(_DEPTHS[number]))
             for number, outputs in enumerate(channels)
         )
-        self.sides = nn.ModuleList(nn.Conv2d(outputs, 1, 1) for outputs in channels)
+        self.sides: Any = nn.ModuleList(nn.Conv2d(outputs, 1, 1) for outputs in channels)
         self.fuse = nn.Conv2d(len(channels), 1, 1)
         self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None])
         self.requires_grad_(False)
@@ -70,7 +72,7 @@ class EdgeNetwork(nn.Module):
         maps = []
         for number, (block, side) in enumerate(zip(self.blocks, self.sides)):
             pixels = max_pool2d(pixels, 2, ceil_mode=True) if number > 0 else pixels
-            for convolution in block:  # pyright: ignore[reportGeneralTypeIssues]
+            for convolution in block:
                 pixels = convolution(pixels).relu_()
             maps.append(interpolate(side(pixels), image.shape[:2], mode="bilinear", align_corners=False))
         return self.fuse(torch.cat(maps, dim=1))[0, 0].sigmoid()
@@ -78,9 +80,9 @@ class EdgeNetwork(nn.Module):
     def layers(self) -> Iterator[tuple[str, nn.Conv2d]]:
         """Yield the convolutions with their names in Keras files."""
         for number, (block, side) in enumerate(zip(self.blocks, self.sides), 1):
-            for i, convolution in enumerate(block):  # pyright: ignore[reportArgumentType]
+            for i, convolution in enumerate(block):
                 yield f"block{number}/layers/conv2d{f'_{i}' if i > 0 else ''}", convolution
-            yield f"dsn{number}", side  # pyright: ignore[reportReturnType]
+            yield f"dsn{number}", side
         yield "fuse", self.fuse
 
 
@@ -98,13 +100,16 @@ def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
     remedy = f"fetch the file again with: {EDGES.command}"
     with third_party_errors("the weights of HED are damaged", remedy), h5py.File(io.BytesIO(content), "r") as file:
         for name, layer in network.layers():
-            shapes = layer.weight.permute(2, 3, 1, 0).shape, layer.bias.shape  # pyright: ignore[reportOptionalMemberAccess]
-            arrays = [file.get(f"{name}/vars/{i}") for i in range(2)]
-            for array, shape in zip(arrays, shapes):
-                if not isinstance(array, h5py.Dataset) or array.shape != shape or array.dtype != np.float32:
-                    raise InputError(f"{name} has no array of type float32 and shape {tuple(shape)}")
-            kernel, bias = (torch.from_numpy(array[()]) for array in arrays)
+            kernel = _read_array(file, f"{name}/vars/0", layer.weight.permute(2, 3, 1, 0).shape)
+            bias = _read_array(file, f"{name}/vars/1", (layer.out_channels,))
             layer.load_state_dict({"weight": kernel.permute(3, 2, 0, 1), "bias": bias})
+
+
+def _read_array(file: Any, name: str, shape: Sequence[int]) -> Tensor:
+    array = file.get(name)
+    if getattr(array, "shape", None) != tuple(shape) or array.dtype != np.float32:
+        raise InputError(f"{name} is not an array of type float32 and shape {tuple(shape)}")
+    return torch.from_numpy(array[()])
 
 
 def watershed_levels(edges: UInt8[np.ndarray, "h w"], counts: Sequence[int]) -> Int32[np.ndarray, "levels h w"]:
@@ -181,11 +186,13 @@ class EdgeRegions(RegionDefaults):
     """Number of regions, in place of the levels; None: the levels."""
     device: str = "cpu"
     """Device of the network."""
+    pixels: int = WORKING_PIXELS
+    """Largest size of the image for the network, approximately."""
 
     @property
     def identity(self) -> dict[str, Any]:
         weights = f"{EDGES.package} {EDGES.version}"
-        return {"kind": "edges", "weights": weights, "pixels": WORKING_PIXELS, "counts": list(self.counts)}
+        return {"kind": "edges", "weights": weights, "pixels": self.pixels, "counts": list(self.counts)}
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -209,7 +216,8 @@ class EdgeRegions(RegionDefaults):
             FileNotFoundError: If the weights are not on this machine.
             InputError: If the weights are damaged, or h5py is not installed.
         """
-        pixels = resize_bilinear(image.to(self.device), *working_size(image.shape[0], image.shape[1]))
+        height, width = working_size(image.shape[0], image.shape[1], self.pixels)
+        pixels = resize_bilinear(image.to(self.device), height, width)
         with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
             strength = self.network(pixels)
         return (strength * (_HEIGHTS - 1)).round().to(torch.uint8).cpu().numpy()
@@ -222,11 +230,11 @@ class EdgeRegions(RegionDefaults):
         return network.to(self.device)
 
 
-def working_size(height: int, width: int) -> tuple[int, int]:
-    """Return the height and width at which HED looks at an image.
+def working_size(height: int, width: int, pixels: int) -> tuple[int, int]:
+    """Return the size of an image for the network.
 
-    >>> working_size(1080, 1920), working_size(100, 200)
+    >>> working_size(1080, 1920, WORKING_PIXELS), working_size(100, 200, WORKING_PIXELS)
     ((384, 683), (100, 200))
     """
-    scale = min(1.0, math.sqrt(WORKING_PIXELS / (height * width)))
+    scale = min(1.0, math.sqrt(pixels / (height * width)))
     return max(1, round(height * scale)), max(1, round(width * scale))

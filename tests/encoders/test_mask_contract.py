@@ -17,6 +17,7 @@ from normlift_ns.segmentation.mask_filtering import Suppression
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.segmentation.sam import SAM_LEVELS, SamMasks, load_sam_network
 from normlift_ns.segmentation.sam3 import Sam3Masks, Sam3Network
+from tests.encoders.test_edges import tiny_regions
 from tests.encoders.test_library import LOOSE, photograph
 from tests.encoders.tiny import Largest, copied, refused
 
@@ -38,10 +39,12 @@ def folders(sam_weights, library_weights, tmp_path_factory) -> dict[str, Path]:
 def make(kind: str, folder: Path) -> Any:
     if kind in NETWORKS:
         return Sam3Masks(("mug", "red mug"), str(folder)) if kind == "sam3" else SamMasks(str(folder), rules=EVERY)
+    if kind == "edges":
+        return tiny_regions()
     return {"files": LabelFiles(folder), "superpixel": Superpixels(20), "grid": Grid(20)}[kind]
 
 
-KINDS = (*NETWORKS, "files", "superpixel", "grid")
+KINDS = (*NETWORKS, "edges", "files", "superpixel", "grid")
 
 
 @pytest.mark.parametrize("kind", KINDS)
