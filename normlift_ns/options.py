@@ -408,7 +408,7 @@ RelevancyRule = Literal["cosine", "lerf", "margin"]
 UnlabeledMode = Literal["ignore", "dilute"]
 """Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
 
-RegionKind = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
+RegionKind = Literal["auto", "sam", "sam3", "edges", "patches", "superpixel", "grid", "files"]
 """Built-in regions."""
 MASK_GROUP = "normlift_ns.masks"
 """Entry point group of mask sources, whose names are further regions."""
@@ -475,6 +475,7 @@ class SourceOptions:
     mean over seven OpenCLIP templates. {} alone is the bare prompt."""
     regions: str = "auto"
     """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
+    edges: regions between the edges that a small network finds, whose weights ns-normlift-weights --get edges fetches.
     patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
     neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
@@ -482,8 +483,8 @@ class SourceOptions:
     sam3_prompts: tuple[str, ...] = ()
     """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None
-    """Approximate number of regions per image, for superpixel, grid and patches; larger values give smaller regions.
-    Default: 256 for superpixel and grid, 1024 for patches."""
+    """Approximate number of regions per image, for superpixel, grid, patches and edges; larger values give smaller
+    regions. Default: 256 for superpixel and grid, 1024 for patches, the --level for edges."""
     sam_model: str | None = None
     """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of Meta's first SAM, or a name to
     download (such as facebook/sam2.1-hiera-large). Default: facebook/sam-vit-huge, as in LangSplat. --regions sam3
@@ -497,9 +498,10 @@ class SourceOptions:
     regions_resample: bool = False
     """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
     level: str | None = None
-    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
-    for subparts, parts or wholes (l if not given), or default for all of SAM's masks in one map. langsplat also accepts
-    sum, the sum of the vectors of all levels."""
+    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for about
+    300, 120 or 40 regions per image (m if not given). sam and langsplat: s, m or l for subparts, parts or wholes (l if
+    not given), or default for all of SAM's masks in one map. langsplat also accepts sum, the sum of the vectors of all
+    levels."""
     features: FeatureKind = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
     as written by LangSplat's preprocessing."""

@@ -191,7 +191,9 @@ def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     check_readable_file(source.text_embeddings, "--text-embeddings")
     name = requested_regions(source) if source.features == "none" else source.features
     if name != "auto":
-        check_mask_options(source.looking_for(texts), name)
+        masks = check_mask_options(source.looking_for(texts), name)
+        if masks.weights is not None:
+            masks.weights.check()
     if source.sam_model is not None and is_local_path(source.sam_model, 2):
         _existing_mode(Path(source.sam_model), "--sam-model")
     if source.prompt_template not in ("{}", "ensemble") and "{}" not in source.prompt_template:

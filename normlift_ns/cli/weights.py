@@ -208,7 +208,7 @@ def _show(found: dict[str, Path | None]) -> None:
     CONSOLE.print(table)
     CONSOLE.print(f"Looked in {weights_folder()} and {hub_folder('').parent}", soft_wrap=True)
     info("Fetch weights with: ns-normlift-weights --get imagenet edges")
-    info("Sizes on the hub are approximate. The terms of the training data are in the file of --json.")
+    info("Sizes on the hub are approximate. The terms of the training data are in the file of --output-json.")
 
 
 def entrypoint() -> None:

@@ -14,6 +14,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, get_args
 
+from normlift_ns.encoders.package_files import EDGES, PackageFile
 from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.errors import InputError
@@ -46,6 +47,8 @@ class MaskSource:
     """Names from `MASK_OPTIONS` that the source accepts."""
     has_features: bool = False
     """True if `make` returns a `FeatureSource`, which needs no encoder of regions."""
+    weights: PackageFile | None = None
+    """Weight file that a lift needs, which `ns-normlift-weights` fetches."""
 
 
 _COUNT, _PATCH_COUNT = 256, 1024
@@ -93,6 +96,22 @@ def _check_sam3(options: SourceOptions) -> None:
 
 SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "sam3_prompts"))
 """Masks of SAM 3 for text prompts."""
+
+
+_make_edges = _make("segmentation.edges:EdgeRegions", lambda o, device: (o.level or "m", o.region_count, device))
+
+
+def _check_edges(options: SourceOptions) -> None:
+    _check_level(options, "edges", ("s", "m", "l"))
+    if options.level is not None and options.region_count is not None:
+        raise InputError(
+            f"--level {options.level} and --region-count {options.region_count} both choose the number of regions of "
+            "--regions edges; leave one of them out"
+        )
+
+
+EDGE_REGIONS = MaskSource(_make_edges, _check_edges, ("level",), weights=EDGES)
+"""Regions between learned edges."""
 
 
 def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
@@ -170,6 +189,7 @@ MASK_SOURCES = Registry(
     {
         "sam": "normlift_ns.segmentation.registry:SAM_MASKS",
         "sam3": "normlift_ns.segmentation.registry:SAM3_MASKS",
+        "edges": "normlift_ns.segmentation.registry:EDGE_REGIONS",
         "patches": "normlift_ns.segmentation.registry:PATCHES",
         "superpixel": "normlift_ns.segmentation.registry:SUPERPIXEL",
         "grid": "normlift_ns.segmentation.registry:GRID",

@@ -145,7 +145,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
     def options(**more: Any) -> SourceOptions:
         return SourceOptions(**{"encoder": "color", "regions": "halves", **more})
 
-    refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
+    refused(options, "must be one of auto, sam, sam3, edges, patches, superpixel, grid, files; got 'halves'")
     with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
         check_source_options(options(level="2"), ())
         source = make_source(options(level="2"))
@@ -154,7 +154,9 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
         assert len(view.features) == 2 and view.labels.tolist() == [[0, 1]] * 4
         assert cached(source, tmp_path / "cache").view(image, "a.png").labels.equal(view.labels)
         refused(lambda: check_source_options(options(sam_model="a/b"), ()), "--sam-model a/b", '"halves"')
-        refused(lambda: options(regions="langsplat"), "auto, sam, sam3, patches, superpixel, grid, files, halves")
+        refused(
+            lambda: options(regions="langsplat"), "auto, sam, sam3, edges, patches, superpixel, grid, files, halves"
+        )
     for number, (labels, parts) in enumerate((
         ("torch.zeros(2, 2)", ["torch.float32 (2, 2)", "(4, 2)", "[H, W]"]),
         (f"{halves} * 2", ["0..2", "without gaps"]),
