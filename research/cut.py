@@ -3,7 +3,8 @@
     python -m research.cut fox=RUN/config.yml castle=RUN/config.yml     results/cut.json
 
 The labels are `fox_labels.json` next to the captures and `labels/castle_labels.json`. The vector of a label is its
-prototype: the normalized mean of the features of the regions inside its polygons, by area. Relevancies are rendered
+prototype, the normalized mean of the features of the regions inside its polygons, by area; where the encoder knows
+the word, its text is measured too. Relevancies are rendered
 into the labeled images and compared with the polygons; a text has one IoU, pooled over its images.
 
 Keys: <capture>.<label>.<cut>, the IoU of one text; <capture>.mean.<cut>, the mean over texts of IoU divided by the
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,8 @@ from PIL import Image, ImageDraw
 from torch.nn.functional import normalize
 
 import normlift_ns as nl
+from normlift_ns.encoders.build import make_source
+from normlift_ns.errors import InputError
 from research.honest_answers import otsu
 from research.report import Report
 from tests.captures import SHARED
@@ -37,7 +41,7 @@ _PARTS = {"fox head"}
 
 
 def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Yield the labeled images, and the pixels of every label in each; later polygons cover earlier ones, parts none."""
+    """Yield the labeled images, and the pixels of every label in each."""
     table = json.loads(LABELS[capture].read_text())
     for image in sorted({label["image"] for label in table["labels"]}):
         canvas, parts, names = Image.new("I", tuple(table["size"])), {}, [""]
@@ -59,7 +63,7 @@ def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
 def prototypes(run: Any, views: dict[str, Any], masks: dict[str, dict[str, np.ndarray]]) -> dict[str, torch.Tensor]:
     """Return the vector of every label: the mean of the features of the regions under its pixels, by area."""
     total: dict[str, torch.Tensor] = {}
-    source = nl.make_source(run_source(run), "cpu") if hasattr(nl, "make_source") else make_source(run)
+    source = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu")
     for image, labels in masks.items():
         found = source.view(views[image].image, views[image].name)
         cells = found.region_of_cell[0].long()
@@ -68,18 +72,6 @@ def prototypes(run: Any, views: dict[str, Any], masks: dict[str, dict[str, np.nd
             region = cells[cell[cell >= 0]]
             total[name] = total.get(name, 0) + found.features[region[region >= 0]].double().sum(0)
     return {name: normalize(vector, dim=0).float() for name, vector in total.items()}
-
-
-def make_source(run: Any) -> Any:
-    """Return the feature source of a run's lift."""
-    from normlift_ns.encoders.build import make_source as build  # noqa: PLC0415
-
-    return build(run_source(run), "cpu")
-
-
-def run_source(run: Any) -> nl.SourceOptions:
-    """Return the options of the front end of a run."""
-    return nl.SourceOptions(**run.field.manifest["source"])
 
 
 def best_cut(values: np.ndarray, truth: np.ndarray) -> float:
@@ -103,14 +95,20 @@ def measure(report: Report, capture: str, config: Path) -> None:
     scene = run.scene
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
     vectors = prototypes(run, views, masks)
+    for name in list(vectors):
+        with suppress(InputError):  # a word that the encoder does not know
+            vectors[f"word {name}"] = torch.from_numpy(run.texts.rows([name])[0])
     cosine, valid = run.field.query(torch.stack(list(vectors.values())).numpy()), run.field.valid()
     ratios: dict[str, list[float]] = {}
-    mode = {"rasterize_mode": scene.rasterize_mode}
-    drawn = {image: nl.render(scene.gaussians, views[image].camera, cosine, **mode) for image in masks}
+    drawn = {
+        image: nl.render(scene.gaussians, views[image].camera, cosine, rasterize_mode=scene.rasterize_mode)[0]
+        for image in masks
+    }
     for q, name in enumerate(vectors):
-        pixels = [image for image, labels in masks.items() if name in labels]
-        values = np.concatenate([drawn[image][0][..., q].numpy().ravel() for image in pixels])
-        truth = np.concatenate([masks[image][name].ravel() for image in pixels])
+        label = name.removeprefix("word ")
+        images = [image for image, labels in masks.items() if label in labels]
+        values = np.concatenate([drawn[image][..., q].numpy().ravel() for image in images])
+        truth = np.concatenate([masks[image][label].ravel() for image in images])
         best = best_cut(values, truth)
         report.add(f"{capture}.{name}.best", best, "IoU")
         for key, cut in candidate_cuts(cosine[valid, q].numpy()).items():
