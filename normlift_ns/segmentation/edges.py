@@ -41,6 +41,8 @@ _CHANNELS, _DEPTHS = (64, 128, 256, 512, 512), (2, 2, 3, 3, 3)
 """Channels and convolutions of each block."""
 _MEAN = (104.00699, 116.66877, 122.67892)
 """Mean color of the training images: blue, green, red."""
+_MARGIN = 16
+"""Pixels of mirrored image around the image. Without them, the network finds edges along the border."""
 _HEIGHTS = 256
 """Number of values of an edge map. Few values hide the rounding errors of devices."""
 
@@ -217,9 +219,11 @@ class EdgeRegions(RegionDefaults):
             InputError: If the weights are damaged, or h5py is not installed.
         """
         height, width = working_size(image.shape[0], image.shape[1], self.pixels)
-        pixels = resize_bilinear(image.to(self.device), height, width)
+        pixels = resize_bilinear(image.to(self.device), height, width).cpu().numpy()
+        margins = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN), (0, 0))
+        mirrored = torch.from_numpy(np.pad(pixels, margins, mode="reflect")).to(self.device)
         with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
-            strength = self.network(pixels)
+            strength = self.network(mirrored)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
         return (strength * (_HEIGHTS - 1)).round().to(torch.uint8).cpu().numpy()
 
     @cached_property
