@@ -288,7 +288,7 @@ def _within(
 ) -> tuple[Float[Tensor, "m k_plus_1"], Float64[Tensor, "m k_plus_1"]]:
     """Return R and squared distances in units of sigma_d for N+, self first."""
     r = _gather(reliability, torch.cat([rows[:, None], neighbors.index[rows]], dim=1))
-    return r, torch.nn.functional.pad(neighbors.distance[rows] / width, (1, 0)) ** 2
+    return r, torch.nn.functional.pad(neighbors.distance[rows].double() / width, (1, 0)) ** 2
 
 
 def _nearest(r: Tensor, square: Tensor) -> Tensor:

@@ -59,6 +59,7 @@ window.wake = () => {
 };
 for (const what of ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "input", "resize"])
   addEventListener(what, wake, true);
+addEventListener("scroll", ({target}) => { (target.scrollingElement ?? target).scrollLeft = 0; }, true);
 const heard = (Kind) => class extends Kind {
   constructor(...how) { super(...how); this.addEventListener("message", wake); }
   postMessage(what, ...rest) {
@@ -69,7 +70,8 @@ const heard = (Kind) => class extends Kind {
 [window.Worker, window.WebSocket] = [heard(Worker), heard(WebSocket)];
 """
 """Ten pictures per second at most; one, where for six seconds nobody has done anything and nothing has come. Counts
-pictures, and values of widgets that were sent to the server.
+pictures, and values of widgets that were sent to the server. Nothing is moved sideways: a click may bring into view
+what a panel hides beyond its edge, and the picture with it.
 """
 _BLIND = """
 const plain = HTMLCanvasElement.prototype.getContext;

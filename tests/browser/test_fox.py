@@ -48,8 +48,7 @@ def test_a_person_finds_the_fox(tmp_path: Path, browser: Browser) -> None:
             (red, green, blue), rest = photo[orange].mean(axis=0), photo[~orange].mean(axis=0)
             return red > green > blue and red - blue > 50 and rest[0] - rest[2] < 0.5 * (red - blue)
 
-        # the picture may still be that of both prompts; roses have more blue than green
-        orange = overlaid(tab.sees(has_found, "what is orange")) & (photo[..., 1] > photo[..., 2])
+        orange = overlaid(tab.sees(has_found, "what is orange"))
         tab.choose("Prompt shown", "2: crimson")
         tab.sees(lambda seen: (overlaid(seen) & orange).sum() < 0.05 * orange.sum(), "the fox is not crimson")
 
