@@ -403,7 +403,7 @@ Background = Literal["black", "white"]
 """Background color behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
 """Storage of directions: the evidence itself (exact), float16, or float16 coordinates in a basis."""
-RelevancyRule = Literal["cosine", "lerf", "margin"]
+RelevancyRule = Literal["contrast", "cosine", "lerf", "margin"]
 """Formula for the relevancy of a prompt from its cosines; see `normlift_ns.relevancy`."""
 UnlabeledMode = Literal["ignore", "dilute"]
 """Meaning of a pixel without a region: ignored, or an observation of the zero vector."""

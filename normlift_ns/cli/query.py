@@ -401,17 +401,14 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
-    """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
+    """Print the table of an answer, and a note for each prompt that is not found."""
     rule = f"{question.rule} > {question.threshold:.4g}"
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
-        if row["stands_out"] is False:
-            top, limit = row["histogram"]["top"], row["histogram"]["limit"]
+        if row["verdict"] in ("weak match", "probably not here"):
+            top = row["histogram"]["top"]
             position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
-            common.info(
-                f"{row['text']}: probably not in this scene. The nearest match{position} has relevancy {top:.3f}; "
-                f"objects in a scene usually reach at least {limit:.3g}."
-            )
+            common.info(f"{row['text']}: {row['verdict']}. The nearest match{position} has relevancy {top:.3f}.")
 
 
 def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
@@ -432,6 +429,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         result.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
     if not narrow:
         result.add_column("histogram", no_wrap=True)
+    result.add_column("verdict", no_wrap=True)
     result.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
@@ -439,7 +437,14 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         bins = row["histogram"]
         bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
         histogram = () if narrow else (common.plain_text(bars),)
-        result.add_row(common.plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
+        result.add_row(
+            common.plain_text(row["text"]),
+            f"{row['fraction']:.2%}",
+            *cells,
+            *histogram,
+            row["verdict"] or "-",
+            suggested,
+        )
     return result
 
 

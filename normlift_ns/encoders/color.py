@@ -64,6 +64,8 @@ class ColorEncoder(LazyTextEncoder):
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.
 
+        A name means every color of the survey whose name ends in it: "red" is also brick red and dull red.
+
         Raises:
             ValueError: If `prompts` or a prompt is empty, or one contains no color name.
         """
@@ -73,7 +75,7 @@ class ColorEncoder(LazyTextEncoder):
             names = find_color_names(prompt)
             if len(names) == 0:
                 raise InputError(_no_color_message(prompt))
-            rows.append(embed_colors(np.stack([_names()[name] for name in names])).mean(axis=0))
+            rows.append(np.mean([_family_vector(name) for name in names], axis=0))
         return _normalized(np.stack(rows)).astype(np.float32)
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
@@ -91,6 +93,14 @@ class ColorEncoder(LazyTextEncoder):
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
         return (self.encode(image, labels) for image, labels in views)
+
+
+@cache
+def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
+    """Return the unit mean of the vectors of all colors whose names end in a color name."""
+    shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
+    (row,) = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
+    return row
 
 
 def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"]:

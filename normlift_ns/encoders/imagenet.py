@@ -85,3 +85,8 @@ def _vocabulary() -> dict[str, tuple[int, ...]]:
                 first, _, last = group.partition("-")
                 known.setdefault(name, set()).update(range(int(first), int(last or first) + 1))
     return {word: tuple(sorted(found)) for word, found in (heads | known).items()}
+
+
+def class_names() -> list[str]:
+    """Return the first name of each of the 1,000 classes."""
+    return [names.split(", ")[0] for names in _table()["classes"].values()]

@@ -60,6 +60,12 @@ class EncoderKind:
     prompts, and the embeddings are cached."""
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
+    has_null_words: bool = True
+    """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
+    suggested: float = 0.5
+    """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
+    present_from: tuple[float, float] | None = None
+    """Best cosines from which a prompt is a weak match, and from which it is found. None: see `query.presence`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     paths: tuple[str, ...] = ()
@@ -202,7 +208,17 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     return ColorEncoder()
 
 
-COLOR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_make_color_encoder, learned=False)
+COLOR = EncoderKind(
+    _make_color_encoder,
+    rule="cosine",
+    negatives=(),
+    threshold="auto",
+    texts=_make_color_encoder,
+    has_null_words=False,
+    suggested=0.8,
+    present_from=(0.68, 0.78),
+    learned=False,
+)
 """Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""
 
 

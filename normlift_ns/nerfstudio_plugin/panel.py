@@ -434,7 +434,7 @@ class SearchPanel(Controller):
         return vectors
 
     def _query_settings(self) -> dict[str, Any]:
-        settings: dict[str, Any] = {"negatives": split_prompts(self._negatives)}
+        settings: dict[str, Any] = {"negatives": split_prompts(self._negatives) or None}
         if (widgets := self._widgets) is not None:
             chosen = {"relevancy": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
             settings |= {name: widget.value for name, widget in chosen.items()}

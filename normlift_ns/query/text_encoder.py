@@ -41,6 +41,7 @@ class DefaultRule(NamedTuple):
 
 
 _PLAIN_COSINE = DefaultRule("cosine", (), "auto")
+_CONTRAST = DefaultRule("contrast", (), 0.5)
 
 
 class HasManifest(Protocol):
@@ -203,8 +204,11 @@ def encoder_name(field: HasManifest) -> str | None:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of a field's encoder.
 
-    For an unknown encoder, or a file of text embeddings without the default negatives, the rule is plain cosine.
+    With a null level it is rule contrast. For an unknown encoder, or a file of text embeddings without the default
+    negatives, the rule is plain cosine.
     """
+    if field.manifest.get("null_words") is not None:
+        return _CONTRAST
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping):
         return _PLAIN_COSINE

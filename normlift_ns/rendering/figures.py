@@ -24,6 +24,7 @@ from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer, Finding
+from normlift_ns.query.presence import Verdict
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
@@ -279,27 +280,29 @@ class FigureHeader:
     """The prompt."""
     summary: str
     """Size of the selection and strength of its evidence."""
-    absent: bool = False
-    """True if the prompt is probably not in the scene."""
+    verdict: Verdict | None = None
+    """Whether the prompt is in the scene."""
 
     @property
     def title(self) -> str:
-        """The prompt, and a note if it is probably not in the scene."""
-        return colors.clip_text(self.text, 60) + self.absent * "   ·   probably not in this scene"
+        """The prompt, and the verdict on it."""
+        return colors.clip_text(self.text, 60) + ("" if self.verdict is None else f"   ·   {self.verdict}")
 
     @staticmethod
     def of(finding: Finding) -> FigureHeader:
         """Summarize the answer to one prompt."""
         mask, scalars = finding.mask, finding.answer.field.scalars
-        threshold, absent = finding.answer.question.threshold, finding.stands_out is False
+        threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
             peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", absent)
+            return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
         below = f" (R < {WEAK_RELIABILITY:g})"
-        return FigureHeader(finding.text, f"{100 * finding.fraction:.1f} % of the Gaussians; {evidence}{below}", absent)
+        return FigureHeader(
+            finding.text, f"{100 * finding.fraction:.1f} % of the Gaussians; {evidence}{below}", verdict
+        )
 
 
 def view_figure(

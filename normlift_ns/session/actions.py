@@ -57,14 +57,11 @@ def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagn
 
 
 def _warning(finding: Finding, histogram: Histogram) -> str:
-    if is_click(finding.text) or histogram.stands_out is None:
+    if is_click(finding.text):
         return ""
     position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
-    if not histogram.stands_out:
-        return (
-            f"{finding.text}: probably not in this scene. The nearest match{position} has relevancy "
-            f"{histogram.top:.2f}; objects in a scene reach {histogram.limit:.2g} or more."
-        )
+    if finding.verdict in ("weak match", "probably not here"):
+        return f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {histogram.top:.2f}."
     if finding.peak is None or bool(finding.mask.any()):
         return ""
     return (
