@@ -1,14 +1,15 @@
-"""IoU at candidate cuts against IoU at the best cut, on lifted captures with labels drawn by hand.
+"""Average precision, and IoU at the default cut against IoU at the best one, on captures with labels drawn by hand.
 
     python -m research.cut fox=RUN/config.yml castle=RUN/config.yml     results/cut.json
 
 The labels are `fox_labels.json` next to the captures and `labels/castle_labels.json`. The vector of a label is its
-prototype, the normalized mean of the features of the regions inside its polygons, by area; where the encoder knows
-the word, its text is measured too. Relevancies are rendered
-into the labeled images and compared with the polygons; a text has one IoU, pooled over its images.
+prototype, the normalized mean of the features of the regions inside its polygons, by area, which is compared like a
+click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
+labeled images and compared with the polygons; a text has one figure, pooled over its images.
 
-Keys: <capture>.<label>.<cut>, the IoU of one text; <capture>.mean.<cut>, the mean over texts of IoU divided by the
-best; <capture>.worst.<cut>, the smallest of these.
+Keys: <capture>.<label>.ap; .best and .default, the IoU at the best threshold of that text and at the default one; for
+prototypes also other candidates. <capture>.mean.<cut>, the mean over texts of IoU divided by the best;
+<capture>.worst.<cut>, the smallest of these.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ from torch.nn.functional import normalize
 import normlift_ns as nl
 from normlift_ns.encoders.build import make_source
 from normlift_ns.errors import InputError
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, make_query
 from research.honest_answers import otsu
 from research.report import Report
 from tests.captures import SHARED
 
-FRACTIONS = tuple(round(0.2 + 0.05 * i, 2) for i in range(13))
+POSITIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 LABELS = {
     "fox": SHARED / "captures" / "fox_labels.json",
     "castle": Path(__file__).parent / "labels" / "castle_labels.json",
@@ -82,42 +85,52 @@ def best_cut(values: np.ndarray, truth: np.ndarray) -> float:
     return float((hits / union).max())
 
 
+def average_precision(values: np.ndarray, truth: np.ndarray) -> float:
+    """Return the average precision of pixels with these relevancies."""
+    hit = truth[np.argsort(-values)]
+    return float((hit.cumsum() / np.arange(1, len(hit) + 1))[hit].mean())
+
+
 def candidate_cuts(values: np.ndarray) -> dict[str, float]:
-    """Return the candidate thresholds from the relevancies of the Gaussians with a direction."""
+    """Return the candidate thresholds of a prototype from the relevancies of the Gaussians with a direction."""
     median, top = np.quantile(values, (0.5, 0.999))
-    cuts = {f"median+{f:.2f}": median + f * (top - median) for f in FRACTIONS}
-    return cuts | {f"zero+{f:.2f}": f * top for f in FRACTIONS} | {"otsu": otsu(values[values > median])}
+    return {f"median+{f:.1f}": median + f * (top - median) for f in POSITIONS} | {"otsu": otsu(values[values > median])}
 
 
 def measure(report: Report, capture: str, config: Path) -> None:
     """Add the figures of one lifted capture."""
     run, masks = nl.open_run(config), dict(label_masks(capture))
-    scene = run.scene
+    scene, field = run.scene, run.field
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
     vectors = prototypes(run, views, masks)
-    for name in list(vectors):
+    asked = {name: (name, Query((name,), row[None].numpy(), suggest_threshold=True)) for name, row in vectors.items()}
+    for name in vectors:
         with suppress(InputError):  # a word that the encoder does not know
-            vectors[f"word {name}"] = torch.from_numpy(run.texts.rows([name])[0])
-    cosine, valid = run.field.query(torch.stack(list(vectors.values())).numpy()), run.field.valid()
-    ratios: dict[str, list[float]] = {}
+            asked[f"word {name}"] = (name, make_query(field, run.texts.rows, [name]))
+    answers = {key: run_query(field, scene.gaussians.means, question) for key, (_, question) in asked.items()}
+    relevancy = torch.cat([answer.relevancy for answer in answers.values()], 1)
     drawn = {
-        image: nl.render(scene.gaussians, views[image].camera, cosine, rasterize_mode=scene.rasterize_mode)[0]
+        image: nl.render(scene.gaussians, views[image].camera, relevancy, rasterize_mode=scene.rasterize_mode)[0]
         for image in masks
     }
-    for q, name in enumerate(vectors):
-        label = name.removeprefix("word ")
+    ratios: dict[str, dict[str, float]] = {}
+    for q, (key, (label, _)) in enumerate(asked.items()):
         images = [image for image, labels in masks.items() if label in labels]
         values = np.concatenate([drawn[image][..., q].numpy().ravel() for image in images])
         truth = np.concatenate([masks[image][label].ravel() for image in images])
-        best = best_cut(values, truth)
-        report.add(f"{capture}.{name}.best", best, "IoU")
-        for key, cut in candidate_cuts(cosine[valid, q].numpy()).items():
-            iou = float(((values > cut) & truth).sum() / ((values > cut) | truth).sum())
-            report.add(f"{capture}.{name}.{key}", iou, "IoU")
-            ratios.setdefault(key, []).append(iou / best)
-    for key, values_ in ratios.items():
-        report.add(f"{capture}.mean.{key}", float(np.mean(values_)), "of the best IoU")
-        report.add(f"{capture}.worst.{key}", min(values_), "of the best IoU")
+        best, answer = best_cut(values, truth), answers[key]
+        cuts = {"default": answer.question.threshold}
+        if not key.startswith("word "):
+            cuts |= candidate_cuts(answer.relevancy[answer.valid, 0].numpy())
+        report.add(f"{capture}.{key}.ap", average_precision(values, truth), "of 1")
+        report.add(f"{capture}.{key}.best", best, "IoU")
+        for name, cut in cuts.items():
+            value = float(((values > cut) & truth).sum() / ((values > cut) | truth).sum())
+            report.add(f"{capture}.{key}.{name}", value, "IoU")
+            ratios.setdefault(name, {})[key] = value / best
+    for name, found in ratios.items():
+        report.add(f"{capture}.mean.{name}", float(np.mean(list(found.values()))), "of the best IoU")
+        report.add(f"{capture}.worst.{name}", min(found.values()), "of the best IoU")
 
 
 def main() -> None:

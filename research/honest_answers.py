@@ -33,7 +33,7 @@ from normlift_ns.demo.capture import demo_cameras, view_image
 from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.options import RefineConfig, RelevancyRule
-from normlift_ns.query.engine import Histogram, presence_limit, relevancy_histogram
+from normlift_ns.query.engine import relevancy_histogram
 from normlift_ns.segmentation.regions import Grid, Superpixels
 from research.damage import LADDER, observe
 from research.report import RESULTS, Report

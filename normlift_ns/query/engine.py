@@ -79,8 +79,8 @@ class Answer:
     valid: Bool[Tensor, " n"]
     """True for Gaussians that have a direction."""
     selected: Bool[Tensor, "n q"]
-    """True for Gaussians that are valid, above the threshold and reliable enough. Rule contrast selects nothing for a
-    prompt that is probably not in the scene."""
+    """True for Gaussians that are valid, above the threshold and reliable enough; none for a prompt that is
+    probably not in the scene, if the query is gated."""
     top_cosines: tuple[float, ...]
     """Cosine to each prompt that one Gaussian in a thousand exceeds; 0 if no Gaussian has a direction."""
 
@@ -326,7 +326,7 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
         )
     reliable = answer.valid & (answer.field.scalars.reliability >= question.min_reliability)
     selected = (answer.relevancy > question.threshold) & reliable[:, None]
-    if question.rule == "contrast":
+    if question.gated:
         for index, verdict in enumerate(answer.verdicts):
             if verdict == "probably not here":
                 selected[:, index] = False

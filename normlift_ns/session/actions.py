@@ -91,7 +91,7 @@ def carry_threshold(state: State, question: Query) -> Query:
         threshold_suggestion(replace(state, shown=None)),
     ):
         return question
-    return replace(question, threshold=previous.threshold, suggest_threshold=False)
+    return replace(question, threshold=previous.threshold, suggest_threshold=False, gated=previous.gated)
 
 
 def _only_clicks(question: Query) -> bool:
@@ -149,7 +149,7 @@ def set_threshold(state: State, value: float) -> State:
     value = min(MAX_THRESHOLD, max(MIN_THRESHOLD, value))
     if state.query is None or value == state.query.threshold:
         return state
-    question = replace(state.query, threshold=value, suggest_threshold=False)
+    question = replace(state.query, threshold=value, suggest_threshold=False, gated=False)
     return replace(state, query=question, action=f"Threshold {value:.3g}")
 
 
