@@ -243,7 +243,7 @@ def render(things: Mapping[str, tuple[Mesh, np.ndarray]], poses: list[np.ndarray
 def draw(renderer: Any, data: Any, pose: np.ndarray, part: int | None = None) -> None:
     """Update a renderer's scene as a camera sees it through a part of each pixel, or through its center.
 
-    With each part, the lights come from another direction near their own.
+    With each part, a strong light comes from another direction on one side, and a weak one on the others.
     """
     renderer.update_scene(data)
     shift = np.zeros(2) if part is None else (np.array(divmod(part, PARTS)) + 0.5) / PARTS - 0.5
@@ -253,10 +253,11 @@ def draw(renderer: Any, data: Any, pose: np.ndarray, part: int | None = None) ->
         camera.frustum_near, camera.frustum_far, camera.frustum_center = NEAR, 20, shift[0] * pixel
         camera.frustum_width = WIDTH / 2 * pixel
         camera.frustum_bottom, camera.frustum_top = ((y + shift[1]) * pixel for y in (-HEIGHT / 2, HEIGHT / 2))
-    random = np.random.default_rng(part)
-    for light in renderer.scene.lights[: renderer.scene.nlight] if part is not None else ():
-        light.dir = light.dir + 0.13 * random.standard_normal(3) * (1, 1, 0)
-        light.pos = -3 * light.dir
+    if part is not None:
+        x, y = 0.618034 * part % 1, (part + 0.5) / PARTS**2
+        key, fill = from_angles(3, 0.3 + 0.7 * x, 50 + 16 * y), from_angles(3, 2.1 + 3.6 * x, 45 + 25 * y)
+        for light, position in zip(renderer.scene.lights[1:3], (key, fill)):
+            light.pos, light.dir = position, -position / 3
 
 
 def scene_xml(things: Mapping[str, tuple[Mesh, np.ndarray]], folder: Path) -> str:
@@ -268,12 +269,8 @@ def scene_xml(things: Mapping[str, tuple[Mesh, np.ndarray]], folder: Path) -> st
     ]
     geoms = [f'<geom type="mesh" mesh="{i}" material="{i}"/>' for i in range(len(things))]
     lights = [
-        f'<light type="directional" pos="{x:.3f} {y:.3f} {z:.3f}" dir="{-x:.3f} {-y:.3f} {-z:.3f}" castshadow="true"'
-        f' diffuse="{power} {power} {power}" specular="0.1 0.1 0.1"/>'
-        for power, (x, y, z) in (
-            *((0.19, from_angles(3, 0.35 + 0.3 * i, 54 + 6 * (i % 2))) for i in range(3)),
-            *((0.1, from_angles(3, 2.4 + 1.3 * i, 60)) for i in range(3)),
-        )
+        f'<light type="directional" castshadow="true" diffuse="{x} {x} {x}" specular="{x / 3} {x / 3} {x / 3}"/>'
+        for x in (0.57, 0.3)
     ]
     return (
         '<mujoco><statistic center="0 0 0" extent="2"/><visual><quality shadowsize="2048"/>'
