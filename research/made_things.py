@@ -26,7 +26,7 @@ class Mesh:
     """[f, 3, 2] indices of a corner's point and of its texture coordinates."""
 
     def __add__(self, other: Mesh) -> Mesh:
-        faces = other.faces + [len(self.points), len(self.uv)]
+        faces = other.faces + np.array([len(self.points), len(self.uv)])
         parts = (self.points, other.points), (self.uv, other.uv), (self.faces, faces)
         return Mesh(*(np.concatenate(pair) for pair in parts))
 
@@ -160,7 +160,9 @@ def peel(color: Sequence[float], pole: Sequence[float], seed: int) -> Picture:
     """Skin of a fruit, with pores, and a pole of another color at the top."""
     shape = (512, 512)
     v, _ = grid(*shape)
-    skin = np.asarray(color) * (1 + 0.05 * noise(seed, shape, (6, 6)) + 0.06 * noise(seed + 1, shape, (64, 96)))[..., None]
+    skin = (
+        np.asarray(color) * (1 + 0.05 * noise(seed, shape, (6, 6)) + 0.06 * noise(seed + 1, shape, (64, 96)))[..., None]
+    )
     return mixed((0, 0, 0), pole, (v - 0.955) * 60) + skin * (1 - ((v - 0.955) * 60).clip(0, 1)[..., None])
 
 
@@ -184,7 +186,9 @@ def football() -> Picture:
     corners = np.array([np.roll((0, a, b), axis) for axis in range(3) for a, b in signs])
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
     near = corners @ corners.T > 0.4
-    triples = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]]
+    triples = [
+        (i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]
+    ]
     middles = np.array([corners[list(x)].sum(axis=0) for x in triples])
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     # The planes of the faces of a truncated icosahedron; the ray leaves it through the nearest one.
@@ -230,7 +234,9 @@ def banana() -> Mesh:
     """It lies on its side."""
     angle = np.linspace(-0.95, 0.95, 65)
     path = 0.105 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
-    radius = 0.0185 * np.interp(np.abs(angle), [0, 0.5, 0.72, 0.82, 0.9, 0.94, 0.95], [1, 0.93, 0.7, 0.38, 0.27, 0.26, 0.05])
+    radius = 0.0185 * np.interp(
+        np.abs(angle), [0, 0.5, 0.72, 0.82, 0.9, 0.94, 0.95], [1, 0.93, 0.7, 0.38, 0.27, 0.26, 0.05]
+    )
     return tube(path, radius, ribs=0.05).turned([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 

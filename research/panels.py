@@ -1,8 +1,8 @@
-"""How one answer came to be, in panels: photograph, edges, regions, 2D answer, lifted answer, R, and the best witnesses.
+"""How one answer came to be, in panels: photograph, edges, regions, 2D answer, lifted answer, R, and the reasons.
 
     python -m research.panels RUN/config.yml VIEW --text "red fox" --output panels.png
 
-VIEW is a training image of the lifted run, by name or number. Regions and features that are not in the run's cache are
+VIEW is a training image of the lifted run, by name. Regions and features that are not in the run's cache are
 computed, which needs the weights of the lift. Both answers have the same colors, and a white line at the threshold.
 """
 
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -31,17 +32,22 @@ from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.query.engine import Finding
 from normlift_ns.rasterization.rasterize import render_image
 from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.rendering.figures import Display, make_display, pixel_relevancy, relevancy_map, reliability_map
+from normlift_ns.rendering import colors
+from normlift_ns.rendering.figures import Display, make_display, pixel_relevancy, relevancy_map
 from normlift_ns.segmentation.edges import EdgeRegions
 
-COLUMNS, WIDTH = 4, 3.6
-"""Panels of a row, and width of a panel in inches."""
+COLUMNS, WIDTH, GAP, TITLE = 4, 3.6, 0.1, 0.32
+"""Panels of a row; width of a panel, gap between panels and height of a title, in inches."""
+WITNESSES, LARGEST, LEAST = 2, 10, 0.1
+"""Photographs that are shown as reasons: those of so many with the largest votes that agree best with all votes. Their
+regions are outlined from this share of the photograph's vote.
+"""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path, help="config.yml of a lifted run")
-    parser.add_argument("view", help="training image, by name or number")
+    parser.add_argument("view", help="name of a training image")
     parser.add_argument("--text", required=True, help="prompt")
     parser.add_argument("--output", type=Path, required=True, help="PNG to write")
     arguments = parser.parse_args()
@@ -68,7 +74,7 @@ class Observed:
 
     def outlined(self, vote: ViewVote) -> Tensor:
         """[H, W, 3] the image with outlines around the regions that voted."""
-        inside = [(self.regions == one.region).any(dim=0) for one in vote.regions]
+        inside = [(self.regions == one.region).any(dim=0) for one in vote.regions if one.share >= LEAST]
         return draw_outlines(self.image, torch.stack([(self.cells >= 0) & x[self.cells.clamp(min=0)] for x in inside]))
 
 
@@ -111,9 +117,9 @@ class Story:
     def in_2d(self, observed: Observed) -> Tensor:
         """[H, W] relevancy of the image's own regions; 0 without a region."""
         question = self.found.answer.question
-        negative = question.negative_embeddings
-        cosines = [None if x is None else observed.features @ torch.as_tensor(x).T for x in (question.embeddings, negative)]
-        found = relevancy(cosines[0], cosines[1], rule=question.rule)[:, self.found.index]
+        vectors = (question.embeddings, question.negative_embeddings)
+        positive, negative = (None if x is None else observed.features @ torch.as_tensor(x).T for x in vectors)
+        found = relevancy(positive, negative, rule=question.rule)[:, self.found.index]
         return found[observed.region.clamp(min=0)].where(observed.region >= 0, 0.0)
 
     def rendered(self) -> tuple[Display, Tensor, Tensor, Tensor]:
@@ -129,27 +135,30 @@ class Story:
 
 def draw(run: LiftedRun, view: str, text: str) -> Figure:
     """Draw the panels of an answer in a view."""
-    names = list(run.scene.train.names)
-    camera = run.camera(int(view) if view.isdecimal() and len(view) < 4 else view)
-    name = next(x for x, y in zip(names, run.scene.train.cameras) if y is camera or torch.equal(y.world_to_camera, camera.world_to_camera))
+    name = next((x for x in run.scene.train.names if view in (x, Path(x).name, Path(x).stem)), None)
+    if name is None:
+        raise SystemExit(f"there is no training image {view!r}, but {', '.join(run.scene.train.names)}")
     story = Story(run, name, run.ask(text)[text])
     panels = list(story_panels(story))
-    height, width = panels[0][1].shape[:2]
+    height = WIDTH * panels[0][1].shape[0] / panels[0][1].shape[1] + TITLE
     rows = -(-len(panels) // COLUMNS)
-    figure = Figure(figsize=(COLUMNS * WIDTH, rows * (WIDTH * height / width + 0.42) + 0.5), layout="constrained")
-    for place, (title, image, line) in zip(figure.subplots(rows, COLUMNS).flat, panels):
+    size = (COLUMNS * (WIDTH + GAP) + GAP, rows * (height + GAP) + TITLE)
+    figure = Figure(figsize=size)
+    for i, (title, image, line) in enumerate(panels):
+        x, y = GAP + i % COLUMNS * (WIDTH + GAP), size[1] - (i // COLUMNS + 1) * (height + GAP) + GAP
+        place = figure.add_axes((x / size[0], y / size[1], WIDTH / size[0], (height - TITLE) / size[1]))
         show(place, title, image, line)
     if bool(story.found.mask.any()):
-        figure.supxlabel(run.why(story.found).sentence, fontsize=10)
+        figure.text(GAP / size[0], 0.12 / size[1], run.why(story.found).sentence, fontsize=10)
     return figure
 
 
 def show(place: Axes, title: str, image: Tensor, line: Tensor | None) -> None:
-    place.imshow(image.numpy(), cmap="gray_r", vmin=0, vmax=1, interpolation="antialiased")
+    place.imshow(image.numpy(), cmap="gray_r", vmin=0, vmax=1, interpolation="antialiased", aspect="auto")
     if line is not None and bool(line.any()):
         for color, width in (("black", 2.4), ("white", 1.2)):
             place.contour(line.numpy(), levels=[0.5], colors=color, linewidths=width)
-    place.set_title(title, fontsize=10.5, loc="left")
+    place.set_title(title, fontsize=11, loc="left", pad=4)
     place.set_axis_off()
 
 
@@ -165,20 +174,34 @@ def story_panels(story: Story) -> Iterator[tuple[str, Tensor, Tensor | None]]:
     display, rgb, values, alpha = story.rendered()
     flat = story.in_2d(observed)
     photograph = observed.image.float() / 255
-    yield f"“{found.text}” in this photograph alone", relevancy_map(display, photograph, flat, torch.ones_like(flat)), (
-        flat > threshold
+    yield (
+        f"“{found.text}” in this photograph alone",
+        relevancy_map(display, photograph, flat, torch.ones_like(flat)),
+        (flat > threshold),
     )
     count = display.num_prompts
     pixel = pixel_relevancy(values[..., : count + 1], alpha)[..., found.index]
     lifted = relevancy_map(display, rgb, pixel, alpha)
-    yield f"“{found.text}” lifted on the Gaussians", lifted, values[..., count + 1] > 0.5
-    yield "How far the views agree", reliability_map(rgb, values[..., count + 3 : count + 4], alpha), None
-    votes = story.run.why(found).views if bool(found.mask.any()) else ()
-    names = story.run.votes.names
-    for vote in [x for x in votes if names[x.view] != story.view][:2]:
+    lifted = colors.add_color_bar(lifted, display.colormap, display.map_scale, "relevancy")
+    yield f"“{found.text}” lifted onto the Gaussians", lifted, values[..., count + 1] > 0.5
+    yield "How far the photographs agree", reliability(values[..., count + 3 : count + 4], alpha, rgb), None
+    names, votes = story.run.votes.names, story.run.why(found).views if bool(found.mask.any()) else ()
+    others = [x for x in votes if names[x.view] != story.view][:LARGEST]
+    for vote in sorted(others, key=lambda x: -x.agreement)[:WITNESSES]:
         witness = story.observe(names[vote.view])
         title = f"Why: photograph {Path(names[vote.view]).stem}, {vote.share:.0%} of the evidence"
         yield title, witness.outlined(vote), None
+
+
+def reliability(values: Tensor, alpha: Tensor, rgb: Tensor) -> Tensor:
+    """[H, W, 3] map of R between its 5 % and 95 % quantiles in the view."""
+    pixel = pixel_relevancy(values, alpha)[..., 0]
+    low, high = pixel[alpha > 0.5].quantile(torch.tensor([0.05, 0.95])).tolist()
+    color, opacity = colors.apply_colormap(
+        pixel, (low, max(high, low + 0.05)), colors.colormap_rgb(colors.RELIABILITY_COLORMAP), min_opacity=0.9
+    )
+    shown = rgb.mean(dim=2, keepdim=True) * (1 - opacity[..., None]) + color * opacity[..., None]
+    return colors.add_color_bar(shown, colors.RELIABILITY_COLORMAP, (low, high), "reliability R")
 
 
 def boundaries(region: Tensor) -> Tensor:
@@ -192,9 +215,8 @@ def boundaries(region: Tensor) -> Tensor:
 def colored(observed: Observed, boundary: Tensor) -> Tensor:
     """[H, W, 3] every region in a color of its own over the gray image, and white lines between them."""
     hue = np.random.default_rng(0).permutation(len(observed.features)) / len(observed.features)
-    from matplotlib.colors import hsv_to_rgb
-
-    palette = torch.from_numpy(hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.75), np.full_like(hue, 0.9)], axis=1))).float()
+    hsv = np.stack([hue, np.full_like(hue, 0.75), np.full_like(hue, 0.9)], axis=1)
+    palette = torch.from_numpy(hsv_to_rgb(hsv)).float()
     gray = observed.image.float().mean(dim=2, keepdim=True) / 255
     inside = (observed.region >= 0)[..., None]
     picture = torch.where(inside, 0.5 * gray + 0.5 * palette[observed.region.clamp(min=0)], gray)
