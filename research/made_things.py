@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Picture = np.ndarray
 """Texture [h, w, 3], RGB in 0..1; the first row is v = 1."""
@@ -30,7 +31,7 @@ class Mesh:
         parts = (self.points, other.points), (self.uv, other.uv), (self.faces, faces)
         return Mesh(*(np.concatenate(pair) for pair in parts))
 
-    def turned(self, matrix: np.ndarray) -> Mesh:
+    def turned(self, matrix: ArrayLike) -> Mesh:
         return Mesh(self.points @ np.asarray(matrix).T, self.uv, self.faces)
 
     def obj(self) -> str:
@@ -120,7 +121,7 @@ def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return v, u
 
 
-def mixed(first: Sequence[float], second: Sequence[float], share: np.ndarray) -> Picture:
+def mixed(first: ArrayLike, second: ArrayLike, share: np.ndarray) -> Picture:
     share = share.clip(0, 1)[..., None]
     return np.asarray(first) * (1 - share) + np.asarray(second) * share
 

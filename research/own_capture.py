@@ -119,7 +119,7 @@ def room() -> dict[str, tuple[Mesh, np.ndarray]]:
 def placed_things(wheels: Path) -> Iterator[tuple[str, tuple[Mesh, np.ndarray]]]:
     """Yield name, mesh on the table and texture of each thing."""
     for name, (x, y, degrees, size) in PLACES.items():
-        mesh, texture = read_scan(wheels, name) if name in SCANS else tuple(make() for make in MADE[name])
+        mesh, texture = read_scan(wheels, name) if name in SCANS else (MADE[name][0](), MADE[name][1]())
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         mesh = mesh.turned(size * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]))
         at = np.array([x, y, -mesh.points[:, 2].min()])

@@ -117,8 +117,9 @@ class Story:
     def in_2d(self, observed: Observed) -> Tensor:
         """[H, W] relevancy of the image's own regions; 0 without a region."""
         question = self.found.answer.question
-        vectors = (question.embeddings, question.negative_embeddings)
-        positive, negative = (None if x is None else observed.features @ torch.as_tensor(x).T for x in vectors)
+        positive = observed.features @ torch.as_tensor(question.embeddings).T
+        against = question.negative_embeddings
+        negative = None if against is None else observed.features @ torch.as_tensor(against).T
         found = relevancy(positive, negative, rule=question.rule)[:, self.found.index]
         return found[observed.region.clamp(min=0)].where(observed.region >= 0, 0.0)
 
