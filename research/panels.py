@@ -1,4 +1,4 @@
-"""How one answer came to be, in panels: photograph, edges, regions, 2D answer, lifted answer, R, and the reasons.
+"""How one answer came to be, in panels: image, edges, regions, 2D answer, lifted answer, R, and the reasons.
 
     python -m research.panels RUN/config.yml VIEW --text "red fox" --output panels.png
 
@@ -39,8 +39,8 @@ from normlift_ns.segmentation.edges import EdgeRegions
 COLUMNS, WIDTH, GAP, TITLE = 4, 3.6, 0.1, 0.32
 """Panels of a row; width of a panel, gap between panels and height of a title, in inches."""
 WITNESSES, LARGEST, LEAST = 2, 10, 0.1
-"""Photographs that are shown as reasons: those of so many with the largest votes that agree best with all votes. Their
-regions are outlined from this share of the photograph's vote.
+"""Number of images that are shown as reasons, number of images with the largest votes among which those with the best
+agreement are chosen, and smallest share of an image's vote for which a region is outlined.
 """
 
 
@@ -73,7 +73,7 @@ class Observed:
     """[levels, C] region of every cell."""
 
     def outlined(self, vote: ViewVote) -> Tensor:
-        """[H, W, 3] the image with outlines around the regions that voted."""
+        """Return the image [H, W, 3] with outlines around the regions that voted."""
         inside = [(self.regions == one.region).any(dim=0) for one in vote.regions if one.share >= LEAST]
         return draw_outlines(self.image, torch.stack([(self.cells >= 0) & x[self.cells.clamp(min=0)] for x in inside]))
 
@@ -106,7 +106,7 @@ class Story:
         return Observed(images[0].image, region, block.features[0], cells, regions)
 
     def edge_map(self, observed: Observed) -> Tensor | None:
-        """[H, W] strength of the learned edges, in 0..1; None if the regions are others."""
+        """Return the strength [H, W] of the learned edges, in 0..1; None for other regions."""
         regions = getattr(self.source, "regions", None)
         regions = getattr(regions, "inner", regions)
         if not isinstance(regions, EdgeRegions):
@@ -115,7 +115,7 @@ class Story:
         return torch.nn.functional.interpolate(edges, observed.region.shape, mode="bilinear")[0, 0]
 
     def in_2d(self, observed: Observed) -> Tensor:
-        """[H, W] relevancy of the image's own regions; 0 without a region."""
+        """Return the relevancy [H, W] of the image's own regions; 0 for pixels without a region."""
         question = self.found.answer.question
         positive = observed.features @ torch.as_tensor(question.embeddings).T
         against = question.negative_embeddings
@@ -124,7 +124,7 @@ class Story:
         return found[observed.region.clamp(min=0)].where(observed.region >= 0, 0.0)
 
     def rendered(self) -> tuple[Display, Tensor, Tensor, Tensor]:
-        """The display of the answer, the rendered scene, its values and its opacity."""
+        """Return the display of the answer, the rendered scene, its values and its opacity."""
         scene, settings = self.run.scene, RasterSettings.recorded(self.run.field.manifest)
         camera = self.run.camera(self.view)
         display = make_display(self.run.field, self.found.answer, shown=self.found.index)
@@ -164,10 +164,10 @@ def show(place: Axes, title: str, image: Tensor, line: Tensor | None) -> None:
 
 
 def story_panels(story: Story) -> Iterator[tuple[str, Tensor, Tensor | None]]:
-    """Yield title, picture and selected pixels of each panel."""
+    """Yield title, image and selected pixels of each panel."""
     observed, found = story.observe(story.view), story.found
     threshold = found.answer.question.threshold
-    yield f"Photograph {Path(story.view).stem}", observed.image, None
+    yield f"Training image {Path(story.view).stem}", observed.image, None
     edges = story.edge_map(observed)
     boundary = boundaries(observed.region)
     yield ("Outlines of regions", boundary.float(), None) if edges is None else ("Learned edges", edges, None)
@@ -176,7 +176,7 @@ def story_panels(story: Story) -> Iterator[tuple[str, Tensor, Tensor | None]]:
     flat = story.in_2d(observed)
     photograph = observed.image.float() / 255
     yield (
-        f"“{found.text}” in this photograph alone",
+        f"“{found.text}” in this image alone",
         relevancy_map(display, photograph, flat, torch.ones_like(flat)),
         (flat > threshold),
     )
@@ -185,17 +185,17 @@ def story_panels(story: Story) -> Iterator[tuple[str, Tensor, Tensor | None]]:
     lifted = relevancy_map(display, rgb, pixel, alpha)
     lifted = colors.add_color_bar(lifted, display.colormap, display.map_scale, "relevancy")
     yield f"“{found.text}” lifted onto the Gaussians", lifted, values[..., count + 1] > 0.5
-    yield "How far the photographs agree", reliability(values[..., count + 3 : count + 4], alpha, rgb), None
+    yield "How far the images agree", reliability(values[..., count + 3 : count + 4], alpha, rgb), None
     names, votes = story.run.votes.names, story.run.why(found).views if bool(found.mask.any()) else ()
     others = [x for x in votes if names[x.view] != story.view][:LARGEST]
     for vote in sorted(others, key=lambda x: -x.agreement)[:WITNESSES]:
         witness = story.observe(names[vote.view])
-        title = f"Why: photograph {Path(names[vote.view]).stem}, {vote.share:.0%} of the evidence"
+        title = f"Why: image {Path(names[vote.view]).stem}, {vote.share:.0%} of the evidence"
         yield title, witness.outlined(vote), None
 
 
 def reliability(values: Tensor, alpha: Tensor, rgb: Tensor) -> Tensor:
-    """[H, W, 3] map of R between its 5 % and 95 % quantiles in the view."""
+    """Return a map [H, W, 3] of R between its 5 % and 95 % quantiles in the view."""
     pixel = pixel_relevancy(values, alpha)[..., 0]
     low, high = pixel[alpha > 0.5].quantile(torch.tensor([0.05, 0.95])).tolist()
     color, opacity = colors.apply_colormap(
@@ -206,7 +206,7 @@ def reliability(values: Tensor, alpha: Tensor, rgb: Tensor) -> Tensor:
 
 
 def boundaries(region: Tensor) -> Tensor:
-    """[H, W] pixels beside another region."""
+    """Return a mask [H, W] of the pixels next to another region."""
     found = torch.zeros_like(region, dtype=torch.bool)
     found[:, 1:] |= region[:, 1:] != region[:, :-1]
     found[1:] |= region[1:] != region[:-1]
@@ -214,7 +214,7 @@ def boundaries(region: Tensor) -> Tensor:
 
 
 def colored(observed: Observed, boundary: Tensor) -> Tensor:
-    """[H, W, 3] every region in a color of its own over the gray image, and white lines between them."""
+    """Return an image [H, W, 3] with each region in a different color, and white lines between regions."""
     hue = np.random.default_rng(0).permutation(len(observed.features)) / len(observed.features)
     hsv = np.stack([hue, np.full_like(hue, 0.75), np.full_like(hue, 0.9)], axis=1)
     palette = torch.from_numpy(hsv_to_rgb(hsv)).float()
