@@ -55,7 +55,7 @@ def smooth(corners: Sequence[Sequence[float]], times: int = 3) -> np.ndarray:
 
 
 def sheet(points: np.ndarray, low: float = 0.0, high: float = 1.0) -> Mesh:
-    """Return the surface over a grid of points [rows, columns, 3]; v runs from `low` to `high` by length along the rows."""
+    """Return the surface over a grid of points [rows, columns, 3]; v runs from `low` to `high` by length."""
     rows, columns = points.shape[:2]
     step = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1)
     v = low + (high - low) * np.concatenate([[0], step.cumsum()]) / step.sum()

@@ -5,7 +5,7 @@
 
 Needs the packages mujoco, numpy and pillow, and Debian's libosmesa6. The wheels are read, not installed.
 
-Six things are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), © 2020 **Google LLC**, licence **CC BY
+Six things are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), © 2020 **Google LLC**, license **CC BY
 4.0** (https://creativecommons.org/licenses/by/4.0/). Each has its page in that collection, at
 https://app.gazebosim.org/GoogleResearch/fuel/models/NAME:
 
@@ -16,7 +16,7 @@ https://app.gazebosim.org/GoogleResearch/fuel/models/NAME:
     basket           Threshold_Basket_Natural_Finish_Fabric_Liner_Small
     ramekin          BIA_Porcelain_Ramekin_With_Glazed_Rim_35_45_oz_cup
 
-The wheels name them otherwise. Plate and white bowl state author and licence in their files; the others were told by
+The wheels name them otherwise. Plate and white bowl state author and license in their files; the others were told by
 their textures, their numbers of triangles, and their extents, which are those of the collection to 0.1 mm; the wheels
 have the basket at another size. Changes: textures are smaller and filled where nothing shows them, and the basket is
 enlarged. Everything else is made by numbers in `research.made_things`. No other file of the wheels is used.

@@ -1,4 +1,4 @@
-"""How one answer came to be, in panels: image, edges, regions, 2D answer, lifted answer, R, and the reasons.
+"""Panels that explain one answer: image, edges, regions, 2D answer, lifted answer, R, and the reasons.
 
     python -m research.panels RUN/config.yml VIEW --text "red fox" --output panels.png
 
