@@ -38,9 +38,9 @@ from normlift_ns.segmentation.edges import EdgeRegions
 
 COLUMNS, WIDTH, GAP, TITLE = 4, 3.6, 0.1, 0.32
 """Panels of a row; width of a panel, gap between panels and height of a title, in inches."""
-WITNESSES, LARGEST, LEAST = 2, 10, 0.1
+WITNESSES, LARGEST, LEAST = 2, 10, 0.25
 """Number of images that are shown as reasons, number of images with the largest votes among which those with the best
-agreement are chosen, and smallest share of an image's vote for which a region is outlined.
+agreement are chosen, and smallest vote of an outlined region relative to the largest of its image.
 """
 
 
@@ -74,7 +74,11 @@ class Observed:
 
     def outlined(self, vote: ViewVote) -> Tensor:
         """Return the image [H, W, 3] with outlines around the regions that voted."""
-        inside = [(self.regions == one.region).any(dim=0) for one in vote.regions if one.share >= LEAST]
+        inside = [
+            (self.regions == one.region).any(dim=0)
+            for one in vote.regions
+            if one.share >= LEAST * vote.regions[0].share
+        ]
         return draw_outlines(self.image, torch.stack([(self.cells >= 0) & x[self.cells.clamp(min=0)] for x in inside]))
 
 
