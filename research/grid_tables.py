@@ -21,8 +21,21 @@ def verdicts(grid: Document, group: str) -> str:
     return table(("candidate", "gain", *POINTS.values(), *SHARES.values(), "rule"), rows)
 
 
-def columns(grid: Document) -> str:
-    """Gain, and gain in the worst cell, of the methods in every column of the grid."""
+def columns(grid: Document, real: Document) -> str:
+    """Gain, and gain in the worst cell, of the methods in every column of the grid, and of statistic real beside it."""
+    header, rows = _columns(grid)
+    last = max((i for i, row in enumerate(rows) if row[0].startswith("statistic: ")), default=-1)
+    beside = [row for row in _columns(real)[1] if row[0].startswith("statistic: ")]
+    return table(header, [*rows[: last + 1], *beside, *rows[last + 1 :]])
+
+
+def real_columns(real: Document) -> str:
+    """The columns of statistic real."""
+    header, rows = _columns(real)
+    return table(header, [row for row in rows if not row[0].startswith("kind: ")])
+
+
+def _columns(grid: Document) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     v, start, end = grid.values, "column.", ".gain"
     found = [key for key in v if key.startswith(start) and key.endswith(end)]
     keys = [key.removeprefix(start).removesuffix(end).split(".", 2) for key in found]
@@ -30,4 +43,4 @@ def columns(grid: Document) -> str:
     for axis, label in dict.fromkeys((axis, label) for axis, label, _ in keys):
         starts = (f"column.{axis}.{label}.{method}" for method in methods)
         rows.append((f"{axis}: {label}", *(f"{v[f'{x}.gain']:+.1f} ({-v[f'{x}.worst']:+.1f})" for x in starts)))
-    return table(("gain (worst cell)", *methods), rows)
+    return ("gain (worst cell)", *methods), rows
