@@ -90,7 +90,9 @@ class Observed(NamedTuple):
     views: list[int]
 
 
-def observe(world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | Cosines | None = None) -> Observed:
+def observe(
+    world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | Cosines | None = None
+) -> Observed:
     """Masks and features of the world after the damage. The same arguments give the same result on any device.
 
     Args:

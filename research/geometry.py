@@ -1,15 +1,16 @@
-"""What real features are like: cosines of the regions of lifted captures, from which statistic "real" is made.
+"""Geometry of real features: cosines between regions of lifted captures, the source of the "real" statistic.
 
     python -m research.geometry fox=RUN/config.yml tabletop=RUN/config.yml    results/geometry.json
 
-The runs are those of `ns-normlift --encoder imagenet --regions edges`. A Gaussian lies in the region of a view that has
-most of its weight there, if that is at least half. Things are the labels of the fox (`cut.label_masks`), or the exact
-masks of the tabletop; a Gaussian belongs to the label with three quarters of its weight in the labeled images.
+The runs are those of `ns-normlift --encoder imagenet --regions edges`. In each view, a Gaussian belongs to the region
+with most of its weight, if that is at least half. Objects are the labels of the fox (`cut.label_masks`), or the exact
+masks of the tabletop. A Gaussian belongs to the label with three quarters of its weight in the labeled images.
 
-Keys: <capture>.drift.<bin>, cosine of the features of one Gaussian in two views so many degrees apart;
-<capture>.thing.<name>.…, of Gaussians of one thing; <capture>.two_things, of Gaussians of two; <capture>.empty, the
-share of regions without a feature. Where a word of the encoder names the thing: cosine with its text (own), with the
-text of 11 other names that has the best mean (wrong), and the spread of the lifted cosines.
+Keys: <capture>.drift.<degrees>, the cosine between the features of one Gaussian in two views that far apart;
+<capture>.<label>.… and <capture>.thing.…, between two Gaussians of one object; <capture>.two_things.…, of two objects;
+<capture>.agreement, the B of its regions, also for small rooms with this statistic. If the encoder knows the
+word for an object: its cosine with its own prompt (own), with the best of 11 other names (wrong), the share of views in
+which any of the 1,000 names beats its own (wins), and the spread of the lifted cosines.
 """
 
 from __future__ import annotations
@@ -31,13 +32,17 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 import normlift_ns as nl
-from normlift_ns import Camera, Evidence
+from normlift_ns import Camera, Evidence, consensus
 from normlift_ns.encoders.imagenet import find_classes
 from normlift_ns.encoders.imagenet_network import ImageNetEncoder
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from research.cut import label_masks
+from research.damage import STEPS, observe
+from research.features import orthogonal_words
+from research.real_features import FOX
 from research.report import Report
-from research.synthetic_scenes import PURITY, WEIGHT
+from research.second_room import second
+from research.synthetic_scenes import PURITY, WEIGHT, demo
 from tests.captures import SHARED
 
 BINS = (0, 3, 6, 10, 20, 30, 60, 180)
@@ -62,7 +67,7 @@ class Seen:
     """[N, V, 3] unit, from the Gaussian to the camera."""
 
     @staticmethod
-    def of(evidence: Evidence, features: Tensor, means: Tensor, cameras: list[Camera]) -> Seen:
+    def of(evidence: Evidence, features: Tensor, means: Tensor, cameras: Sequence[Camera]) -> Seen:
         """Where the Gaussians of a lift lie."""
         rows, views = evidence.rows, evidence.num_views
         place = rows.row_index() * views + evidence.region_view[rows.column.long()].long()
@@ -91,12 +96,13 @@ class Seen:
         return {f"{low}-{high}": (x, angle) for (low, high), x, angle, n in values if n >= FEWEST}
 
     def pairs(self, some: Tensor, others: Tensor, g: torch.Generator, *, one_view: bool) -> float:
-        """Mean cosine of random pairs of Gaussians that lie in different regions."""
+        """Mean cosine of random pairs of different Gaussians that lie in different regions."""
         i, j = (x[torch.randint(0, len(x), (PAIRS,), generator=g)] for x in (some, others))
         v, u = torch.randint(0, self.home.shape[1], (2, PAIRS), generator=g)
         p, q = self.home[i, v], self.home[j, v if one_view else u]
-        both = (p >= 0) & (q >= 0) & (p != q)
-        return float((self.features[p[both]] * self.features[q[both]]).sum(1).mean())
+        both = ((p >= 0) & (q >= 0) & (p != q) & (i != j)).nonzero().squeeze(1)
+        parts = [(self.features[p[x]] * self.features[q[x]]).sum(1).double() for x in both.split(10_000)]
+        return float(torch.cat(parts).mean())
 
 
 def geometry(seen: Seen, things: Mapping[str, Tensor], g: torch.Generator) -> dict[str, float]:
@@ -138,7 +144,7 @@ def text_cosines(
     by_text = seen.features[home[home >= 0].unique(return_inverse=True)[0]] @ texts.T
     weights = home[home >= 0].unique(return_counts=True)[1].float()
     mean = weights @ by_text / weights.sum()
-    right, related = by_text[:, own].amax(1), sorted({*own, *find_classes(word.split()[-1])})
+    right, related = by_text[:, own].amax(1), sorted({*own, *find_classes(word.rsplit(maxsplit=1)[-1])})
     others = by_text.clone()
     others[:, related] = -1
     best, name = others.max(1)
@@ -203,6 +209,8 @@ def measure(report: Report, capture: str, config: Path) -> None:
     things = things_of(run, capture)
     for key, value in geometry(seen, things, g).items():
         report.add(f"{capture}.{key}", value, "degrees" if key == "scale" else "cosine")
+    agreement = run.field.manifest["statistics"]["consensus"]["agreement"]
+    report.add(f"{capture}.agreement", agreement[0], "B")
     report.add(f"{capture}.empty", (features == 0).all(1).float().mean(), "share of regions without a feature")
     texts = normalize(ImageNetEncoder().network.fc.weight.detach().float(), dim=1)
     lifted = run.field.directions().cpu()
@@ -217,6 +225,15 @@ def measure(report: Report, capture: str, config: Path) -> None:
             report.add(f"{capture}.{key}", fmean(x[key] for x in found.values()), "mean over the labels")
 
 
+def measure_agreement(report: Report) -> None:
+    """Add B, the agreement of regions across views, of small rooms with statistic real."""
+    for world in (demo(8000, 24, 160), second(8000, views=24, width=160)):
+        for step in ("noise only", "mild", "hard"):
+            seen = observe(world, orthogonal_words(world.classes), STEPS[step], 1000, FOX)
+            found = consensus(seen.evidence, seen.features)
+            report.add(f"{world.name}.{step}.agreement", found.agreement[0], "B")
+
+
 def main() -> None:
     """Write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -225,6 +242,7 @@ def main() -> None:
     for text in parser.parse_args().runs:
         capture, config = text.split("=", 1)
         measure(report, capture, Path(config))
+    measure_agreement(report)
     report.write()
 
 

@@ -4,7 +4,7 @@
     python -m research.grid --minutes 9           no new cell after so many minutes; the same command goes on later
     python -m research.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
                                                     for CPUs: a sample votes and counts
-    python -m research.grid --statistic real      the cells of statistic real, which decide nothing; results/grid_real.json
+    python -m research.grid --statistic real      cells of statistic real, which decide nothing: results/grid_real.json
     python -m research.grid --quick               a small plain room, three cells per kind of region, for the tests
 
 Every finished cell is one line of `--rows`, which a later call reads first. The decision so far is always printed;

@@ -1,7 +1,7 @@
-"""Features like those of a trained network on photographs: made-up vectors with the cosines that were measured there.
+"""Features like those of a trained network on photographs: made-up vectors with the same cosines.
 
-`research.geometry` measured them on the fox, in regions between learned edges with ImageNet's classifier. A thing has
-several parts, each a region of its own. The feature of part p of thing k in view v is the normalized sum of
+`research.geometry` measured these on the fox, in regions between learned edges with ImageNet's classifier. A thing has
+several parts, each a region of its own. The feature of a part in a view is the normalized sum of
 
 * a direction that all features share, one of the thing and one of the part, all orthogonal to the texts;
 * the text of the class, longer in some parts than in others, and the text of one other class that is the same
