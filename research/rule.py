@@ -28,7 +28,7 @@ minutes, because what distinguishes pieces is what they show, and these two span
 
 *Statistic real* (`research.real_features`) came later, when a trained network had been measured on photographs. Its
 cells are those of masks again, 43 per scene, but regions are parts of objects. They are run and shown next to the
-others (`research.grid --statistic real`). They have no part in a decision: the grid on which it is made stays as it was.
+others (`research.grid --statistic real`). They have no part in a decision: its grid stays as it was.
 
 That is 212 cells of masks and 87 of pieces per scene, 299 x 4 x 4 seeds = 4,784 observations.
 

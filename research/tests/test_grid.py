@@ -18,6 +18,7 @@ from research.geometry import Seen, geometry, spread
 from research.pseudo_regions import KINDS, observe_pieces, pieces
 from research.real_features import FOX, NOISE, Regions, real_features
 from research.report import RESULTS
+from research.rule import cells_of, real_cells_of
 from research.second_room import second
 from research.synthetic_scenes import PARTS, World, made_words
 from research.tests import ROOT, quick
@@ -132,3 +133,4 @@ def test_regions_of_real_features_are_parts_of_things(room):
     alike = (real.features @ real.features.T > 1 - 1e-5).unique(dim=0)
     assert 2 * 16 < len(alike) <= 16 * PARTS
     assert len(plain.features) < real.evidence.num_regions == len(real.features)
+    assert len(beside := real_cells_of("demo")) == 43 and len(set(cells_of("demo")) - set(beside)) == 299
