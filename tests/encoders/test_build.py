@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from normlift_ns.encoders.base import PatchFeatures
-from normlift_ns.encoders.build import make_source, resolve_regions
+from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.segmentation.registry import resolve_regions
 from normlift_ns.segmentation.sam import SamMasks
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import refused
