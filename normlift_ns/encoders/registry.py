@@ -194,11 +194,9 @@ SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("sig
 def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
     from normlift_ns.encoders.imagenet_network import ImageNetEncoder  # noqa: PLC0415 (needs torch)
 
-    default = SourceOptions()
-    for name in ("encoder_model", "encoder_pretrained", "prompt_template"):
-        value = getattr(options, name)
-        if value != getattr(default, name):
-            raise InputError(f"--{name.replace('_', '-')} {value} has no effect on --encoder imagenet; leave it out")
+    for name in _options_of_clip(options):
+        flag = f"--{name.replace('_', '-')} {getattr(options, name)}"
+        raise InputError(f"{flag} has no effect on --encoder imagenet; leave it out")
     return ImageNetEncoder(device)
 
 
@@ -248,6 +246,12 @@ _PREFERENCE = ("open_clip", "siglip2", "siglip", "metaclip2", "imagenet", "color
 """Encoders of `--encoder auto`, the best first; the last is on every machine."""
 
 
+def _options_of_clip(options: SourceOptions) -> list[str]:
+    """Return the names of options that are set and that networks trained with captions alone take."""
+    names, default = ("encoder_model", "encoder_pretrained", "prompt_template"), SourceOptions()
+    return [name for name in names if getattr(options, name) != getattr(default, name)]
+
+
 def with_encoder(options: SourceOptions) -> SourceOptions:
     """Return the options with an encoder in place of "auto": the best that is on this machine.
 
@@ -255,8 +259,7 @@ def with_encoder(options: SourceOptions) -> SourceOptions:
     """
     if options.encoder != "auto":
         return options
-    own = (options.encoder_model, options.encoder_pretrained) != (DEFAULT_MODEL, DEFAULT_PRETRAINED)
-    if own or options.features == "langsplat":
+    if options.features == "langsplat" or len(_options_of_clip(options)) > 0:
         return replace(options, encoder="open_clip")
     return replace(options, encoder=next(name for name in _PREFERENCE if ENCODERS.load(name).is_here()))
 

@@ -1,13 +1,16 @@
 """Flat options to sources, and what is refused."""
 
+import importlib.util
 from pathlib import Path
 
 from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile
 from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation import registry
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.segmentation.registry import resolve_regions
+from normlift_ns.segmentation.registry import describe_choice, resolve_source
 from normlift_ns.segmentation.sam import SamMasks
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import refused
@@ -35,23 +38,58 @@ def test_options_reach_the_regions(tmp_path):
     assert [x.identity["kind"] for x in (Superpixels(9), LabelFiles(tmp_path))] == ["superpixel", "files"]
     source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", prompt_template="a {}"))
     assert source == PatchFeatures(OpenClipEncoder("ViT-B-32", "openai", template="a {}"), 1024)
-    assert make_source(SourceOptions(region_count=9)) == PatchFeatures(OpenClipEncoder(), 9)
+    assert make_source(SourceOptions("open_clip", region_count=9)) == PatchFeatures(OpenClipEncoder(), 9)
 
 
-def test_auto_takes_the_best_that_is_there(tmp_path, empty_hub):
-    def chosen(device="cpu", **options):
-        return resolve_regions(SourceOptions(**options), device)
+def make_present(file: PackageFile) -> None:
+    """A file of the right size, of which only the size is looked at."""
+    file.path.parent.mkdir(parents=True, exist_ok=True)
+    with file.path.open("wb") as content:
+        content.truncate(file.size)
 
-    assert chosen() == chosen("cuda") == "patches"
-    assert chosen(encoder_model="RN50") == "superpixel"
-    assert chosen(encoder="color") == "superpixel"
-    assert chosen(regions_dir=tmp_path) == "files"
-    assert chosen(sam_model="weights") == "sam"
-    assert chosen(regions="grid", regions_dir=tmp_path) == "grid"
-    for name in ("config.json", "model.safetensors"):
-        put(empty_hub, "facebook/sam-vit-huge", name)
-    assert chosen("cuda") == "sam" and chosen("cuda", encoder="color") == "superpixel"
-    assert chosen() == "patches"
+
+def test_auto_takes_the_best_that_is_there_and_names_what_is_better(tmp_path, empty_hub, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def check(encoder: str, regions: str, better: str | None, device: str = "cpu", **options) -> None:
+        found = resolve_source(SourceOptions(**options), device)
+        assert (found.encoder, found.regions) == (encoder, regions)
+        said, get = describe_choice(SourceOptions(**options), device), "ns-normlift-weights --get "
+        assert (said or "").partition(get)[2] == (better or "") and (said is None) == (better is None), said
+        assert said is None or f"--encoder {encoder} --regions {regions}" in said
+
+    def put_all(repository: str, *names: str) -> None:
+        for name in names:
+            put(empty_hub, repository, name)
+
+    check("color", "superpixel", "imagenet edges")
+    check("color", "superpixel", "imagenet edges", "cuda")
+    check("color", "superpixel", None, encoder="color")
+    check("color", "files", "imagenet", regions_dir=tmp_path)
+    check("color", "grid", "imagenet", regions="grid", regions_dir=tmp_path)
+    check("open_clip", "sam", None, encoder="open_clip", sam_model="weights")
+    for own in ({"encoder_model": "RN50"}, {"encoder_pretrained": "a.pt"}, {"prompt_template": "a {}"}):
+        assert resolve_source(SourceOptions(**own)).encoder == "open_clip"
+    assert resolve_source(SourceOptions(features="langsplat", features_dir=tmp_path)).encoder == "open_clip"
+    check("open_clip", "patches", "", encoder="open_clip")
+    check("open_clip", "patches", "edges", "cuda", encoder="open_clip")
+    check("open_clip", "superpixel", "edges", encoder="open_clip", encoder_model="RN50")
+    make_present(IMAGENET)
+    check("imagenet", "patches", "open_clip edges")
+    make_present(EDGES)
+    check("imagenet", "edges", "open_clip")
+    check("imagenet", "edges", "open_clip sam", "cuda")
+    check("open_clip", "edges", "", encoder="open_clip", encoder_model="RN50")
+    put_all("google/siglip2-base-patch16-224", "config.json", "model.safetensors")
+    check("siglip2", "patches", "")
+    put_all("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", "open_clip_model.safetensors")
+    check("open_clip", "edges", "sam", "cuda")
+    put_all("facebook/sam-vit-huge", "config.json", "model.safetensors")
+    check("open_clip", "sam", "", "cuda")
+    check("open_clip", "patches", "")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == "h5py" else find(name))
+    assert "pip install h5py && ns-normlift-weights" in str(describe_choice(SourceOptions("imagenet"), "cpu"))
 
 
 def test_bad_options_say_what_to_do(tmp_path):
