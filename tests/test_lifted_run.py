@@ -1,7 +1,5 @@
 """The front door: a run lifted, opened, asked, drawn and exported from Python."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings

@@ -1,8 +1,6 @@
 """What a lift refuses or warns of, on a scene made by hand: nothing labelled, files shared by two images, label maps of
 photographs that were undistorted."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

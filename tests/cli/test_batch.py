@@ -1,7 +1,5 @@
 """Many captures by several workers: each is lifted once, whoever dies, and a rerun does only what is missing."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

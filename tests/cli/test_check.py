@@ -1,7 +1,5 @@
 """ns-normlift-check and ns-normlift --dry-run: what they tell, what they refuse, and that they leave nothing behind."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Text is text: no markup, emoji code or escape of a prompt, path, name or label is interpreted by a command."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from types import SimpleNamespace

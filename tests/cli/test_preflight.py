@@ -1,7 +1,5 @@
 """Mistakes that show before torch is imported: what they say, and what they cost."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

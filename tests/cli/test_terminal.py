@@ -1,7 +1,5 @@
 """What the commands print, and where: --quiet, --log-file, colours, warnings of others, errors that can be copied."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

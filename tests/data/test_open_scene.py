@@ -1,7 +1,5 @@
 """One scene by every way in: evidence and answers are those of the nerfstudio run."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A run that SigLIP 2 lifted: asked through the commands' own code, again without its weights, and with others."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

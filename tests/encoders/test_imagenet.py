@@ -1,7 +1,5 @@
 """The encoder of ImageNet's classes: its words, its network, and the pooling of features inside regions."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

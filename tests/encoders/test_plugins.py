@@ -1,7 +1,5 @@
 """Encoders by entry point: how they are found, what a broken one does, the recipe of CONTRIBUTING.md as a package."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

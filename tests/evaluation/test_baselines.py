@@ -1,7 +1,5 @@
 """Ideas of other methods on a run's own features, against dense sums over pixels in float64."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Where to look next: gains against a loop, regions and photographs of a wall of which the lift saw one side only."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import permutations

@@ -1,7 +1,5 @@
 """Studies: what R knows, on Gaussians made by hand, against SciPy and plain loops; which votes are tried; figures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -10,8 +10,6 @@ neighbours. So numbers are compared one by one on the kind of machine that golde
 means, counts and a sample of the sources.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -1,7 +1,5 @@
 """Files appear completely or not at all, replace nothing unasked, and survive processes that are killed."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

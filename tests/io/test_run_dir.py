@@ -1,7 +1,5 @@
 """The files of a lifted run belong together, and no output takes the place of one."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

@@ -4,8 +4,6 @@ version_0_1/ was written by version 0.1: a small demo room in scene/, a run of n
 and one of ns-train normlift (trained), and what ns-normlift-query answered.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

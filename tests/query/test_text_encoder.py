@@ -1,7 +1,5 @@
 """The encoder that answers is the one that made the field."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pictures of --render-dir: their names, what their pixels mean, and texts that are drawn as they are."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Regions between learned edges."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import h5py
