@@ -1,6 +1,5 @@
 """Flat options to sources, and what is refused."""
 
-import importlib.util
 from pathlib import Path
 
 from normlift_ns.encoders.base import PatchFeatures
@@ -42,7 +41,7 @@ def test_options_reach_the_regions(tmp_path):
 
 
 def make_present(file: PackageFile) -> None:
-    """A file of the right size, of which only the size is looked at."""
+    """A file of the right size, which is all that the choice looks at."""
     file.path.parent.mkdir(parents=True, exist_ok=True)
     with file.path.open("wb") as content:
         content.truncate(file.size)
@@ -51,44 +50,39 @@ def make_present(file: PackageFile) -> None:
 def test_auto_takes_the_best_that_is_there_and_names_what_is_better(tmp_path, empty_hub, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
-    def check(encoder: str, regions: str, better: str | None, device: str = "cpu", **options) -> None:
-        found = resolve_source(SourceOptions(**options), device)
-        assert (found.encoder, found.regions) == (encoder, regions)
-        said, get = describe_choice(SourceOptions(**options), device), "ns-normlift-weights --get "
-        assert (said or "").partition(get)[2] == (better or "") and (said is None) == (better is None), said
-        assert said is None or f"--encoder {encoder} --regions {regions}" in said
+    def check(chosen: str, better: str | None, device: str = "cpu", **options) -> None:
+        found, told = (call(SourceOptions(**options), device) for call in (resolve_source, describe_choice))
+        assert f"{found.encoder} {found.regions}" == chosen
+        assert (told is None) == (better is None)
+        assert (told or "").partition("ns-normlift-weights --get ")[2] == (better or ""), told
 
-    def put_all(repository: str, *names: str) -> None:
-        for name in names:
-            put(empty_hub, repository, name)
-
-    check("color", "superpixel", "imagenet edges")
-    check("color", "superpixel", "imagenet edges", "cuda")
-    check("color", "superpixel", None, encoder="color")
-    check("color", "files", "imagenet", regions_dir=tmp_path)
-    check("color", "grid", "imagenet", regions="grid", regions_dir=tmp_path)
-    check("open_clip", "sam", None, encoder="open_clip", sam_model="weights")
-    for own in ({"encoder_model": "RN50"}, {"encoder_pretrained": "a.pt"}, {"prompt_template": "a {}"}):
-        assert resolve_source(SourceOptions(**own)).encoder == "open_clip"
-    assert resolve_source(SourceOptions(features="langsplat", features_dir=tmp_path)).encoder == "open_clip"
-    check("open_clip", "patches", "", encoder="open_clip")
-    check("open_clip", "patches", "edges", "cuda", encoder="open_clip")
-    check("open_clip", "superpixel", "edges", encoder="open_clip", encoder_model="RN50")
+    for device in ("cpu", "cuda"):
+        check("color superpixel", "imagenet edges", device)
+    check("color superpixel", None, encoder="color")
+    check("color files", "imagenet", regions_dir=tmp_path)
+    check("color grid", "imagenet", regions="grid", regions_dir=tmp_path)
+    for own in ({"encoder_model": "ViT-L-14"}, {"encoder_pretrained": "a.pt"}, {"prompt_template": "a {}"}):
+        check("open_clip patches", "", **own)
+    check("open_clip auto", None, features="langsplat", features_dir=tmp_path)
+    check("open_clip patches", "edges", "cuda", encoder="open_clip")
+    check("open_clip superpixel", "edges", encoder_model="RN50")
+    check("open_clip sam", None, encoder="open_clip", sam_model="weights")
     make_present(IMAGENET)
-    check("imagenet", "patches", "open_clip edges")
+    check("imagenet patches", "open_clip edges")
     make_present(EDGES)
-    check("imagenet", "edges", "open_clip")
-    check("imagenet", "edges", "open_clip sam", "cuda")
-    check("open_clip", "edges", "", encoder="open_clip", encoder_model="RN50")
-    put_all("google/siglip2-base-patch16-224", "config.json", "model.safetensors")
-    check("siglip2", "patches", "")
-    put_all("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", "open_clip_model.safetensors")
-    check("open_clip", "edges", "sam", "cuda")
-    put_all("facebook/sam-vit-huge", "config.json", "model.safetensors")
-    check("open_clip", "sam", "", "cuda")
-    check("open_clip", "patches", "")
-    find = importlib.util.find_spec
-    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == "h5py" else find(name))
+    check("imagenet edges", "open_clip")
+    check("imagenet edges", "open_clip sam", "cuda")
+    check("open_clip edges", "", encoder_model="RN50")
+    for name in ("config.json", "model.safetensors"):
+        put(empty_hub, "google/siglip2-base-patch16-224", name)
+    check("siglip2 patches", "")
+    put(empty_hub, "laion/CLIP-ViT-B-16-laion2B-s34B-b88K", "open_clip_model.safetensors")
+    check("open_clip edges", "sam", "cuda")
+    for name in ("config.json", "model.safetensors"):
+        put(empty_hub, "facebook/sam-vit-huge", name)
+    check("open_clip sam", "", "cuda")
+    check("open_clip patches", "")
+    monkeypatch.setattr(registry, "find_spec", lambda name: None)
     assert "pip install h5py && ns-normlift-weights" in str(describe_choice(SourceOptions("imagenet"), "cpu"))
 
 
