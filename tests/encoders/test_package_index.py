@@ -194,7 +194,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     def run(*words: str) -> tuple[int, list[dict]]:
         file = tmp_path / "weights.json"
         file.unlink(missing_ok=True)
-        monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--json", str(file)])
+        monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--output-json", str(file)])
         try:
             weights.entrypoint()
         except SystemExit as stop:

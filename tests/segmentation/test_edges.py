@@ -38,14 +38,6 @@ def tiny_regions(**options) -> EdgeRegions:
     return source
 
 
-@pytest.fixture(scope="module")
-def weights() -> bytes:
-    try:
-        return EDGES.read()
-    except FileNotFoundError as error:
-        pytest.skip(str(error))
-
-
 def assert_nested(maps: np.ndarray) -> None:
     """Every region of a level lies in one region of the next level, and none is empty."""
     for level in maps:
@@ -154,11 +146,12 @@ def test_options_choose_a_level_or_a_number(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 @needs_shared
-def test_trained_weights(weights):
+@pytest.mark.usefixtures("trained_weights")
+def test_trained_weights():
     image = capture("fox").train[0].image
     crop = image[300:460, 100:301]
     source = EdgeRegions()
-    error = np.abs(source.network(crop).numpy() - edge_probability(weights, crop.numpy())).max()
+    error = np.abs(source.network(crop).numpy() - edge_probability(EDGES.read(), crop.numpy())).max()
     assert error <= 1e-4
     labels = source.labels(image, "a.png")
     assert [int(level.max()) + 1 for level in labels] == list(EDGE_COUNTS)
