@@ -1,7 +1,7 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
 It asks for colors. Last, it asks for a thing, by the small networks behind `--regions edges --encoder imagenet`. Their
-weights are fetched first; where they cannot be had, the question is left out.
+weights are fetched first; if they cannot be had, the question is left out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
-"""What the networks are asked for, its class in the room, and how many views are enough to find it."""
+"""Prompt for the networks, its class in the room, and a number of views that is enough to find it."""
 _ASK = AskOptions(threshold="auto")
 _COMPILE = (
     "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
@@ -48,7 +48,7 @@ _COMPILE = (
 @dataclass
 class Demo(CheckedOptions):
     """Generate a room with a trained run, lift it with ns-normlift, and search it for colors and for a thing. Two small
-    networks find the thing; their weights (78 MB) are fetched once."""
+    networks find the thing; their weights (77 MB) are fetched once."""
 
     folder: Path = Path("demo")
     """Output folder; existing files of the demo are replaced."""
