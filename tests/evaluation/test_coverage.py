@@ -52,10 +52,8 @@ def wall(**changes: Any) -> Any:
     facts = {
         "train": Photographs([f"{i}.png" for i in range(8)], cameras),
         "held_out": Photographs(["h.png"], [looking((3.0, 0.0, 0.4))]),
-        "colors": lambda camera: torch.full((n, 3), 0.5),
-        "renderer": None,
-        "background": torch.zeros(3),
-    }
+        "colors": lambda camera: torch.full((n, 3), 0.5), "renderer": None, "background": torch.zeros(3),
+    }  # fmt: skip
     return made_scene(scene, **{**facts, **changes})
 
 
