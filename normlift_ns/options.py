@@ -457,11 +457,13 @@ class SourceOptions:
     (3, True)
     """
 
-    encoder: str = "open_clip"
-    """Encoder of regions and prompts. open_clip: CLIP, on masked crops or on patches. siglip, siglip2, metaclip2: the
-    same with networks of the transformers library. imagenet: a small classifier of 1,000 things, whose weights
-    ns-normlift-weights --get imagenet fetches; prompts are names of these things or of groups, such as dog. color: mean
-    colors compared with color names, without learned weights. Any other name: an encoder from an installed plugin."""
+    encoder: str = "auto"
+    """Encoder of regions and prompts. auto: the first of open_clip, siglip2, siglip, metaclip2, imagenet and color
+    whose default weights are on this machine; nothing is downloaded. open_clip: CLIP, on masked crops or on patches.
+    siglip, siglip2, metaclip2: the same with networks of the transformers library. imagenet: a small classifier of
+    1,000 things, whose weights ns-normlift-weights --get imagenet fetches; prompts are names of these things or of
+    groups, such as dog. color: mean colors compared with color names, without learned weights. Any other name: an
+    encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
     defaults are google/siglip-base-patch16-224, google/siglip2-base-patch16-224 and
@@ -478,8 +480,9 @@ class SourceOptions:
     edges: regions between the edges that a small network finds, whose weights ns-normlift-weights --get edges fetches.
     patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
-    neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
-    cases use superpixel. Any other name: a mask source from an installed plugin."""
+    neural network uses sam on a GPU if SAM's weights are on this machine, else edges if those are, else its patches if
+    it has them; on a CPU, one that encodes crops prefers its patches to edges. All other cases use superpixel. Any
+    other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None

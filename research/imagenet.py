@@ -13,7 +13,6 @@ import argparse
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
@@ -57,7 +56,7 @@ def measure_time(report: Report, device: str, images: list[torch.Tensor]) -> Non
         start = perf_counter()
         rows.append(encoder.encode(image, labels))
         seconds.append(perf_counter() - start)
-    report.add("539x959", median(seconds), "s per image")
+    report.add("539x959", min(seconds), f"s per image, the fastest of {len(seconds)}")
     same = [torch.equal(row, again.encode(image, labels)) for row, image in zip(rows, images)]
     report.add("repeats", float(np.mean(same)), "share of images whose features are equal in a second run")
     if device != "cpu":

@@ -24,9 +24,11 @@ from torch import Tensor
 
 from normlift_ns import LiftedRun, open_run, render
 from normlift_ns.analysis.explain import ViewVote, draw_outlines
+from normlift_ns.core.null_level import NULL_SHARE
 from normlift_ns.core.relevancy import relevancy
 from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
+from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.evidence_collection import observe_views
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.query.engine import Finding
@@ -124,6 +126,11 @@ class Story:
         positive = observed.features @ torch.as_tensor(question.embeddings).T
         against = question.negative_embeddings
         negative = None if against is None else observed.features @ torch.as_tensor(against).T
+        if question.rule == "contrast":
+            null = null_vectors(restore_source(self.run.field.manifest), self.run.field.manifest["encoder"])
+            assert null is not None
+            cosines = observed.features @ torch.nn.functional.normalize(null, dim=1).T
+            negative = cosines.topk(max(2, round(NULL_SHARE * len(null))), dim=1).values[:, -1:]
         found = relevancy(positive, negative, rule=question.rule)[:, self.found.index]
         return found[observed.region.clamp(min=0)].where(observed.region >= 0, 0.0)
 

@@ -3,8 +3,6 @@
 Figures rest on it to the last bit, so it stays as it is. `normlift_ns.demo.room.demo_room` is the room that people see.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,12 +33,10 @@ def _parts() -> list[Part]:
         *(place(box(0.2, 0.6, 0.52, 0.06), x, 0, 0.25) for x in (-0.6, 0.6)),
     )
     cactus = union(
-        capsule((0, 0, 0), (0, 0, 0.95), 0.13),
-        capsule((0, 0, 0.5), (0.3, 0, 0.5), 0.075),
-        capsule((0.3, 0, 0.5), (0.3, 0, 0.8), 0.075),
-        capsule((0, 0, 0.35), (-0.28, 0, 0.35), 0.07),
+        capsule((0, 0, 0), (0, 0, 0.95), 0.13), capsule((0, 0, 0.5), (0.3, 0, 0.5), 0.075),
+        capsule((0.3, 0, 0.5), (0.3, 0, 0.8), 0.075), capsule((0, 0, 0.35), (-0.28, 0, 0.35), 0.07),
         capsule((-0.28, 0, 0.35), (-0.28, 0, 0.6), 0.07),
-    )
+    )  # fmt: skip
     return [
         Part("cream", 1, cavity(box(2 * w, 2 * w, 4 * HEIGHT))),
         Part("light brown", 2.5, place(box(2 * w, 2 * w, 0.1), 0, 0, -0.05)),

@@ -1,7 +1,5 @@
 """Small random scenes, cameras, label maps and evidence for tests; all from a seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +25,9 @@ def random_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float64, size
     """Gaussians around the origin, opacities over the whole of 0..1."""
     g = generator(seed)
     return GaussianScene(
-        torch.randn(n, 3, generator=g, dtype=dtype),
-        torch.randn(n, 4, generator=g, dtype=dtype),
-        torch.rand(n, 3, generator=g, dtype=dtype) * size,
-        torch.rand(n, generator=g, dtype=dtype),
-    )
+        torch.randn(n, 3, generator=g, dtype=dtype), torch.randn(n, 4, generator=g, dtype=dtype),
+        torch.rand(n, 3, generator=g, dtype=dtype) * size, torch.rand(n, generator=g, dtype=dtype),
+    )  # fmt: skip
 
 
 def orbit_camera(angle: float, width: int = 40, height: int = 35, distance: float = 4.0, focal: float = 40.0) -> Camera:

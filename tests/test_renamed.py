@@ -103,13 +103,9 @@ def test_functions_have_old_keywords():
 def test_ns_train_has_old_options_of_our_methods(capsys):
     _print_renamed.cache_clear()
     old = [
-        "normlift",
-        "--pipeline.lift.beta",
-        "2",
-        "--pipeline.source.text_template=a {}",
-        "--pipeline.lift.vote.k",
-        "7",
-    ]
+        "normlift", "--pipeline.lift.beta", "2", "--pipeline.source.text_template=a {}",
+        "--pipeline.lift.vote.k", "7",
+    ]  # fmt: skip
     new = [*old[:1], "--pipeline.lift.reliability-beta", "2", "--pipeline.source.prompt-template=a {}", *old[4:]]
     assert entry._rename_flags(["/bin/ns-train", *old]) == ["/bin/ns-train", *new]
     assert [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()] == [
@@ -156,7 +152,7 @@ def test_manifests_and_keys_of_version_0_2_stay_valid(tmp_path):
 def test_the_encoder_color_has_two_names():
     color, colour = (make_encoder(SourceOptions(encoder=name)) for name in ("color", "colour"))
     assert color.identity == colour.identity == {"kind": "colour", "sigma": 30.0}
-    with pytest.raises(InputError, match="unknown encoder 'purple'; --encoder is one of color, metaclip2"):
+    with pytest.raises(InputError, match="unknown encoder 'purple'; --encoder is one of color, imagenet, metaclip2"):
         make_encoder(SourceOptions(encoder="purple"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

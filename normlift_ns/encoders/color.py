@@ -192,5 +192,6 @@ def _no_color_message(prompt: str) -> str:
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
         f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD "
-        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip for other words"
+        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip or imagenet for other "
+        "words (ns-normlift-weights lists their weights)"
     )

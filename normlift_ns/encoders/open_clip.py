@@ -87,7 +87,7 @@ def _folder() -> Path:
 
 OPEN_CLIP_REMEDY = (
     "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
-    "the encoder that needs no weights: --encoder color"
+    "--encoder imagenet, whose weights come from the Python index, or --encoder color, which needs none"
 )
 
 

@@ -17,6 +17,7 @@ from normlift_ns.encoders.registry import (
     encoder_kind,
     find_encoder_kind,
     make_encoder,
+    with_encoder,
 )
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
@@ -58,6 +59,7 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
     """Return the settings that `text_encoder_for` needs, as JSON types, with absolute paths."""
+    options = with_encoder(options)
     stored = names_of_0_2(options)
     settings = {key: stored[key] for key in ENCODER_KEYS} | absolute_paths(options)
     vectors = options.text_embeddings
@@ -70,7 +72,8 @@ def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
     Args:
         text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
     """
-    return {**encoder_settings(SourceOptions()), "encoder": PRECOMPUTED, "text_vectors": text_vectors}
+    settings = encoder_settings(SourceOptions(encoder="open_clip"))
+    return {**settings, "encoder": PRECOMPUTED, "text_vectors": text_vectors}
 
 
 def with_text_source(field: FieldT, *, text_embeddings: Path | None = None, template: str | None = None) -> FieldT:

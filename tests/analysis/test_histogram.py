@@ -1,7 +1,5 @@
 """Histograms of relevancy: every Gaussian is in one bin, and the rules are those that the module says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """How commands end: exit codes, what is said where, and what happens to output that cannot be written."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal
@@ -86,14 +84,9 @@ def caught(_: str) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_device_is_a_message(ended, monkeypatch):
     for body, *flags in (
-        (info,),
-        (print,),
-        (lambda _: info("a" * 10**6),),
-        (lambda _: sys.stdout.write("x"),),
-        (caught,),
-        (info, "--help"),
-        (info, "--version"),
-    ):
+        (info,), (print,), (lambda _: info("a" * 10**6),), (lambda _: sys.stdout.write("x"),), (caught,),
+        (info, "--help"), (info, "--version"),
+    ):  # fmt: skip
         with open("/dev/full", "w") as full, monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", full)
             code, _, err = ended(body, *flags)

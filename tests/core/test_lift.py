@@ -44,14 +44,10 @@ def test_equals_the_definition(seed, unlabeled, beta):
             continue
         f, lengths, n_eff = total / w, sum(s.norm() for s in s_jv), w**2 / sum(x**2 for x in w_jv)
         expected = {
-            "norm": f.norm(),
-            "c_intra": lengths / w,
-            "c_inter": total.norm() / lengths,
-            "n_eff": n_eff,
-            "reliability": f.norm() * n_eff / (n_eff + beta),
-            "view_count": sum(x > 0 for x in w_jv),
+            "norm": f.norm(), "c_intra": lengths / w, "c_inter": total.norm() / lengths, "n_eff": n_eff,
+            "reliability": f.norm() * n_eff / (n_eff + beta), "view_count": sum(x > 0 for x in w_jv),
             "weight": w,
-        }
+        }  # fmt: skip
         for name, value in expected.items():
             assert float(getattr(lifted.scalars, name)[j]) == pytest.approx(float(value), rel=1e-11), name
         assert (directions[j] - f / f.norm()).abs().max() < 1e-11
@@ -248,11 +244,9 @@ def test_bad_input_is_named():
     good, evidence = unit_rows(4, D, 0), evidence_of([[1.0, 1, 1, 1]], [0, 0, 1, 1])
     for features, kwargs, message in (
         *((good.index_fill(0, torch.tensor([2]), x), {}, r"1 of 4 .*row 2 has length") for x in (0.0, math.nan, 3.0)),
-        (unit_rows(3, D, 0), {}, r"features .*\[4, D\]"),
-        (torch.zeros(4, D).int(), {}, "int32"),
-        (good, {"beta": -1.0}, "beta .*>= 0"),
-        (good, {"beta": math.nan}, "beta .*>= 0"),
+        (unit_rows(3, D, 0), {}, r"features .*\[4, D\]"), (torch.zeros(4, D).int(), {}, "int32"),
+        (good, {"beta": -1.0}, "beta .*>= 0"), (good, {"beta": math.nan}, "beta .*>= 0"),
         (good, {"unlabeled": "drop"}, "unlabeled .*ignore.*dilute"),
-    ):
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             lift(evidence, features, **kwargs)

@@ -269,16 +269,9 @@ def test_half_precision_directions_vote_like_float32():
 
 def test_parameters_have_ranges():
     for name, wrong, fine in (
-        ("k", 0, 1),
-        ("sigma_d", 0.0, 1e-6),
-        ("tau", 1.5, 1.0),
-        ("tau", -1.5, -1.0),
-        ("gamma", -1.0, 1e-6),
-        ("gamma", 0.0, 1.0),
-        ("delta", -0.1, 0.0),
-        ("prior", -1.0, 0.0),
-        ("vote", "mean", "paper"),
-    ):
+        ("k", 0, 1), ("sigma_d", 0.0, 1e-6), ("tau", 1.5, 1.0), ("tau", -1.5, -1.0), ("gamma", -1.0, 1e-6),
+        ("gamma", 0.0, 1.0), ("delta", -0.1, 0.0), ("prior", -1.0, 0.0), ("vote", "mean", "paper"),
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=f"{name} must"):
             RefineConfig(**{name: wrong})
         assert getattr(RefineConfig(**{name: fine}), name) == fine
@@ -334,11 +327,9 @@ def test_ablation_variants_are_what_their_names_say():
     support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + 1), 0.0)
     assert torch.equal(got["none"], u)
     for name, r in (
-        ("plain_knn", ones),
-        ("norm_only", scalars.norm),
-        ("support_only", support),
+        ("plain_knn", ones), ("norm_only", scalars.norm), ("support_only", support),
         ("paper", scalars.reliability),
-    ):
+    ):  # fmt: skip
         assert torch.equal(got[name], u[refine(means, u, r, config).long()]), name
     own = scalars.norm * scalars.n_eff
     assert torch.equal(scalars.own_evidence, own)

@@ -1,7 +1,5 @@
 """HED in numpy and float64, from the arrays of a Keras file; and such files of tiny networks."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Files that are damaged, absurd or no files: only our own errors leave the loaders."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

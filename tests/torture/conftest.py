@@ -1,7 +1,5 @@
 """The server of commands, and the table of what was tried, which docs/reliability.md shows."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -31,14 +29,9 @@ class Server:
         environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "tests.torture.server"],
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-            )
+                [sys.executable, "-m", "tests.torture.server"], cwd=folder, env=environment,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+            )  # fmt: skip
         assert self.process.stdout is not None
         if self.process.stdout.readline() != "ready\n":
             pytest.fail(self.log.read_text())

@@ -1,7 +1,5 @@
 """Flipped bits in all that is written for runs and their caches: noticed, or harmless."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path
@@ -30,17 +28,9 @@ def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, re
     server.command(*splat)
     cameras = ("--transforms", place.folder / "room", "--world-transform", place.trained.parent / TRANSFORMS)
     common = (
-        "--encoder",
-        "color",
-        "--check-alignment",
-        False,
-        "--device",
-        "cpu",
-        "--vote-k",
-        6,
-        "--storage",
+        "--encoder", "color", "--check-alignment", False, "--device", "cpu", "--vote-k", 6, "--storage",
         "evidence",
-    )
+    )  # fmt: skip
     output = ("--timestamp", "ply", "--output-dir", place.folder / "outputs")
     server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *common, *output)
     result = tmp_path / "flips.json"
