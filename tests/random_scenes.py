@@ -25,9 +25,11 @@ def random_scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float64, size
     """Gaussians around the origin, opacities over the whole of 0..1."""
     g = generator(seed)
     return GaussianScene(
-        torch.randn(n, 3, generator=g, dtype=dtype), torch.randn(n, 4, generator=g, dtype=dtype),
-        torch.rand(n, 3, generator=g, dtype=dtype) * size, torch.rand(n, generator=g, dtype=dtype),
-    )  # fmt: skip
+        torch.randn(n, 3, generator=g, dtype=dtype),
+        torch.randn(n, 4, generator=g, dtype=dtype),
+        torch.rand(n, 3, generator=g, dtype=dtype) * size,
+        torch.rand(n, generator=g, dtype=dtype),
+    )
 
 
 def orbit_camera(angle: float, width: int = 40, height: int = 35, distance: float = 4.0, focal: float = 40.0) -> Camera:

@@ -175,11 +175,13 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
 def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
     for images, expected in (
         (["images/0.png", "images/1.png"], ["0", "1"]),
-        (["a/0.png", "b/0.png", "b/1.png"], ["a_0", "b_0", "1"]), (["0.png", "0.jpg"], ["0.png", "0.jpg"]),
+        (["a/0.png", "b/0.png", "b/1.png"], ["a_0", "b_0", "1"]),
+        (["0.png", "0.jpg"], ["0.png", "0.jpg"]),
         (["a/b_0.png", "a_b/0.png", "c/0.png"], ["b_0", "a_b_0", "c_0"]),
-        (["a/b/0.png", "a_b/0.png"], ["a_b_0.png", "a_b_0_2.png"]), (["a/X.png", "b/x.png"], ["a_X", "b_x"]),
+        (["a/b/0.png", "a_b/0.png"], ["a_b_0.png", "a_b_0_2.png"]),
+        (["a/X.png", "b/x.png"], ["a_X", "b_x"]),
         (["/data/a/0.png", "../b/0.png"], ["_data_a_0", ".._b_0"]),
-    ):  # fmt: skip
+    ):
         assert unique_file_names(images) == expected
     made = scene("a/0000.png", "b/0000.png", "b/0001.png")
     assert list(training_cameras(made)) == ["a_0000", "b_0000", "0001"]

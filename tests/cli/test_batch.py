@@ -307,15 +307,17 @@ def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
 def test_lists_that_cannot_be(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text, options, facts in (
-        ("# none\n\n", (), ("list.txt",)), ("a\nb 'c\n", (), ("list.txt, line 2", "b 'c")),
+        ("# none\n\n", (), ("list.txt",)),
+        ("a\nb 'c\n", (), ("list.txt, line 2", "b 'c")),
         ("a\n\nb --encodr x\n", (), ("list.txt, line 3", "--encodr")),
         ("a --vote-k 0\n", (), ("list.txt, line 1", "k must be at least 1, got 0")),
         ("a\nb\n./a\n", (), ("list.txt, line 3", "line 1")),
         ("a --timestamp x", (), ("list.txt, line 1", "--timestamp")),
         ("a", ("--nothing",), ("After --", "--nothing")),
         ("a", ("--load-ply", "x.ply"), ("--load-ply", "after --")),
-        ("a\0b", (), ("list.txt, line 1", "load_config")), ("\udcff", (), ("list.txt", "UTF-8")),
-    ):  # fmt: skip
+        ("a\0b", (), ("list.txt, line 1", "load_config")),
+        ("\udcff", (), ("list.txt", "UTF-8")),
+    ):
         Path("list.txt").write_bytes(text.encode("utf8", "surrogateescape"))
         with pytest.raises(InputError) as told:
             batch.read_captures(Path("list.txt"), options)

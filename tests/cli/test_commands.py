@@ -310,9 +310,11 @@ def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, litt
     write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})
     given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
     for kind, name, *facts in (
-        ("ply", "points.ply", "not a splat", "5", "f_dc_0"), ("gsplat", "other.pt", "normalized"),
-        ("ply", "scene.ply", "does not show"), ("ply", "far.ply", "do not look at this splat"),
-    ):  # fmt: skip
+        ("ply", "points.ply", "not a splat", "5", "f_dc_0"),
+        ("gsplat", "other.pt", "normalized"),
+        ("ply", "scene.ply", "does not show"),
+        ("ply", "far.ply", "do not look at this splat"),
+    ):
         assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
         text = said(capsys).replace("│", " ")
         assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text

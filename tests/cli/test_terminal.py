@@ -28,9 +28,11 @@ def talk(word: str) -> None:
 
 def test_quiet_leaves_results_warnings_and_errors(ended) -> None:
     for words, quiet in (
-        (("--word", "a"), False), (("--word", "a", "--quiet", "False"), False),
-        (("--quiet", "--word", "a"), True), (("--word", "a", "--quiet", "True"), True),
-    ):  # fmt: skip
+        (("--word", "a"), False),
+        (("--word", "a", "--quiet", "False"), False),
+        (("--quiet", "--word", "a"), True),
+        (("--word", "a", "--quiet", "True"), True),
+    ):
         code, out, err = ended(talk, *words)
         assert (code, out.splitlines()[:-1]) == (0, ["answer a"] if quiet else ["lift", "answer a"])
         assert err.startswith("Opening run") != quiet and "wrong" in err and "old" not in err

@@ -6,9 +6,11 @@ from normlift_ns import Camera, GaussianScene, nearest_neighbors
 
 N = 4
 GOOD = {
-    "means": torch.zeros(N, 3), "quats": torch.ones(N, 4), "scales": torch.ones(N, 3),
+    "means": torch.zeros(N, 3),
+    "quats": torch.ones(N, 4),
+    "scales": torch.ones(N, 3),
     "opacities": torch.full((N,), 0.5),
-}  # fmt: skip
+}
 K = torch.tensor([[30.0, 0, 10], [0, 30, 8], [0, 0, 1]])
 
 

@@ -244,9 +244,11 @@ def test_bad_input_is_named():
     good, evidence = unit_rows(4, D, 0), evidence_of([[1.0, 1, 1, 1]], [0, 0, 1, 1])
     for features, kwargs, message in (
         *((good.index_fill(0, torch.tensor([2]), x), {}, r"1 of 4 .*row 2 has length") for x in (0.0, math.nan, 3.0)),
-        (unit_rows(3, D, 0), {}, r"features .*\[4, D\]"), (torch.zeros(4, D).int(), {}, "int32"),
-        (good, {"beta": -1.0}, "beta .*>= 0"), (good, {"beta": math.nan}, "beta .*>= 0"),
+        (unit_rows(3, D, 0), {}, r"features .*\[4, D\]"),
+        (torch.zeros(4, D).int(), {}, "int32"),
+        (good, {"beta": -1.0}, "beta .*>= 0"),
+        (good, {"beta": math.nan}, "beta .*>= 0"),
         (good, {"unlabeled": "drop"}, "unlabeled .*ignore.*dilute"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=message):
             lift(evidence, features, **kwargs)

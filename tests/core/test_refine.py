@@ -327,9 +327,11 @@ def test_ablation_variants_are_what_their_names_say():
     support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + 1), 0.0)
     assert torch.equal(got["none"], u)
     for name, r in (
-        ("plain_knn", ones), ("norm_only", scalars.norm), ("support_only", support),
+        ("plain_knn", ones),
+        ("norm_only", scalars.norm),
+        ("support_only", support),
         ("paper", scalars.reliability),
-    ):  # fmt: skip
+    ):
         assert torch.equal(got[name], u[refine(means, u, r, config).long()]), name
     own = scalars.norm * scalars.n_eff
     assert torch.equal(scalars.own_evidence, own)

@@ -22,9 +22,11 @@ N = 40
 def voters() -> dict:
     g = generator(1)
     return {
-        "means": torch.rand(N, 3, generator=g), "directions": unit_rows(N, 6, seed=2).float(),
-        "reliability": torch.rand(N, generator=g), "own": 5 * torch.rand(N, generator=g),
-    }  # fmt: skip
+        "means": torch.rand(N, 3, generator=g),
+        "directions": unit_rows(N, 6, seed=2).float(),
+        "reliability": torch.rand(N, generator=g),
+        "own": 5 * torch.rand(N, generator=g),
+    }
 
 
 def test_feature_rows_are_refused_alike():

@@ -80,11 +80,13 @@ def rows_of(splat: SplatParameters, rows: slice) -> SplatParameters:
 
 def camera_parameters(model: str, c: Intrinsics) -> list[float]:
     return {
-        "SIMPLE_PINHOLE": [c.fx, c.cx, c.cy], "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
-        "SIMPLE_RADIAL": [c.fx, c.cx, c.cy, c.k1], "RADIAL": [c.fx, c.cx, c.cy, c.k1, c.k2],
+        "SIMPLE_PINHOLE": [c.fx, c.cx, c.cy],
+        "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
+        "SIMPLE_RADIAL": [c.fx, c.cx, c.cy, c.k1],
+        "RADIAL": [c.fx, c.cx, c.cy, c.k1, c.k2],
         "OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2],
         "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, 0.01, 0.0, 0.0, 0.0],
-    }[model]  # fmt: skip
+    }[model]
 
 
 def write_colmap(

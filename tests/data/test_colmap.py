@@ -96,10 +96,12 @@ def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
         ("cameras", "1 PINHOLE 640 480 500 500 320", read_cameras),
         ("cameras", "1 PINHOLE 640", read_cameras),
         ("cameras", "1 PINHOLE wide 480 500 500 320 240", read_cameras),
-        ("images", "1 1 0 0 0 0 0 0", read_images), ("images", "1 nan 0 0 0 0 0 0 1 a.jpg", read_images),
-        ("images", "1 0 0 0 0 0 0 0 1 a.jpg", read_images), ("points3D", "1 2 3", read_colmap_points),
+        ("images", "1 1 0 0 0 0 0 0", read_images),
+        ("images", "1 nan 0 0 0 0 0 0 1 a.jpg", read_images),
+        ("images", "1 0 0 0 0 0 0 0 1 a.jpg", read_images),
+        ("points3D", "1 2 3", read_colmap_points),
         ("points3D", "1 nan 3 4 0 0 0 1", read_colmap_points),
-    ):  # fmt: skip
+    ):
         whole = (folder / f"{name}.txt").read_text()
         (folder / f"{name}.txt").write_text(line + "\n")
         with pytest.raises(InputError, match=str(folder)):
@@ -111,9 +113,11 @@ def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
     folder = find_colmap_model(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
     cameras, images = (folder / "cameras.txt").read_text(), (folder / "images.txt").read_text()
     for changed, message in (
-        (cameras + cameras.splitlines()[-1], "twice"), (cameras.replace("640", "1000000000"), "65,536"),
-        (cameras.replace("500.5", "inf"), "inf"), ("# nothing", "camera 5"),
-    ):  # fmt: skip
+        (cameras + cameras.splitlines()[-1], "twice"),
+        (cameras.replace("640", "1000000000"), "65,536"),
+        (cameras.replace("500.5", "inf"), "inf"),
+        ("# nothing", "camera 5"),
+    ):
         (folder / "cameras.txt").write_text(changed)
         with pytest.raises(InputError, match=message):
             read_colmap_model(folder)

@@ -281,7 +281,8 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     for options, message in (
         ({"images": "."}, "camera file, got none"),
         ({"colmap": "p", "images": "none"}, "folder none, given with --images"),
-        ({"colmap": "p"}, "folder .*p/images"), ({"colmap": "p", "images": "half"}, "13 of the 14 .*half"),
+        ({"colmap": "p"}, "folder .*p/images"),
+        ({"colmap": "p", "images": "half"}, "13 of the 14 .*half"),
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
@@ -290,8 +291,9 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({**every, "eval_images": ("list.txt",)}, r"--eval-images .*list\.txt"),
         ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
-        ({"transforms": "t.json"}, "--colmap"), (every, "0 points"),
-    ):  # fmt: skip
+        ({"transforms": "t.json"}, "--colmap"),
+        (every, "0 points"),
+    ):
         with pytest.raises((nl.InputError, FileNotFoundError), match=message):
             nl.open_splat(path, nl.SplatOptions(**options))
     with pytest.raises(TypeError, match="SplatOptions, got str and str"):

@@ -201,9 +201,11 @@ def test_what_is_wrong_with_a_folder_is_said(hub_weights: Path, tmp_path: Path) 
     vision, text, tokens = "vision_config", "text_config", "tokenizer_config.json"
     table: list[tuple[Callable[[Path], object], list[str]]] = [
         (cut("model.safetensors"), ["SigLIP 2", "--encoder-model", "--encoder open_clip"]),
-        (cut("config.json"), ["config.json"]), (cut("tokenizer.json"), ["SigLIP 2"]),
+        (cut("config.json"), ["config.json"]),
+        (cut("tokenizer.json"), ["SigLIP 2"]),
         (gone("tokenizer.json"), ["tokenizer.json"]),
-        (gone("processor_config.json"), ["preprocessor_config.json"]), (gone("config.json"), ["config.json"]),
+        (gone("processor_config.json"), ["preprocessor_config.json"]),
+        (gone("config.json"), ["config.json"]),
         (gone("model.safetensors", "pytorch_model.bin"), ["model.safetensors", "pytorch_model.bin"]),
         (changed("config.json", None, model_type="sam"), ["'sam'", "'siglip' or 'siglip2'"]),
         (changed("config.json", vision, hidden_size=10**9), ["hidden_size", vision, "1000000000"]),
@@ -219,7 +221,7 @@ def test_what_is_wrong_with_a_folder_is_said(hub_weights: Path, tmp_path: Path) 
         (changed(tokens, None, pad_token="<nothing>"), ["'<nothing>'"]),
         (sharded("../model.safetensors"), ["weight_map"]),
         (sharded("model-00002-of-00002.safetensors"), ["model-00002-of-00002.safetensors"]),
-    ]  # fmt: skip
+    ]
     for number, (damage, parts) in enumerate(table):
         folder = copied(hub_weights / "siglip2", tmp_path / str(number))
         damage(folder)

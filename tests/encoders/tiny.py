@@ -44,10 +44,12 @@ def tiny_sam(seed: int = 0, gain: float = 1.0) -> Any:
         prompts = meta.PromptEncoder(_CHANNELS, (grid, grid), (SIDE, SIDE), mask_in_chans=4)
         turning = meta.TwoWayTransformer(depth=2, embedding_dim=_CHANNELS, num_heads=8, mlp_dim=64)
         sam = meta.Sam(
-            image_encoder=encoder, prompt_encoder=prompts,
+            image_encoder=encoder,
+            prompt_encoder=prompts,
             mask_decoder=meta.MaskDecoder(transformer_dim=_CHANNELS, transformer=turning, iou_head_hidden_dim=32),
-            pixel_mean=[123.675, 116.28, 103.53], pixel_std=[58.395, 57.12, 57.375],
-        )  # fmt: skip
+            pixel_mean=[123.675, 116.28, 103.53],
+            pixel_std=[58.395, 57.12, 57.375],
+        )
         with torch.no_grad():
             for name, value in sam.named_parameters():
                 if "rel_pos" in name or "pos_embed" in name:

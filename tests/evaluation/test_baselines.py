@@ -129,10 +129,12 @@ def changed(lifted: EvaluatedRun, **facts: Any) -> EvaluatedRun:
 
 def test_features_that_cannot_be_made_again_are_refused(lifted):
     for change, message in (
-        ({"source": None}, "does not record"), ({"source": {"wings": 2}}, "does not know"),
-        ({"source": [1]}, "does not know"), ({"source": {"encoder": 3}}, "encoder"),
+        ({"source": None}, "does not record"),
+        ({"source": {"wings": 2}}, "does not know"),
+        ({"source": [1]}, "does not know"),
+        ({"source": {"encoder": 3}}, "encoder"),
         ({"features": {"kind": "other"}}, "other features"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=message):
             baselines.baseline_field("sfs", changed(lifted, **change), "cpu")
 

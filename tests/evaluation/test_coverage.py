@@ -52,8 +52,10 @@ def wall(**changes: Any) -> Any:
     facts = {
         "train": Photographs([f"{i}.png" for i in range(8)], cameras),
         "held_out": Photographs(["h.png"], [looking((3.0, 0.0, 0.4))]),
-        "colors": lambda camera: torch.full((n, 3), 0.5), "renderer": None, "background": torch.zeros(3),
-    }  # fmt: skip
+        "colors": lambda camera: torch.full((n, 3), 0.5),
+        "renderer": None,
+        "background": torch.zeros(3),
+    }
     return made_scene(scene, **{**facts, **changes})
 
 

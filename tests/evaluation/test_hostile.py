@@ -130,9 +130,11 @@ def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r" label .*x, red, class"):
         read_labels(path)
     for labels, message in (
-        (np.array([1163, 1165], np.int32), "NYU40"), (np.array([1.5, 2]), "32-bit integers"),
-        (np.array([np.nan, 2]), "32-bit integers"), (np.array([1e300, 2]), "32-bit integers"),
-    ):  # fmt: skip
+        (np.array([1163, 1165], np.int32), "NYU40"),
+        (np.array([1.5, 2]), "32-bit integers"),
+        (np.array([np.nan, 2]), "32-bit integers"),
+        (np.array([1e300, 2]), "32-bit integers"),
+    ):
         path.write_bytes(ply(labels))
         with pytest.raises(InputError, match=rf"a\.ply.*{message}"):
             read_labels(path)

@@ -90,8 +90,10 @@ def test_a_full_disk_names_the_final_file(tmp_path: Path, monkeypatch: pytest.Mo
 
     ways: dict[str, Callable[[Path], Any]] = {
         "a": lambda path: atomic.write_text_file(path, "x" * 2000),
-        "b": lambda path: save_arrays(path, {"a": numbers}), "c": with_torch, "run/inner/b.txt": folder,
-    }  # fmt: skip
+        "b": lambda path: save_arrays(path, {"a": numbers}),
+        "c": with_torch,
+        "run/inner/b.txt": folder,
+    }
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # what is imported now would be cut off in Python's cache
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))

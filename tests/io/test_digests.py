@@ -226,9 +226,11 @@ def test_a_product_never_reads_outside_of_its_table() -> None:
         rows.matmul(torch.ones(5, 1))
     assert rows.matmul(torch.ones(6, 1)).tolist() == [[2.0]]
     for broken in (
-        replace(rows, column=torch.tensor([0, -5]).int()), replace(rows, offsets=torch.tensor([0, 3])),
-        replace(rows, offsets=torch.tensor([0, 5, -3, 2])), replace(rows, weight=torch.ones(1)),
-    ):  # fmt: skip
+        replace(rows, column=torch.tensor([0, -5]).int()),
+        replace(rows, offsets=torch.tensor([0, 3])),
+        replace(rows, offsets=torch.tensor([0, 5, -3, 2])),
+        replace(rows, weight=torch.ones(1)),
+    ):
         with pytest.raises(ValueError, match=r"must (be 0 or more|rise from 0)"):
             broken.matmul(torch.ones(6, 1))
 

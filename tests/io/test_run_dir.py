@@ -39,9 +39,11 @@ def test_the_manifest_knows_the_files_of_the_run(tmp_path: Path) -> None:
     digests = run_dir.read_manifest(run / "normlift")[1]
     assert digests is not None
     assert set(digests) == {
-        "field.safetensors", "texts.npz", "../dataparser_transforms.json",
+        "field.safetensors",
+        "texts.npz",
+        "../dataparser_transforms.json",
         "../nerfstudio_models/step-000000007.ckpt",
-    }  # fmt: skip
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run_dir.check_run(run)

@@ -174,12 +174,14 @@ def write_images(rng: np.random.Generator, files: list[Path], size: tuple[int, i
 
 WORLD = {
     "orientation_method": st.sampled_from(["pca", "up", "vertical", "none"]),
-    "center_method": st.sampled_from(["poses", "focus", "none"]), "auto_scale_poses": st.booleans(),
+    "center_method": st.sampled_from(["poses", "focus", "none"]),
+    "auto_scale_poses": st.booleans(),
     "scale_factor": st.sampled_from([1.0, 0.3, 7.0]),
     "eval_mode": st.sampled_from(["fraction", "interval", "filename", "all"]),
-    "train_split_fraction": st.sampled_from([0.5, 0.9, 1.0]), "eval_interval": st.sampled_from([2, 3, 8]),
+    "train_split_fraction": st.sampled_from([0.5, 0.9, 1.0]),
+    "eval_interval": st.sampled_from([2, 3, 8]),
     "downscale_factor": st.sampled_from([None, 1, 2]),
-}  # fmt: skip
+}
 
 
 def with_held_out(parser: dict[str, Any], lists: bool) -> dict[str, Any]:

@@ -125,14 +125,16 @@ def test_a_question_of_another_run_is_refused(tmp_path: Path) -> None:
 def test_vectors_fit_the_texts(tmp_path: Path) -> None:
     for tensors, message in (
         ({"vectors": torch.eye(3)}, r"float32 \(3, 3\).* float32 \(1, 3\)"),
-        ({"vectors": torch.ones(3)}, r"float32 \(3,\)"), ({"vectors": torch.tensor(1.0)}, r"float32 \(\)"),
+        ({"vectors": torch.ones(3)}, r"float32 \(3,\)"),
+        ({"vectors": torch.tensor(1.0)}, r"float32 \(\)"),
         ({"vectors": torch.ones(1, 0)}, r"\(1, 0\)"),
         ({"vectors": torch.ones(1, 3, dtype=torch.float64)}, "float64"),
         ({"vectors": torch.zeros(1, 3)}, "'a' is zero"),
         ({"vectors": torch.tensor([[1.0, torch.nan, 1.0]])}, r"nan\.\.nan"),
         ({"vectors": torch.tensor([[1.0, -torch.inf, 1.0]])}, "'a' is zero or not finite"),
-        ({"negative_vectors": torch.ones(1, 3)}, "0 negatives"), ({"others": torch.ones(1, 3)}, "others"),
-    ):  # fmt: skip
+        ({"negative_vectors": torch.ones(1, 3)}, "0 negatives"),
+        ({"others": torch.ones(1, 3)}, "others"),
+    ):
         store(tmp_path, FACTS, **tensors)
         with damaged_question(message):
             load_query(tmp_path)

@@ -58,9 +58,11 @@ def test_pixels_as_regions_give_the_matrix_itself():
 def test_equal_depths_are_drawn_by_index():
     """Two Gaussians at the same place: the first one hides the second."""
     scene = GaussianScene(
-        torch.zeros(2, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), torch.full((2, 3), 0.5),
+        torch.zeros(2, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        torch.full((2, 3), 0.5),
         torch.tensor([0.9, 0.9]),
-    )  # fmt: skip
+    )
     camera = orbit_camera(0.0)
     labels = torch.zeros(camera.height, camera.width, dtype=torch.int32)
     for backend in BACKENDS:

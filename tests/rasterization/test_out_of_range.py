@@ -44,9 +44,11 @@ def evidence_of(scene, cameras, labels, backend, **options):
 
 
 ROW = st.tuples(
-    st.tuples(*[FLOATS] * 3), st.tuples(*[FLOATS] * 4), st.tuples(*[FLOATS.map(abs)] * 3),
+    st.tuples(*[FLOATS] * 3),
+    st.tuples(*[FLOATS] * 4),
+    st.tuples(*[FLOATS.map(abs)] * 3),
     st.floats(0, 1, width=32) | st.just(math.nan),
-)  # fmt: skip
+)
 
 
 @examples(3)

@@ -58,9 +58,11 @@ def test_the_network_computes_what_keras_computes(size):
 
 def test_files_of_another_layout_are_refused():
     for name, values in (
-        ("dsn2/vars/0", None), ("dsn2/vars/0", np.zeros((1, 1, 8, 1), np.float32)),
-        ("dsn2/vars/1", np.zeros(1)), ("block3/layers/conv2d_1/vars/1", {}),
-    ):  # fmt: skip
+        ("dsn2/vars/0", None),
+        ("dsn2/vars/0", np.zeros((1, 1, 8, 1), np.float32)),
+        ("dsn2/vars/1", np.zeros(1)),
+        ("block3/layers/conv2d_1/vars/1", {}),
+    ):
         content = keras_file(tiny_network())
         with h5py.File(content, "a") as file:
             del file[name]
@@ -153,6 +155,8 @@ def test_trained_weights():
     assert error <= 1e-4
     labels = source.labels(image, "a.png")
     assert [int(level.max()) + 1 for level in labels] == list(EDGE_COUNTS)
+    assert_nested(labels[:, 0].numpy())
+    assert torch.equal(labels, EdgeRegions().labels(image, "a.png"))
 
 
 @needs_cuda
