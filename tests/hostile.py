@@ -120,11 +120,15 @@ def no_files(path: Path) -> Iterator[str]:
     """Makes the path one thing after the other that is no file with content, and says what it is."""
     outside = path.with_name(f"{path.name}.elsewhere")
     for kind, make in {
-        "nothing": lambda: None, "an empty file": path.touch, "a folder": path.mkdir,
+        "nothing": lambda: None,
+        "an empty file": path.touch,
+        "a folder": path.mkdir,
         "a link to nothing": lambda: path.symlink_to(outside),
-        "a link to itself": lambda: path.symlink_to(path), "a pipe": lambda: os.mkfifo(path),
-        "a device": lambda: path.symlink_to("/dev/zero"), "one byte": lambda: path.write_bytes(b"x"),
-    }.items():  # fmt: skip
+        "a link to itself": lambda: path.symlink_to(path),
+        "a pipe": lambda: os.mkfifo(path),
+        "a device": lambda: path.symlink_to("/dev/zero"),
+        "one byte": lambda: path.write_bytes(b"x"),
+    }.items():
         if path.is_dir():
             path.rmdir()
         elif os.path.lexists(path):

@@ -66,9 +66,12 @@ def test_only_the_first_line_of_a_foreign_message_is_shown():
 
 def test_control_characters_are_shown_as_escapes():
     for text, shown in (
-        ("plain [/red] :smile: 中文 é", "plain [/red] :smile: 中文 é"), ("\x1b[31mred", "\\x1b[31mred"),
-        ("a\nb\tc\rd\0", "a\\nb\\tc\\rd\\x00"), ("\u202eabc\u200f", "\\u202eabc\\u200f"),
-        ("\udc80", "\\udc80"), ("\x9b31m", "\\x9b31m"),
-    ):  # fmt: skip
+        ("plain [/red] :smile: 中文 é", "plain [/red] :smile: 中文 é"),
+        ("\x1b[31mred", "\\x1b[31mred"),
+        ("a\nb\tc\rd\0", "a\\nb\\tc\\rd\\x00"),
+        ("\u202eabc\u200f", "\\u202eabc\\u200f"),
+        ("\udc80", "\\udc80"),
+        ("\x9b31m", "\\x9b31m"),
+    ):
         assert escape_unprintable(text) == shown
         escape_unprintable(text).encode("utf8")

@@ -110,9 +110,14 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert opened.field.manifest["features"]["kind"] == "given"
     (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
     flags = (
-        "--load-config", tmp_path / "moved" / "config.yml", "--text", "red", "file", "--output-json",
+        "--load-config",
+        tmp_path / "moved" / "config.yml",
+        "--text",
+        "red",
+        "file",
+        "--output-json",
         tmp_path / "a.json",
-    )  # fmt: skip
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
@@ -149,29 +154,36 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
     labels, vectors = torch.arange(160).expand(120, 160) // 80, torch.eye(2)
     half = (labels, vectors)
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"features": [half] * 3}, "^3 .* 12 "), ({"features": {"nowhere.png": half}}, r"nowhere\.png"),
+        ({"features": [half] * 3}, "^3 .* 12 "),
+        ({"features": {"nowhere.png": half}}, r"nowhere\.png"),
         ({"features": [(labels[:, :80], vectors)] * 12}, r"images/0000\.png .*\(120, 80\), .*\(120, 160\)"),
         ({"features": [(labels + 1, vectors)] * 12}, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
         ({"features": [(labels, torch.nan * vectors)] * 12}, r"images/0000\.png must be \[regions, D\] and finite"),
-        ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"), ({"features": []}, "^0 .* 12"),
-        ({"features": {}}, "empty"), ({"features": [labels.numpy()] * 12}, "got ndarray"),
+        ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
+        ({"features": []}, "^0 .* 12"),
+        ({"features": {}}, "empty"),
+        ({"features": [labels.numpy()] * 12}, "got ndarray"),
         ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
         ({"texts": {"a": np.zeros(2)}}, r"text 'a' must be \[D\], finite and not zero"),
         ({"texts": {"a": [1.0, float("nan")]}}, "text 'a' must be"),
         ({"texts": {"a": np.ones((1, 2))}}, "text 'a' must be"),
-        ({"texts": {" ": [1, 2]}}, "not a valid text"), ({"texts": {"fox.npy": [1, 2]}}, "not a valid text"),
-        ({"texts": {5: [1, 2]}}, "dictionary"), ({"texts": {"a": ["x", "y"]}}, "numbers"),
-        ({"texts": {"a": [1j, 2]}}, "real"), ({"texts": {"a": [1, 2, 3]}}, r"\[2, 3\]"),
+        ({"texts": {" ": [1, 2]}}, "not a valid text"),
+        ({"texts": {"fox.npy": [1, 2]}}, "not a valid text"),
+        ({"texts": {5: [1, 2]}}, "dictionary"),
+        ({"texts": {"a": ["x", "y"]}}, "numbers"),
+        ({"texts": {"a": [1j, 2]}}, "real"),
+        ({"texts": {"a": [1, 2, 3]}}, r"\[2, 3\]"),
         ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .* 1; closest: a"),
         ({"queries": ["b"]}, "is empty"),
         ({"texts": {"a": [1, 2]}, "queries": "a"}, "queries must be a list"),
         ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="color")}, "texts"),
-        ({"source": nl.SourceOptions(encoder="color")}, "source"), ({"load_step": 3}, "open_scene"),
+        ({"source": nl.SourceOptions(encoder="color")}, "source"),
+        ({"load_step": 3}, "open_scene"),
         *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
         ({"output_dir": 5}, "output_dir"),
         *(({"timestamp": x}, "name of a folder") for x in (".", "..", "a/b", "/x", "", ".cache", "x\ny", "\x1b[31m")),
         ({"timestamp": "a" * 300}, "300 .* 200"),
-    ]  # fmt: skip
+    ]
     for arguments, message in wrong:
         with pytest.raises(nl.InputError, match=message):
             nl.lift_run(scene, **{"output_dir": tmp_path, "features": [half] * 12, "overwrite": True, **arguments})
@@ -205,9 +217,12 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
         warnings.simplefilter("error", UserWarning)
         nl.open_run(lifted, data=room)  # a copy has the same cameras
     for change, changed in (
-        ("focal", "training and held-out"), ("order", "training"), ("poses", "training and held-out"),
-        ("one pose", "training and held-out"), ("held out", "held-out"),
-    ):  # fmt: skip
+        ("focal", "training and held-out"),
+        ("order", "training"),
+        ("poses", "training and held-out"),
+        ("one pose", "training and held-out"),
+        ("held out", "held-out"),
+    ):
         content = json.loads(whole)
         frames = content["frames"]
         if change == "focal":

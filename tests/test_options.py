@@ -141,11 +141,15 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
 
 def test_texts_and_devices_that_can_and_that_cannot_be():
     for texts, fact in (
-        (["a", ""], "prompt 2 of 2 in queries"), ([" \n\t"], "empty"),
-        (["a", "b", "a"], "prompt 3 of 3 in queries, 'a'"), (["a\0"], "character"), (["\udc80"], "character"),
+        (["a", ""], "prompt 2 of 2 in queries"),
+        ([" \n\t"], "empty"),
+        (["a", "b", "a"], "prompt 3 of 3 in queries, 'a'"),
+        (["a\0"], "character"),
+        (["\udc80"], "character"),
         (["x" * (MAX_PROMPT_LENGTH + 1)], f"10,001 characters; give at most {MAX_PROMPT_LENGTH:,}"),
-        ("red", "list"), ([3], "got 3"),
-    ):  # fmt: skip
+        ("red", "list"),
+        ([3], "got 3"),
+    ):
         with pytest.raises(InputError) as told:
             check_prompt_list("queries", texts)
         assert fact in str(told.value) and len(str(told.value)) < 300

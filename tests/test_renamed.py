@@ -103,9 +103,13 @@ def test_functions_have_old_keywords():
 def test_ns_train_has_old_options_of_our_methods(capsys):
     _print_renamed.cache_clear()
     old = [
-        "normlift", "--pipeline.lift.beta", "2", "--pipeline.source.text_template=a {}",
-        "--pipeline.lift.vote.k", "7",
-    ]  # fmt: skip
+        "normlift",
+        "--pipeline.lift.beta",
+        "2",
+        "--pipeline.source.text_template=a {}",
+        "--pipeline.lift.vote.k",
+        "7",
+    ]
     new = [*old[:1], "--pipeline.lift.reliability-beta", "2", "--pipeline.source.prompt-template=a {}", *old[4:]]
     assert entry._rename_flags(["/bin/ns-train", *old]) == ["/bin/ns-train", *new]
     assert [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()] == [

@@ -294,9 +294,12 @@ def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
     )  # the default
     assert key(path, "--device", "cpu", "--output-dir", "elsewhere") == first
     others = [
-        ("--reliability-beta", "2"), ("--colmap", "x"), ("--queries", "red"), ("--encoder", "color"),
+        ("--reliability-beta", "2"),
+        ("--colmap", "x"),
+        ("--queries", "red"),
+        ("--encoder", "color"),
         ("--refine", "False"),
-    ]  # fmt: skip
+    ]
     keys = [key(path, *options) for options in others]
     assert len({first, *keys}) == 1 + len(others)
     assert key(f"{path} --reliability-beta 2") == keys[0]

@@ -88,9 +88,15 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
     folder = tmp_path / "[x] :smile: [/red]"
     flags = (
-        "--load-config", lifted, "--output-json", folder / "a.json", "--render-dir", folder, "--render-views",
+        "--load-config",
+        lifted,
+        "--output-json",
+        folder / "a.json",
+        "--render-dir",
+        folder,
+        "--render-views",
         "0003",
-    )  # fmt: skip
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
     shown = capsys.readouterr().out
     for text in texts:

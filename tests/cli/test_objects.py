@@ -180,9 +180,15 @@ def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path
     rows = {}
     for part in ("scene", "clean"):
         flags = (
-            "--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", "--select",
+            "--load-config",
+            lifted,
+            "--output-dir",
+            tmp_path,
+            "--output-filename",
+            f"{part}.ply",
+            "--select",
             part,
-        )  # fmt: skip
+        )
         assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
         rows[part] = np.load(tmp_path / f"{part}_rows.npy")
     mask = open_run(lifted).floaters().mask

@@ -43,9 +43,17 @@ def in_copy(own: Path) -> Path:
 def test_sam3_answers_beside_the_run(own: Path, weights: Path, tmp_path, monkeypatch, capsys) -> None:
     table, arrays, lifted = tmp_path / "table.json", tmp_path / "arrays.npz", in_copy(own)
     flags = (
-        "--load-config", lifted, "--text", "red", "--output-json", table, "--output-npz", arrays, "--segment",
+        "--load-config",
+        lifted,
+        "--text",
+        "red",
+        "--output-json",
+        table,
+        "--output-npz",
+        arrays,
+        "--segment",
         "sam3",
-    )  # fmt: skip
+    )
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--segment-model", weights, "--segment-views", 4) == 0
     shown = said(capsys)
     assert "SAM 3" in shown and "50%" in shown

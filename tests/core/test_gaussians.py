@@ -30,12 +30,15 @@ def test_scenes_and_cameras_name_what_is_wrong():
     good = {"K": K, "world_to_camera": torch.eye(4), "width": 20, "height": 16}
     Camera(**good)
     for change, message in (
-        ({"K": torch.eye(4)}, r"K .*\(3, 3\)"), ({"K": torch.full((3, 3), torch.nan)}, "K .*finite"),
+        ({"K": torch.eye(4)}, r"K .*\(3, 3\)"),
+        ({"K": torch.full((3, 3), torch.nan)}, "K .*finite"),
         ({"K": K + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])}, r"K .*\[\[fx, 0, cx\]"),
-        ({"K": -K}, "fx, fy > 0"), ({"world_to_camera": 2 * torch.eye(4)}, "no scale, no mirror"),
+        ({"K": -K}, "fx, fy > 0"),
+        ({"world_to_camera": 2 * torch.eye(4)}, "no scale, no mirror"),
         ({"world_to_camera": torch.diag(torch.tensor([-1.0, 1, 1, 1]))}, "no scale, no mirror"),
-        ({"width": 0}, "width 0, height 16"), ({"height": 0}, "width 20, height 0"),
-    ):  # fmt: skip
+        ({"width": 0}, "width 0, height 16"),
+        ({"height": 0}, "width 20, height 0"),
+    ):
         with pytest.raises(ValueError, match=message):
             Camera(**{**good, **change})
 

@@ -44,10 +44,14 @@ def test_equals_the_definition(seed, unlabeled, beta):
             continue
         f, lengths, n_eff = total / w, sum(s.norm() for s in s_jv), w**2 / sum(x**2 for x in w_jv)
         expected = {
-            "norm": f.norm(), "c_intra": lengths / w, "c_inter": total.norm() / lengths, "n_eff": n_eff,
-            "reliability": f.norm() * n_eff / (n_eff + beta), "view_count": sum(x > 0 for x in w_jv),
+            "norm": f.norm(),
+            "c_intra": lengths / w,
+            "c_inter": total.norm() / lengths,
+            "n_eff": n_eff,
+            "reliability": f.norm() * n_eff / (n_eff + beta),
+            "view_count": sum(x > 0 for x in w_jv),
             "weight": w,
-        }  # fmt: skip
+        }
         for name, value in expected.items():
             assert float(getattr(lifted.scalars, name)[j]) == pytest.approx(float(value), rel=1e-11), name
         assert (directions[j] - f / f.norm()).abs().max() < 1e-11

@@ -30,11 +30,14 @@ def scenes() -> dict[str, torch.Tensor]:
     sparse = 1e3 * torch.rand(20, 3, generator=generator(5))
     return {
         "random": torch.rand(120, 3, generator=generator(0)),
-        "grid": torch.cartesian_prod(*[torch.arange(4.0)] * 3), "all at one place": torch.zeros(30, 3),
-        "few places": torch.rand(20, 3, generator=generator(1))[some], "grid, several at a place": lattice(),
+        "grid": torch.cartesian_prod(*[torch.arange(4.0)] * 3),
+        "all at one place": torch.zeros(30, 3),
+        "few places": torch.rand(20, 3, generator=generator(1))[some],
+        "grid, several at a place": lattice(),
         "dense and sparse": torch.cat([1e-4 * torch.rand(60, 3, generator=generator(4)), sparse]),
-        "one": torch.zeros(1, 3), "two": torch.tensor([[0.0, 0, 0], [1, 0, 0]]),
-    }  # fmt: skip
+        "one": torch.zeros(1, 3),
+        "two": torch.tensor([[0.0, 0, 0], [1, 0, 0]]),
+    }
 
 
 def test_equals_all_pairs_ties_by_index():

@@ -269,9 +269,16 @@ def test_half_precision_directions_vote_like_float32():
 
 def test_parameters_have_ranges():
     for name, wrong, fine in (
-        ("k", 0, 1), ("sigma_d", 0.0, 1e-6), ("tau", 1.5, 1.0), ("tau", -1.5, -1.0), ("gamma", -1.0, 1e-6),
-        ("gamma", 0.0, 1.0), ("delta", -0.1, 0.0), ("prior", -1.0, 0.0), ("vote", "mean", "paper"),
-    ):  # fmt: skip
+        ("k", 0, 1),
+        ("sigma_d", 0.0, 1e-6),
+        ("tau", 1.5, 1.0),
+        ("tau", -1.5, -1.0),
+        ("gamma", -1.0, 1e-6),
+        ("gamma", 0.0, 1.0),
+        ("delta", -0.1, 0.0),
+        ("prior", -1.0, 0.0),
+        ("vote", "mean", "paper"),
+    ):
         with pytest.raises(ValueError, match=f"{name} must"):
             RefineConfig(**{name: wrong})
         assert getattr(RefineConfig(**{name: fine}), name) == fine

@@ -66,16 +66,21 @@ def test_half_precision_and_float64_become_float32(tmp_path: Path) -> None:
 
 
 OTHER: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
-    "shorter": lambda value: value[:-1], "empty": lambda value: value[:0],
-    "flat": lambda value: value.reshape(-1), "deeper": lambda value: value[..., None],
-    "wider": lambda value: torch.cat([value, value], dim=-1), "int64": lambda value: value.long(),
-    "bool": lambda value: value > 0, "complex": lambda value: value.to(torch.complex64),
+    "shorter": lambda value: value[:-1],
+    "empty": lambda value: value[:0],
+    "flat": lambda value: value.reshape(-1),
+    "deeper": lambda value: value[..., None],
+    "wider": lambda value: torch.cat([value, value], dim=-1),
+    "int64": lambda value: value.long(),
+    "bool": lambda value: value > 0,
+    "complex": lambda value: value.to(torch.complex64),
     "sparse": lambda value: value.to_sparse(),
     "expanded": lambda value: value[:1].expand(10**6, *value.shape[1:]),
     "meta": lambda value: torch.empty(value.shape, device="meta"),
     "quantized": lambda value: torch.quantize_per_tensor(value, 0.1, 0, torch.qint8),
-    "float8": lambda value: value.to(torch.float8_e4m3fn), "a number": lambda value: torch.zeros(()),
-}  # fmt: skip
+    "float8": lambda value: value.to(torch.float8_e4m3fn),
+    "a number": lambda value: torch.zeros(()),
+}
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -40,14 +40,17 @@ def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
 def test_what_is_not_a_similarity_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "world.json"
     for content, message in (
-        (np.diag([1.0, 1, -1, 1]).tolist(), "similarity"), (np.diag([1.0, 1, 2, 1]).tolist(), "similarity"),
-        (np.zeros((4, 4)).tolist(), "similarity"), ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
-        ([[1, 2], [3]], "does not hold a transform"), ("eye", "does not hold a transform"),
+        (np.diag([1.0, 1, -1, 1]).tolist(), "similarity"),
+        (np.diag([1.0, 1, 2, 1]).tolist(), "similarity"),
+        (np.zeros((4, 4)).tolist(), "similarity"),
+        ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
+        ([[1, 2], [3]], "does not hold a transform"),
+        ("eye", "does not hold a transform"),
         ({"transform": [[1, 0, 0, 0]] * 3}, "`scale`"),
         ({"transform": [[1, 0, 0, 0]] * 3, "scale": 1}, "similarity"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "3 rows and scale -1"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "does not hold a transform"),
-    ):  # fmt: skip
+    ):
         path.write_text(json.dumps(content))
         with pytest.raises(InputError, match=message) as caught:
             read_world_transform(path)

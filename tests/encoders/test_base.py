@@ -16,11 +16,14 @@ UNIT = torch.nn.functional.normalize(torch.arange(1.0, 7.0).reshape(2, 3), dim=1
 def test_view_features_accept_what_fits_and_refuse_the_rest():
     none = torch.zeros(2, 2, dtype=torch.int32)
     for labels, features, parts in (
-        (none.float(), UNIT, ["labels", "torch.int32"]), (none.flatten(), UNIT, ["labels", "torch.int32"]),
-        (none, UNIT.double(), ["features", "torch.float32"]), (none + 2, UNIT, ["-1..1", "2 cells", "2..2"]),
-        (none - 2, UNIT, ["-2..-2"]), (none, 2 * UNIT, ["2 of 2", "row 0 has length 2"]),
+        (none.float(), UNIT, ["labels", "torch.int32"]),
+        (none.flatten(), UNIT, ["labels", "torch.int32"]),
+        (none, UNIT.double(), ["features", "torch.float32"]),
+        (none + 2, UNIT, ["-1..1", "2 cells", "2..2"]),
+        (none - 2, UNIT, ["-2..-2"]),
+        (none, 2 * UNIT, ["2 of 2", "row 0 has length 2"]),
         (none, UNIT * torch.tensor([[1.0], [torch.nan]]), ["row 1 has length nan"]),
-    ):  # fmt: skip
+    ):
         refused(lambda given=(labels, features): ViewFeatures(*given), *parts)
     # Unlabelled pixels and regions without pixels fit
     view = ViewFeatures(torch.tensor([[-1, 0], [0, 0]], dtype=torch.int32), UNIT)

@@ -113,10 +113,16 @@ def test_basic_colours_are_found_in_shade(survey):
 
 def test_prompts_are_reduced_to_names():
     for prompt, found in {
-        "orange": ["orange"], "dark red shoes": ["dark red"], "Dark-Red Shoes!": ["dark red"],
-        "a black and white cat": ["black", "white"], "robin's egg blue": ["robin's egg blue"],
-        "light gray": ["light grey"], "blue/green": ["blue green"], "redwood": [], "": [],
-    }.items():  # fmt: skip
+        "orange": ["orange"],
+        "dark red shoes": ["dark red"],
+        "Dark-Red Shoes!": ["dark red"],
+        "a black and white cat": ["black", "white"],
+        "robin's egg blue": ["robin's egg blue"],
+        "light gray": ["light grey"],
+        "blue/green": ["blue green"],
+        "redwood": [],
+        "": [],
+    }.items():
         assert find_color_names(prompt) == found, prompt
 
 
@@ -124,7 +130,10 @@ def test_what_names_no_colour_is_refused_with_near_names():
     for prompts, parts in (
         (["red", 10_000 * "x"], [f"'{39 * 'x'}…'"]),
         (["red", "darkred chair"], ["'darkred chair'", "dark red", "--encoder open_clip"]),
-        (["bleu"], ["'bleu'", "blue"]), (["7"], ["red, dark green, sky blue"]), ([], []), ([""], []),
+        (["bleu"], ["'bleu'", "blue"]),
+        (["7"], ["red, dark green, sky blue"]),
+        ([], []),
+        ([""], []),
         ("red", ["['red']"]),
-    ):  # fmt: skip
+    ):
         refused(lambda prompts=prompts: COLOUR.text(prompts), *parts)

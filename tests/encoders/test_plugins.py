@@ -210,9 +210,16 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
     assert done.returncode == 0, done.stdout + done.stderr
     asked = (
-        "--load-config", lifted, "--output-json", tmp_path / "a.json", "--overwrite", "True", "--text", "red",
+        "--load-config",
+        lifted,
+        "--output-json",
+        tmp_path / "a.json",
+        "--overwrite",
+        "True",
+        "--text",
+        "red",
         "yellow",
-    )  # fmt: skip
+    )
     done = run("ns-normlift-query", *asked)
     assert done.returncode == 0, done.stdout + done.stderr
     red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]

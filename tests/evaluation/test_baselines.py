@@ -143,9 +143,13 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
 def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     """As `lift_scene` lifts them, numbers that vote included."""
     options = LiftOptions(
-        refine=False, max_views=4, consensus=True, consensus_power=power, consensus_sample=9,
+        refine=False,
+        max_views=4,
+        consensus=True,
+        consensus_power=power,
+        consensus_sample=9,
         consensus_min_agreement=0.0,
-    )  # fmt: skip
+    )
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}
     agreed = replace(lifted, field=replace(found, manifest=json.loads(json.dumps(manifest))))

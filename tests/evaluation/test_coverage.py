@@ -221,12 +221,15 @@ def test_records_of_what_was_lifted():
     with pytest.raises(InputError, match="no longer has"):
         coverage.lifted_names(scene, {"views_lifted": ["gone.png"]})
     for facts in (
-        {"views_lifted": "0.png"}, {"views_lifted": [3]}, {"views_lifted": [["0.png"]]},
-        {"views_lifted": ["0.png"], "views_without_features": None}, {"statistics": 3},
+        {"views_lifted": "0.png"},
+        {"views_lifted": [3]},
+        {"views_lifted": [["0.png"]]},
+        {"views_lifted": ["0.png"], "views_without_features": None},
+        {"statistics": 3},
         {"statistics": {"views": 8.5, "left_out": 0}},
         {"statistics": {"views": 8, "left_out": 0}, "options": {"max_views": 0}},
         {"statistics": {"views": 8, "left_out": 0}, "options": []},
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match="damaged"):
             coverage.lifted_names(scene, facts)
 

@@ -80,16 +80,19 @@ def changed(document: dict[str, Any], path: tuple[Any, ...], value: Any) -> str:
 def test_labels_of_lerf_say_what_is_wrong(tmp_path: Path) -> None:
     for path, value, message in (
         (("info", "width"), 0, r"`int` >= 1 - at `\$\.info\.width`"),
-        (("info", "width"), 10**9, "`int` <= 32768"), (("info", "height"), True, "`int`, got `bool`"),
-        (("info", "height"), "30", "`int`, got `str`"), (("objects",), {}, "`array`, got `object`"),
-        (("objects", 0, "category"), "", "regex"), (("objects", 0, "category"), 3, "`str`, got `int`"),
+        (("info", "width"), 10**9, "`int` <= 32768"),
+        (("info", "height"), True, "`int`, got `bool`"),
+        (("info", "height"), "30", "`int`, got `str`"),
+        (("objects",), {}, "`array`, got `object`"),
+        (("objects", 0, "category"), "", "regex"),
+        (("objects", 0, "category"), 3, "`str`, got `int`"),
         (("objects", 0, "segmentation"), [[1, 2]], "length >= 3"),
         (("objects", 0, "segmentation", 1), [1e9, 3], r"40 x 30 .* 1e\+09"),
         (("objects", 0, "segmentation", 1), [1, 2, 3], "length 2"),
         (("objects", 0, "segmentation", 1, 0), float("nan"), "NaN"),
         (("objects", 0, "bbox"), [1, 2, 3], "length 4"),
         (("objects", 0, "bbox"), [0, 0, -1e12, 5], r"1e\+12"),
-    ):  # fmt: skip
+    ):
         (tmp_path / "f.json").write_text(changed(FRAME, path, value))
         with pytest.raises(InputError, match=rf"f\.json .*{message}"):
             read_frame(tmp_path / "f.json", 40, 30)
@@ -97,15 +100,18 @@ def test_labels_of_lerf_say_what_is_wrong(tmp_path: Path) -> None:
 
 def test_names_say_what_is_wrong(tmp_path: Path) -> None:
     for text, message in (
-        ('{"labels": {"1": "a", "1": "b"}}', "'1' .*twice"), ('{"labels": {"01": "a"}}', "'01'"),
-        ('{"labels": {"1": null}}', "`str`, got `null`"), ('{"labels": {"1": 2}}', "`str`, got `int`"),
+        ('{"labels": {"1": "a", "1": "b"}}', "'1' .*twice"),
+        ('{"labels": {"01": "a"}}', "'01'"),
+        ('{"labels": {"1": null}}', "`str`, got `null`"),
+        ('{"labels": {"1": 2}}', "`str`, got `int`"),
         ('{"labels": {"1": " "}}', "regex"),
         ('{"labels": {"0": "a"}, "background": 0}', "0 is the background"),
         ('{"labels": {"1": "a"}, "background": true}', r"`int \| null`, got `bool`"),
-        ('{"labels": {"' + "9" * 5000 + '": "a"}}', "not a mask value"), ("[" * 100000, "RecursionError"),
+        ('{"labels": {"' + "9" * 5000 + '": "a"}}', "not a mask value"),
+        ("[" * 100000, "RecursionError"),
         *((text, "") for text in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{")),
         ('{"labels": {"1": "\\ud800"}}', "regex"),
-    ):  # fmt: skip
+    ):
         (tmp_path / "labels.json").write_text(text)
         with pytest.raises(InputError, match=rf"labels\.json (?s:.*){message}"):
             read_names(tmp_path / "labels.json")

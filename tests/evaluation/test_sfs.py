@@ -33,14 +33,18 @@ def bins(**counts: int) -> list[int]:
 
 
 SHAPED = {
-    "two peaks": bins(b5=900, b30=700, b20=0), "a plateau is two peaks": bins(b10=800, b11=800, b30=700),
+    "two peaks": bins(b5=900, b30=700, b20=0),
+    "a plateau is two peaks": bins(b10=800, b11=800, b30=700),
     "fewer peaks than instances": bins(b8=2000, b12=0),
     "no valley to the left": [3000, 2000, *range(1900, 1862, -1)],
-    "rising to the right": [*range(10, 790, 20), 801], "no peak": bins(b5=599, b30=599),
-    "peak in the first bin": bins(b0=5000, b20=0), "peak in the last bin": bins(b39=5000, b38=0),
-    "valley of equal bins": bins(b20=4000, b15=50), "all equal": [650] * 40,
+    "rising to the right": [*range(10, 790, 20), 801],
+    "no peak": bins(b5=599, b30=599),
+    "peak in the first bin": bins(b0=5000, b20=0),
+    "peak in the last bin": bins(b39=5000, b38=0),
+    "valley of equal bins": bins(b20=4000, b15=50),
+    "all equal": [650] * 40,
     "two plateaus": [700] * 20 + [690] * 20,
-}  # fmt: skip
+}
 
 
 def random_map(seed: int) -> np.ndarray:

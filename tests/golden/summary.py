@@ -29,9 +29,19 @@ from safetensors.numpy import load_file
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
 VOTE = (
-    "--vote", "paper", "--vote-k", 36, "--vote-sigma-d", 1, "--vote-tau", 0.95, "--vote-gamma", 0.4,
-    "--vote-delta", 0,
-)  # fmt: skip
+    "--vote",
+    "paper",
+    "--vote-k",
+    36,
+    "--vote-sigma-d",
+    1,
+    "--vote-tau",
+    0.95,
+    "--vote-gamma",
+    0.4,
+    "--vote-delta",
+    0,
+)
 """Of version 0.1, which knew no consensus."""
 SINCE = {"stands_out", "nearest", "suggested_threshold", "histogram"}
 """What an answer tells since."""

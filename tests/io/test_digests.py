@@ -265,13 +265,16 @@ def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> No
 def test_a_digest_covers_names_types_shapes_numbers_facts_and_key() -> None:
     base, facts = {"a": torch.arange(6.0), "b": torch.ones(2)}, {"f": "1"}
     digests = [
-        array_digest(base, facts), array_digest(base, facts, "key"), array_digest(base, {"f": "2"}),
-        array_digest(base, {"g": "1"}), array_digest({"a": base["b"], "b": base["a"]}, facts),
+        array_digest(base, facts),
+        array_digest(base, facts, "key"),
+        array_digest(base, {"f": "2"}),
+        array_digest(base, {"g": "1"}),
+        array_digest({"a": base["b"], "b": base["a"]}, facts),
         array_digest({**base, "a": base["a"].view(2, 3)}, facts),
         array_digest({**base, "a": base["a"].view(torch.int32)}, facts),
         array_digest({**base, "c": torch.zeros(0)}, facts),
         array_digest({**base, "b": torch.tensor([1.0, 1.0000001])}, facts),
-    ]  # fmt: skip
+    ]
     assert len(set(digests)) == len(digests)
     assert array_digest(dict(reversed(base.items())), facts) == digests[0]
     strided = torch.stack([base["a"], base["a"]], dim=1)[:, 0]
@@ -371,10 +374,13 @@ def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
         ({"num_views": "-1"}, {}, "num_views.*-1, 1, 0"),
         ({"weight_power": "3"}, {}, "weight_power.*4, 3, 0"),
         ({"num_excluded": "16"}, {}, "num_excluded.*4, 1, 16"),
-        ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"), ({"format": "other"}, {}, "'other'"),
-        ({}, {"region_view": views.flip(0)}, "rising"), ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
-        ({}, {"region_view": views.long()}, "region_view .*int64.*int32"), ({"num_excluded": "15"}, {}, None),
-    ):  # fmt: skip
+        ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"),
+        ({"format": "other"}, {}, "'other'"),
+        ({}, {"region_view": views.flip(0)}, "rising"),
+        ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
+        ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
+        ({"num_excluded": "15"}, {}, None),
+    ):
         save_arrays(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
         if message is None:
             assert Evidence.load(path).num_excluded == 15

@@ -45,9 +45,17 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "normlift"
 
     again = (
-        "--load-config", config, "--encoder", "colour", "--region-count", 16, "--vote-k", 6, "--timestamp",
+        "--load-config",
+        config,
+        "--encoder",
+        "colour",
+        "--region-count",
+        16,
+        "--vote-k",
+        6,
+        "--timestamp",
         "again",
-    )  # fmt: skip
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *again) == 0
     lifted = nl.open_run(config.parents[1] / "again" / "config.yml")
     assert lifted.ask("red").texts == ("red",)

@@ -111,28 +111,43 @@ def hostile_values() -> dict[str, list[object]]:
     parser, model, nan = "pipeline.datamanager.dataparser", "pipeline.model", float("nan")
     return {
         "experiment_name": [None, 3, "", "..", "a/b", "/etc", "a\\b", "x" * 256, "a\nb", "a\0b", ["a"]],
-        "method_name": ["a/b"], "timestamp": [None, 3, ".", "../x", "/tmp/x", True],
-        "output_dir": [None, 3, "outputs"], "relative_model_dir": [Path("/etc"), Path("../.."), None],
+        "method_name": ["a/b"],
+        "timestamp": [None, 3, ".", "../x", "/tmp/x", True],
+        "output_dir": [None, 3, "outputs"],
+        "relative_model_dir": [Path("/etc"), Path("../.."), None],
         "viewer.relative_log_filename": ["../../x", "/tmp/x", None],
-        "logging.relative_log_dir": [Path("/tmp"), Path("..")], "data": [5, ["scene"], {"a": 1}],
-        "pipeline": [None, "x", {}], "pipeline.datamanager": [None, {}],
-        "pipeline.datamanager.data": [1, "scene"], parser: [None, "x"], f"{parser}.data": [None, 5],
+        "logging.relative_log_dir": [Path("/tmp"), Path("..")],
+        "data": [5, ["scene"], {"a": 1}],
+        "pipeline": [None, "x", {}],
+        "pipeline.datamanager": [None, {}],
+        "pipeline.datamanager.data": [1, "scene"],
+        parser: [None, "x"],
+        f"{parser}.data": [None, 5],
         f"{parser}.scale_factor": [0.0, -1.0, nan, float("inf"), "1", None, True],
         f"{parser}.downscale_factor": [0, -2, 1.5, "2", True, 1025, 10**400],
-        f"{parser}.train_split_fraction": [0.0, 1.01, nan, None], f"{parser}.eval_interval": [0, -1, 2.5],
+        f"{parser}.train_split_fraction": [0.0, 1.01, nan, None],
+        f"{parser}.eval_interval": [0, -1, 2.5],
         f"{parser}.eval_mode": ["some", None, 1],
-        "pipeline.datamanager.camera_res_scale_factor": [0.0, -1.0, 1.01, float("inf")], model: [None, {}],
-        f"{model}.sh_degree": ["x", -1, 5, True, 1.0, None], f"{model}.sh_degree_interval": [0, -1],
-        f"{model}.rasterize_mode": ["fast", None, 1], f"{model}.background_color": ["pink", None, [0, 0, 0]],
-        f"{model}.camera_optimizer": [None, {}, "off"], f"{model}.camera_optimizer.mode": ["on", False, None],
-        "pipeline.lift": [None, {}], "pipeline.lift.max_views": [0, "all", 1.5],
-        "pipeline.lift.reliability_beta": ["x", nan], "pipeline.lift.vote": [None],
-        "pipeline.lift.vote.k": [0, 1.5, None], "pipeline.source.encoder": [None, 5],
-        "pipeline.queries": ["red", None, (1, 2), {"a": 1}], "machine": [None],
+        "pipeline.datamanager.camera_res_scale_factor": [0.0, -1.0, 1.01, float("inf")],
+        model: [None, {}],
+        f"{model}.sh_degree": ["x", -1, 5, True, 1.0, None],
+        f"{model}.sh_degree_interval": [0, -1],
+        f"{model}.rasterize_mode": ["fast", None, 1],
+        f"{model}.background_color": ["pink", None, [0, 0, 0]],
+        f"{model}.camera_optimizer": [None, {}, "off"],
+        f"{model}.camera_optimizer.mode": ["on", False, None],
+        "pipeline.lift": [None, {}],
+        "pipeline.lift.max_views": [0, "all", 1.5],
+        "pipeline.lift.reliability_beta": ["x", nan],
+        "pipeline.lift.vote": [None],
+        "pipeline.lift.vote.k": [0, 1.5, None],
+        "pipeline.source.encoder": [None, 5],
+        "pipeline.queries": ["red", None, (1, 2), {"a": 1}],
+        "machine": [None],
         "viewer.websocket_port": ["x"],
         "optimizers": [None, [], {"means": None}, {"means": {"optimizer": None, "scheduler": None}}],
         "optimizers.means": [{"optimizer": [], "scheduler": None}],
-    }  # fmt: skip
+    }
 
 
 def test_values_of_other_types_and_ranges_are_named(tmp_path: Path, texts: tuple[str, str]) -> None:
@@ -176,9 +191,12 @@ def test_missing_keys_are_named_unless_an_older_version_lacks_them(tmp_path: Pat
 def test_odd_yaml_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:
     text = texts[0]
     added = {
-        "timestamp: again": "twice", "x: " + "[" * 800 + "]" * 800: "nested too deeply",
-        "<<: {data: null}": "<<", "x: " + "y" * 2**18: f"{2**18:,}", "data: *nowhere": "YAML",
-    }  # fmt: skip
+        "timestamp: again": "twice",
+        "x: " + "[" * 800 + "]" * 800: "nested too deeply",
+        "<<: {data: null}": "<<",
+        "x: " + "y" * 2**18: f"{2**18:,}",
+        "data: *nowhere": "YAML",
+    }
     for line, problem in added.items():
         assert problem in refusal(tmp_path, f"{text}{line}\n"), line[:40]
     exchanged = {

@@ -68,9 +68,12 @@ def test_a_config_runs_no_code(tmp_path: Path) -> None:
     for value in (
         "object/apply:os.system ['touch hacked']",
         "object/apply:nerfstudio.engine.trainer.Path.touch ['hacked']",
-        "object/new:os.system ['touch hacked']", "object/apply:nerfstudio.engine.trainer.TrainerConfig []",
-        "object:subprocess.Popen {}", "name:nerfstudio.utils.scripts.run_command ''", "module:os ''",
-    ):  # fmt: skip
+        "object/new:os.system ['touch hacked']",
+        "object/apply:nerfstudio.engine.trainer.TrainerConfig []",
+        "object:subprocess.Popen {}",
+        "name:nerfstudio.utils.scripts.run_command ''",
+        "module:os ''",
+    ):
         with working_directory(tmp_path):
             refused(tmp_path / "config.yml", f"{HEADER}data: !!python/{value}\n", "line 3")
         assert os.listdir(tmp_path) == ["config.yml"], value

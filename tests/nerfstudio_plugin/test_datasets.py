@@ -104,15 +104,21 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
     cases: list[tuple[dict[str, Any] | str, str]] = [
         ({"frames": [frame]}, "1 cameras .* same position"),
         ({"frames": [frame, {**frame, "file_path": "images/001.jpg"}]}, "2 cameras .* same position"),
-        ({"frames": [{**frame, "transform_matrix": turned}]}, "NaN"), ({"w": 10**9}, "w is 1e[+]09"),
-        ({"w": 65536, "h": 65536}, "268,435,456 pixels"), ({"fl_x": -1}, "fl_x is -1"),
-        ({"k1": 1e38}, "k1 is 1e[+]38"), ({"fl_x": None}, "fl_x .* images/000.jpg"),
-        ({"camera_model": "CUBE"}, "CUBE"), ({"orientation_override": "sideways"}, "cannot read the dataset"),
+        ({"frames": [{**frame, "transform_matrix": turned}]}, "NaN"),
+        ({"w": 10**9}, "w is 1e[+]09"),
+        ({"w": 65536, "h": 65536}, "268,435,456 pixels"),
+        ({"fl_x": -1}, "fl_x is -1"),
+        ({"k1": 1e38}, "k1 is 1e[+]38"),
+        ({"fl_x": None}, "fl_x .* images/000.jpg"),
+        ({"camera_model": "CUBE"}, "CUBE"),
+        ({"orientation_override": "sideways"}, "cannot read the dataset"),
         ({"frames": [{**frame, "file_path": "images\0"}, *keep]}, "not a valid file name"),
-        ({"frames": [[[[[[[[]]]]]]]]}, "form"), ({"frames": []}, "has no frames"),
-        ({"w": 40}, "000.jpg is 48 x 36 pixels, but its camera has 40 x 36"), ("{}", "`frames`"),
+        ({"frames": [[[[[[[[]]]]]]]]}, "form"),
+        ({"frames": []}, "has no frames"),
+        ({"w": 40}, "000.jpg is 48 x 36 pixels, but its camera has 40 x 36"),
+        ("{}", "`frames`"),
         ("[" * 20_000, "JSON"),
-    ]  # fmt: skip
+    ]
     for content, message in cases:
         path.write_text(content if isinstance(content, str) else json.dumps(whole | content))
         with pytest.raises(InputError, match=message) as caught:

@@ -88,14 +88,23 @@ def store(folder: Path, facts: object, **tensors: torch.Tensor) -> Path:
 
 def test_facts_have_their_types_and_ranges(tmp_path: Path) -> None:
     for changes, message in (
-        ({"refined": "false"}, "bool.*str"), ({"refined": 0}, "bool.*int"),
-        ({"threshold": "0.5"}, "float.*str"), ({"threshold": True}, "float.*bool"),
-        ({"threshold": None}, "float.*null"), ({"threshold": float("nan")}, "malformed"),
-        ({"min_reliability": 1.5}, "float.*<= 1"), ({"min_reliability": -0.1}, "float.*>= 0"),
-        ({"texts": "a"}, "array.*str"), ({"texts": []}, "length >= 1"), ({"texts": [3]}, "str.*int"),
-        ({"texts": [" "]}, "regex"), ({"negatives": ["b"]}, "1 negatives"),
-        ({"form": "lerf"}, "'lerf'.*negatives"), ({"form": "dot"}, "'dot'"), ({"more": 1}, "`more`"),
-    ):  # fmt: skip
+        ({"refined": "false"}, "bool.*str"),
+        ({"refined": 0}, "bool.*int"),
+        ({"threshold": "0.5"}, "float.*str"),
+        ({"threshold": True}, "float.*bool"),
+        ({"threshold": None}, "float.*null"),
+        ({"threshold": float("nan")}, "malformed"),
+        ({"min_reliability": 1.5}, "float.*<= 1"),
+        ({"min_reliability": -0.1}, "float.*>= 0"),
+        ({"texts": "a"}, "array.*str"),
+        ({"texts": []}, "length >= 1"),
+        ({"texts": [3]}, "str.*int"),
+        ({"texts": [" "]}, "regex"),
+        ({"negatives": ["b"]}, "1 negatives"),
+        ({"form": "lerf"}, "'lerf'.*negatives"),
+        ({"form": "dot"}, "'dot'"),
+        ({"more": 1}, "`more`"),
+    ):
         store(tmp_path, {**FACTS, **changes})
         with damaged_question(message):
             load_query(tmp_path)
@@ -149,10 +158,14 @@ def test_vectors_fit_the_texts(tmp_path: Path) -> None:
 
 def test_a_question_that_could_not_be_loaded_is_not_stored(tmp_path: Path) -> None:
     for changes in (
-        {"threshold": float("nan")}, {"threshold": float("inf")}, {"min_reliability": 2.0},
-        {"texts": ("a", " ")}, {"embeddings": torch.zeros(2, 3)}, {"negatives": ()},
+        {"threshold": float("nan")},
+        {"threshold": float("inf")},
+        {"min_reliability": 2.0},
+        {"texts": ("a", " ")},
+        {"embeddings": torch.zeros(2, 3)},
+        {"negatives": ()},
         {"texts": ("a", "\ud800")},
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match="cannot be stored"):
             save_query(tmp_path, replace(WHOLE, **changes))  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []

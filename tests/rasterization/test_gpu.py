@@ -70,10 +70,14 @@ def test_gsplat_draws_what_its_compiled_code_can(on_gpu, monkeypatch):
         with pytest.raises(ValueError, match=rf"tile_size .*power of two.* {size};"):
             triton.check(job(on_gpu, tile_size=size))
     for installed, rules, changed in (
-        ("1.4.0", "1.4", None), ("1.4.0", "1.5", "per_axis, radius_sigmas"), ("1.5.3", "1.4", None),
-        ("1.5.3", "1.5", None), ("1.5.3", "1.6", "min_compensation, max_alpha"),
-        ("1.6.0", "1.4", "min_compensation, max_alpha"), ("1.6.0", "1.6", None),
-    ):  # fmt: skip
+        ("1.4.0", "1.4", None),
+        ("1.4.0", "1.5", "per_axis, radius_sigmas"),
+        ("1.5.3", "1.4", None),
+        ("1.5.3", "1.5", None),
+        ("1.5.3", "1.6", "min_compensation, max_alpha"),
+        ("1.6.0", "1.4", "min_compensation, max_alpha"),
+        ("1.6.0", "1.6", None),
+    ):
         monkeypatch.setattr(gsplat, "installed_gsplat_version", lambda installed=installed: installed)
         wanted = RasterJob(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
         if changed is None:

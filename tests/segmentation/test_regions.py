@@ -140,10 +140,13 @@ def test_another_size_is_refused_or_resampled_when_asked(tmp_path):
 
 def test_wrong_label_files_say_what_is_wrong(tmp_path):
     for content, parts in (
-        (MAP / 2, ["float64"]), (np.array([["a"]]), ["integer"]), (np.array([{}]), ["NPY"]),
-        (np.arange(3), ["(3,)", "[H, W]", "[levels, H, W]"]), (np.zeros((0, 2, 3), int), ["(0, 2, 3)"]),
+        (MAP / 2, ["float64"]),
+        (np.array([["a"]]), ["integer"]),
+        (np.array([{}]), ["NPY"]),
+        (np.arange(3), ["(3,)", "[H, W]", "[levels, H, W]"]),
+        (np.zeros((0, 2, 3), int), ["(0, 2, 3)"]),
         (b"\x93NUMPY\x01\x00", ["NPY"]),
-    ):  # fmt: skip
+    ):
         if isinstance(content, bytes):
             (tmp_path / "a.npy").write_bytes(content)
         else:

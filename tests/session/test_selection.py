@@ -124,12 +124,17 @@ def test_a_box_cuts_inside_outside_and_turned():
 
 def test_every_deed_is_undone_and_done_again():
     deeds = (
-        asked_red := lambda s: asked("red", s), lambda s: actions.click(s, ray(0), "add"),
+        asked_red := lambda s: asked("red", s),
+        lambda s: actions.click(s, ray(0), "add"),
         lambda s: actions.click(s, ray(BLOCK), "add"),
-        lambda s: actions.set_box(s, SelectionBox((0, 0, 0), (50, 50, 50))), actions.hide, asked_red,
-        lambda s: actions.set_threshold(s, 0.95), lambda s: actions.resize(s, 1), actions.clear,
+        lambda s: actions.set_box(s, SelectionBox((0, 0, 0), (50, 50, 50))),
+        actions.hide,
+        asked_red,
+        lambda s: actions.set_threshold(s, 0.95),
+        lambda s: actions.resize(s, 1),
+        actions.clear,
         actions.show_all,
-    )  # fmt: skip
+    )
     history, seen = History.of(State(world()), lean=State.without_caches), [(rows(), ~rows())]
     for deed in deeds:
         history = history.do(deed(history.now))

@@ -28,9 +28,17 @@ def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, re
     server.command(*splat)
     cameras = ("--transforms", place.folder / "room", "--world-transform", place.trained.parent / TRANSFORMS)
     common = (
-        "--encoder", "color", "--check-alignment", False, "--device", "cpu", "--vote-k", 6, "--storage",
+        "--encoder",
+        "color",
+        "--check-alignment",
+        False,
+        "--device",
+        "cpu",
+        "--vote-k",
+        6,
+        "--storage",
         "evidence",
-    )  # fmt: skip
+    )
     output = ("--timestamp", "ply", "--output-dir", place.folder / "outputs")
     server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *common, *output)
     result = tmp_path / "flips.json"
