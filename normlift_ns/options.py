@@ -725,12 +725,13 @@ class AskOptions:
     """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
     texture). color: none."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
-    """Relevancy formula. cosine: the cosine itself. lerf: the smallest softmax against any negative. margin:
-    the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
+    """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
+    lerf: the smallest softmax against any negative. margin: the cosine minus that of the best negative. auto: set by
+    the lift, which is contrast if it compared with unrelated words, else lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
-    relevancies. Default: set by the encoder (color: 0.5), else 0.5 for lerf, 0.02 for margin and auto for
-    cosine."""
+    relevancies. Default: set by the encoder (color: 0.7), else 0.5 for contrast and lerf, 0.02 for margin and auto
+    for cosine. A prompt that is probably not in the scene selects nothing, unless a number is given."""
     min_reliability: float = 0.0
     """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""
     refined: bool = True

@@ -418,7 +418,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         rows: Rows of `Answer.to_json`.
         rule: Selection rule for the title, such as lerf > 0.5.
         threshold: Threshold that each histogram marks with a bar |.
-        narrow: Leave out the histograms.
+        narrow: Leave out the histograms and the verdicts.
     """
     from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
@@ -429,20 +429,19 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         result.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
     if not narrow:
         result.add_column("histogram", no_wrap=True)
-    result.add_column("verdict", no_wrap=True)
+        result.add_column("verdict", no_wrap=True)
     result.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
         *cells, suggested = (common.format_number(row[name]) for name in names)
         bins = row["histogram"]
         bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
-        histogram = () if narrow else (common.plain_text(bars),)
+        wide = () if narrow else (common.plain_text(bars), row["verdict"] or "-")
         result.add_row(
             common.plain_text(row["text"]),
             f"{row['fraction']:.2%}",
             *cells,
-            *histogram,
-            row["verdict"] or "-",
+            *wide,
             suggested,
         )
     return result

@@ -47,6 +47,8 @@ _STRONG_CHROMA = 40.0
 _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Above 1, the lattice is denser among dark colors, whose coordinates change fast."""
+_OWN_SHARE = 0.2
+"""Weight of a color name's own color beside the mean of its shades; with less, pure blue would be nearer to purple."""
 _JITTER = 1e-10
 _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
 """Words of the survey that are accepted in prompts, but not suggested."""
@@ -97,9 +99,10 @@ class ColorEncoder(LazyTextEncoder):
 
 @cache
 def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
-    """Return the unit mean of the vectors of all colors whose names end in a color name."""
+    """Return the unit mean of the vectors of all colors whose names end in a color name, which itself counts a fifth."""
     shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
-    (row,) = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
+    family = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
+    (row,) = _normalized(_OWN_SHARE * embed_colors(_names()[name][None]) + (1 - _OWN_SHARE) * family)
     return row
 
 

@@ -38,11 +38,11 @@ def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Ten
     Args:
         encoder: settings of the encoder, as in the manifest.
     """
-    kind = find_encoder_kind(encoder["encoder"])
+    kind, file = find_encoder_kind(encoder.get("encoder")), encoder.get("text_vectors")
     if isinstance(source, PrecomputedFeatures):
         words: tuple[str, ...] = tuple(source.texts)
-    elif encoder["text_vectors"] is not None:
-        words = tuple(TextEmbeddingFile(Path(encoder["text_vectors"])).texts)
+    elif file is not None:
+        words = tuple(TextEmbeddingFile(Path(file)).texts)
     else:
         words = null_words() if kind is not None and kind.has_null_words else ()
     if len(words) < _FEWEST:

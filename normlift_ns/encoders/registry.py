@@ -70,7 +70,7 @@ class EncoderKind:
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     has_null_words: bool = True
     """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
-    suggested: float = 0.5
+    suggested: float = 0.6
     """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
     """Best cosines from which a prompt is a weak match, and from which it is found. None: see `query.presence`."""
@@ -231,15 +231,15 @@ COLOR = EncoderKind(
     _make_color_encoder,
     rule="cosine",
     negatives=(),
-    threshold="auto",
+    threshold=0.7,
     texts=_make_color_encoder,
     has_null_words=False,
     suggested=0.8,
-    present_from=(0.68, 0.78),
+    present_from=(0.66, 0.74),
     learned=False,
     is_here=lambda: True,
 )
-"""Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""
+"""Mean colors compared with color names: a shade has a cosine of 0.7 or more, another color less."""
 
 
 ENCODERS = Registry(

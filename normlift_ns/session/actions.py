@@ -32,8 +32,8 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Warning that the prompt is probably not in the scene, or that nothing reaches the threshold, with the nearest
-    match; empty if a selected match stands out, or if presence cannot be judged."""
+    """Verdict on a prompt that is not found, or warning that nothing reaches the threshold, with the nearest match;
+    empty otherwise."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 

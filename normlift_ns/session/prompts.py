@@ -121,8 +121,8 @@ def build_query(
 ) -> tuple[tuple[Prompt, ...], Query]:
     """Build the query of all rows that have a vector.
 
-    Clicks alone are compared by cosine, above the suggested threshold by default. Together with texts, clicks need the
-    rule cosine.
+    Clicks alone are compared by cosine, above the suggested threshold by default; they are in the scene, so the query
+    is not gated. Together with texts, clicks need the rule cosine.
 
     Args:
         read: encoder of the negatives. The other arguments are those of `make_query`.
@@ -144,7 +144,7 @@ def build_query(
         error: dict[str, Any] = {"vector": None, "error": _CLICK_RULE}
         rows = tuple(replace(p, **error) if p.is_click and p.vector is not None else p for p in rows)
         question = _question(field, rows, read, options)
-    return rows, question
+    return rows, replace(question, gated=question.gated and not all(clicks))
 
 
 def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, options: Mapping[str, Any]) -> Query:

@@ -56,7 +56,7 @@ def test_every_encoder_has_a_default_that_selects_something():
         ("open_clip", {"relevancy": "cosine", "threshold": 0.3}, 0.3, False),
         ("open_clip", {"relevancy": "margin"}, 0.02, False),
         ("open_clip", {"threshold": "auto"}, 0.5, True),
-        ("color", {}, 0.5, True),
+        ("color", {}, 0.7, False),
         ("color", {"threshold": "auto"}, 0.5, True),
         (None, {}, 0.5, True),
     ):
@@ -71,7 +71,7 @@ def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
     field = SemanticField.build(lifted, means, source)
     question = Query(("a", "b"), unit_rows(2, D, 3).float().numpy(), suggest_threshold=True)
     found = engine.run_query(field, means, question)
-    wanted = suggest_threshold(found.relevancy.numpy(), found.valid.numpy(), 0.5)
+    wanted = suggest_threshold(found.relevancy.numpy(), found.valid.numpy(), 0.6)
     assert (found.question.threshold, found.question.suggest_threshold) == (wanted, False)
     assert torch.equal(found.selected, (found.relevancy > wanted) & found.valid[:, None])
     assert bool(found.mask.any())

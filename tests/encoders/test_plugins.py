@@ -68,7 +68,7 @@ def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
-        expected = {"color": ("cosine", 0.5), "imagenet": ("cosine", "auto")}.get(name, ("lerf", 0.5))
+        expected = {"color": ("cosine", 0.7), "imagenet": ("cosine", "auto")}.get(name, ("lerf", 0.5))
         assert (kind.rule, kind.threshold) == expected
         assert isinstance(kind, encoders.EncoderKind)  # where packages of others import it from
 

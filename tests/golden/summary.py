@@ -43,7 +43,7 @@ VOTE = (
     0,
 )
 """Of version 0.1, which knew no consensus."""
-SINCE = {"stands_out", "nearest", "suggested_threshold", "histogram"}
+SINCE = {"verdict", "nearest", "suggested_threshold", "histogram"}
 """What an answer tells since."""
 NUMBERS = {"class_id", "instance_id"}
 """What exports tell since, in place of `label`, which is `class_id` - 1."""

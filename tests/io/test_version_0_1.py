@@ -8,15 +8,18 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from skimage.color import rgb2lab
 
 import normlift_ns as nl
 from normlift_ns.cli import evaluate, export, lift, query
+from normlift_ns.encoders.color import embed_colors
 from tests.cli.conftest import run_entry
 from tests.golden.summary import differences, without_news
 from tests.nerfstudio_plugin.stock_run import relocate_config
 
-QUERIES = {"lifted": ("--text", "red", "sky blue", "--threshold", 0.4), "trained": ("--text", "red")}
+QUERIES = {"lifted": ("red", "sky blue", "--threshold", 0.4), "trained": ("red", "--threshold", 0.5)}
 STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
 
 
@@ -29,8 +32,10 @@ def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("nerfstudio")
 def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    name, answers = config.parent.name, tmp_path / "answers.json"
-    flags = ("--load-config", config, *QUERIES[name], "--output-json", answers)
+    name, answers, texts = config.parent.name, tmp_path / "answers.json", tmp_path / "texts.npz"
+    colors = rgb2lab(np.array([[229, 0, 0], [117, 187, 253]]) / 255)  # a name was one color, without other shades
+    np.savez(texts, **dict(zip(("red", "sky blue"), embed_colors(colors).astype(np.float32))))
+    flags = ("--load-config", config, "--text-embeddings", texts, "--output-json", answers, "--text", *QUERIES[name])
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     before = json.loads((tmp_path / "old" / f"answers_{name}.json").read_text())
     assert differences(without_news(json.loads(answers.read_text())), before, 1e-5) == []
@@ -44,19 +49,8 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert run_entry(monkeypatch, evaluate.entrypoint, *scored) == 0
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "normlift"
 
-    again = (
-        "--load-config",
-        config,
-        "--encoder",
-        "colour",
-        "--region-count",
-        16,
-        "--vote-k",
-        6,
-        "--timestamp",
-        "again",
-    )
-    assert run_entry(monkeypatch, lift.entrypoint, *again) == 0
+    again = ("--encoder", "colour", "--region-count", 16, "--vote-k", 6, "--timestamp", "again")
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *again) == 0
     lifted = nl.open_run(config.parents[1] / "again" / "config.yml")
     assert lifted.ask("red").texts == ("red",)
 

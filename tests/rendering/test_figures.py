@@ -65,12 +65,12 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
     answer = SimpleNamespace(field=SimpleNamespace(scalars=scalars), question=SimpleNamespace(threshold=0.5))
     finding: Any = SimpleNamespace(
         text="x", answer=answer, mask=torch.tensor([True, False, True, False]), fraction=0.5, mean_reliability=0.5,
-        peak=0.9, stands_out=True,
+        peak=0.9, verdict="found",
     )  # fmt: skip
     for facts in ("50.0 %", "R 0.50", "3.0 views", "100 %", "R < 0.6"):
         assert facts in figures.FigureHeader.of(finding).summary
     finding.mask = torch.zeros(4, dtype=torch.bool)
     assert re.fullmatch(r"[^\d]* 0\.5; [^\d]* 0\.90", figures.FigureHeader.of(finding).summary)  # threshold and peak
-    for stands_out, alone in ((True, True), (False, False), (None, True)):  # None: nobody can tell
-        finding.stands_out = stands_out
-        assert (figures.FigureHeader.of(finding).title == "x") is alone
+    for verdict in ("found", "probably not here", None):  # None: nobody can tell
+        finding.verdict = verdict
+        assert figures.FigureHeader.of(finding).title.split("   ·   ") == ["x", verdict][: 1 + (verdict is not None)]
