@@ -102,17 +102,14 @@ def find_inventory(
     features: Float[Tensor, "s d"],
     means: Float[Tensor, "n 3"],
     spread: float,
-    *,
-    max_objects: int = MAX_OBJECTS,
 ) -> Int32[Tensor, " n"]:
     """Number the objects of a scene, 1 for the one with the most evidence; 0: none.
 
-    An object has at least 20 Gaussians, and at least a thousandth of the evidence of all images.
+    There are at most 20. An object has at least 20 Gaussians, and at least a thousandth of the evidence of all images.
 
     Args:
         features: one unit row per column (region) of the evidence.
         spread: 1 - median ||f_j||, the usual disagreement of the views about a Gaussian.
-        max_objects: largest number of objects.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))
@@ -120,7 +117,7 @@ def find_inventory(
     size, total = np.bincount(part), np.bincount(part, weight)
     order = np.argsort(-total, kind="stable")
     large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_SHARE * weight.sum()) & (total[order] > 0)
-    listed = order[large][:max_objects]
+    listed = order[large][:MAX_OBJECTS]
     number = np.zeros(len(size), np.int32)
     number[listed] = np.arange(1, len(listed) + 1)
     return torch.from_numpy(number[part]).to(means.device)
