@@ -564,7 +564,7 @@ def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names
     """Draw the outline of every mask, with its number and name where it is widest."""
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
-    canvas, size = image.clone().cpu(), max(12, max(height, width) // 50)
+    canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)
     outside = torch.nn.functional.pad((~masks).float(), (line,) * 4, value=1.0)
     border = masks & (torch.nn.functional.max_pool2d(outside, 2 * line + 1, stride=1) > 0)
     for number, edge in enumerate(border.cpu(), 1):
@@ -578,7 +578,8 @@ def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names
         y, x = divmod(int(inner.where(mask, -1.0).argmax()), width)
         text = str(number) if name == f"object {number}" else f"{number} {colors.clip_text(name, 24)}"
         place = {"text": text, "font": font, "anchor": "mm"}
-        draw.rectangle(draw.textbbox((x, y), **place), fill=(0, 0, 0))
+        left, top, right, bottom = draw.textbbox((x, y), **place)
+        draw.rectangle((left - line, top - line, right + line, bottom + line), fill=(0, 0, 0))
         draw.text((x, y), fill=object_color(number), **place)
     return picture
 
