@@ -85,7 +85,7 @@ class _Borders(NamedTuple):
     first: Int64[np.ndarray, " e"]
     second: Int64[np.ndarray, " e"]
     total: Float64[np.ndarray, " e"]
-    count: Float64[np.ndarray, " e"]
+    observed: Float64[np.ndarray, " e"]
 
     def joined(self, part: Int64[np.ndarray, " n"]) -> _Borders:
         """Return the borders between new parts, where part i becomes `part[i]`."""
@@ -93,7 +93,7 @@ class _Borders(NamedTuple):
         keep = first != second
         low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
         key, index = np.unique(low * len(part) + high, return_inverse=True)
-        sums = (np.bincount(index, x[keep], len(key)) for x in (self.total, self.count))
+        sums = (np.bincount(index, x[keep], len(key)) for x in (self.total, self.observed))
         return _Borders(key // len(part), key % len(part), *sums)
 
 
@@ -180,11 +180,11 @@ def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> 
 def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
     """Join Gaussians to parts; return the part of each, numbered from 0 without gaps."""
     part, size = np.arange(num_gaussians), np.ones(num_gaussians)
-    images = float(np.median(borders.count)) if len(borders.count) > 0 else 0.0
+    images = float(np.median(borders.observed)) if len(borders.observed) > 0 else 0.0
     for level in _LEVELS:
         while True:
             least = images * np.sqrt(np.minimum(size[borders.first], size[borders.second]))
-            affinity = borders.total / np.maximum(borders.count, least)
+            affinity = borders.total / np.maximum(borders.observed, least)
             target = _targets(borders, affinity, size, np.flatnonzero(affinity >= level))
             if np.array_equal(target, np.arange(len(size))):
                 break

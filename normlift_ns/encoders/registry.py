@@ -7,7 +7,7 @@ heavy.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -63,7 +63,7 @@ class EncoderKind:
     has_null_words: bool = True
     """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
     words: Callable[[], Sequence[str]] = tuple
-    """Returns the words that an inventory names objects by, the most natural for the encoder; (): none."""
+    """Returns the words that an inventory names objects by; (): none."""
     suggested: float = 0.5
     """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None

@@ -60,7 +60,8 @@ def test_parts_are_divided_where_images_agree(seam: int, cosine: float, objects:
 
 
 def test_nothing_is_listed_without_evidence() -> None:
-    nothing = Evidence.from_entries([Entries(*(torch.zeros(0, dtype=t) for t in (int, int, float)), (0,))], 30)
+    none = torch.zeros(0, dtype=torch.int64)
+    nothing = Evidence.from_entries([Entries(none, none, torch.zeros(0), (0,))], 30)
     assert find_inventory(nothing, torch.zeros(0, 4), torch.eye(30)[:, :3], 0.2).tolist() == [0] * 30
 
 
