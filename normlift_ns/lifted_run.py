@@ -18,7 +18,7 @@ from torch import Tensor
 
 from normlift_ns import exports
 from normlift_ns.analysis.explain import RecordedVotes, Why
-from normlift_ns.analysis.inventory import Inventory, as_instances, find_inventory, mean_directions
+from normlift_ns.analysis.inventory import Inventory, as_instances, best_words, find_inventory, mean_directions
 from normlift_ns.analysis.objects import (
     Catalogue,
     Floaters,
@@ -34,6 +34,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
+from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_run_files
@@ -56,10 +57,14 @@ from normlift_ns.options import (
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
 from normlift_ns.query.question import Query, load_query, make_query, save_query
-from normlift_ns.query.text_encoder import own_words, text_encoder_for, with_text_source
+from normlift_ns.query.text_encoder import encoder_name, own_words, text_encoder_for, with_text_source
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
+
+_MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
+"""Of a vocabulary of at least 100 words, so many objects of an inventory may have a wrong name by chance; the scene is
+represented by about 5,000 Gaussians."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,7 +370,8 @@ class LiftedRun:
         """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
 
         An object has a name only if the verdict on the best word of the vocabulary is "found" and the word selects more
-        than half of the object; else it is called "object 3".
+        than half of the object; else it is called "object 3". From 100 words, the word must also stand out from those
+        that would be best by chance, except for colors.
 
         Args:
             vocabulary: words to name objects by. If None, use those of the encoder: the 1,000 classes of imagenet, the
@@ -401,11 +407,17 @@ class LiftedRun:
     ) -> tuple[str, ...]:
         """Return the name of every object of an inventory."""
         names = [f"object {number}" for number in range(1, len(directions) + 1)]
-        if len(words) > 0 and len(names) > 0:
-            vectors = torch.from_numpy(self.texts.rows(words)).to(directions)
-            best = [words[index] for index in (directions @ vectors.T).argmax(dim=1).tolist()]
-            answer = self.ask(*dict.fromkeys(best))
-            for number, word in enumerate(best, 1):
+        if len(words) == 0 or len(names) == 0:
+            return tuple(names)
+        kind = find_encoder_kind(encoder_name(self.field))
+        absolute = len(words) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
+        sample = self.field.directions(torch.arange(0, len(self.field), max(1, len(self.field) // _SAMPLE)))
+        vectors = torch.from_numpy(self.texts.rows(words))
+        best = best_words(directions, sample, vectors, by_chance=float("inf") if absolute else _FALSE_NAMES)
+        chosen = {number: words[index] for number, index in enumerate(best, 1) if index is not None}
+        if len(chosen) > 0:
+            answer = self.ask(*dict.fromkeys(chosen.values()))
+            for number, word in chosen.items():
                 selected = answer[word].mask[instance_id == number]
                 if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
                     names[number - 1] = word

@@ -231,3 +231,30 @@ def mean_directions(
     weight = torch.zeros((count + 1) * evidence.num_regions, dtype=torch.float64, device=key.device)
     weight.index_add_(0, key, rows.weight.double())
     return torch.nn.functional.normalize(weight.view(count + 1, -1)[1:] @ features.to(weight), dim=1)
+
+
+def best_words(
+    directions: Float64[Tensor, "m d"], scene: Float[Tensor, "k d"], vectors: Float[Tensor, "w d"], *, by_chance: float
+) -> list[int | None]:
+    """Return the best word of every object; None where many words are as likely to be the best by chance.
+
+    Some words are near to everything. So the cosines of each word are standardized over the scene, and then those of
+    each object over the words. The best word must stay the best, and must exceed the value that `by_chance` of all
+    pairs of an object and a word would exceed if they were normally distributed.
+
+    Args:
+        directions: of the objects, from `mean_directions`.
+        scene: directions of a sample of the Gaussians of the scene.
+        vectors: one unit row per word.
+        by_chance: number of pairs that may exceed the limit; inf: no limit, and the best word need not stay the best.
+    """
+    cosine = directions @ vectors.to(directions).T
+    best = cosine.argmax(dim=1)
+    if by_chance == float("inf") or len(best) == 0:
+        return best.tolist()
+    usual = scene.to(directions) @ vectors.to(directions).T
+    score = (cosine - usual.mean(dim=0)) / usual.std(dim=0).clamp(min=1e-9)
+    score = (score - score.mean(dim=1, keepdim=True)) / score.std(dim=1, keepdim=True).clamp(min=1e-9)
+    limit = float(torch.special.ndtri(torch.tensor(1 - by_chance / (MAX_OBJECTS * len(vectors)), dtype=torch.float64)))
+    clear = (score.argmax(dim=1) == best) & (score.amax(dim=1) > limit)
+    return [word if stands_out else None for word, stands_out in zip(best.tolist(), clear.tolist())]
