@@ -7,7 +7,7 @@ heavy.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -70,6 +70,8 @@ class EncoderKind:
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     has_null_words: bool = True
     """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
+    words: Callable[[], Sequence[str]] = tuple
+    """Returns the words that an inventory names objects by; (): none."""
     suggested: float = 0.6
     """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
@@ -206,8 +208,15 @@ def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
     return ImageNetEncoder(device)
 
 
+def _imagenet_words() -> Sequence[str]:
+    from normlift_ns.encoders.imagenet import class_names  # noqa: PLC0415 (a file to read)
+
+    return tuple(dict.fromkeys(class_names()))
+
+
 IMAGENET_CLASSES = EncoderKind(
     _make_imagenet_encoder,
+    words=_imagenet_words,
     rule="cosine",
     negatives=(),
     threshold="auto",
@@ -227,8 +236,15 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     return ColorEncoder()
 
 
+def _color_words() -> Sequence[str]:
+    from normlift_ns.encoders.color import xkcd_colors  # noqa: PLC0415 (needs numpy)
+
+    return [name for name in xkcd_colors() if "/" not in name]
+
+
 COLOR = EncoderKind(
     _make_color_encoder,
+    words=_color_words,
     rule="cosine",
     negatives=(),
     threshold=0.7,

@@ -22,7 +22,7 @@ from normlift_ns.encoders.registry import (
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
-from normlift_ns.options import RelevancyRule, SourceOptions, names_of_0_2
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that determine the encoder or the text embeddings of a field; its manifest records them by their
@@ -202,6 +202,20 @@ def encoder_name(field: HasManifest) -> str | None:
     stored = field.manifest.get("encoder")
     name = stored.get("encoder") if isinstance(stored, Mapping) else None
     return name if isinstance(name, str) else None
+
+
+def own_words(field: HasManifest) -> tuple[str, ...]:
+    """Return the words that an inventory names objects by: those of the encoder, or of the file of text embeddings.
+
+    Raises:
+        ValueError, FileNotFoundError: the file is damaged or does not exist.
+    """
+    stored = field.manifest.get("encoder")
+    vectors = stored.get("text_vectors") if isinstance(stored, Mapping) else None
+    if vectors is not None:
+        return tuple(text for text in TextEmbeddingFile(Path(vectors)).texts if text not in CANONICAL_NEGATIVES)
+    kind = find_encoder_kind(encoder_name(field))
+    return () if kind is None else tuple(kind.words())
 
 
 def default_rule(field: HasManifest) -> DefaultRule:
