@@ -10,8 +10,8 @@ the plain room, cut into superpixels and into squares; words that are not in the
 survey whose cosine to every colour of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
-  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5), suggested, Otsu's, and
-                      the best for each class, which nobody knows
+  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
+                      Otsu's, and the best for each class, which nobody knows
   visible.<verdict>   % of the classes that get a verdict
   absent.<verdict>    % of the words that are not in the scene that get it
   auc.<statistic>     the chance that a class has more of a statistic than a word that is not in the scene
@@ -95,10 +95,11 @@ def measure(
         present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
         truth: [N] class, -1 where it is not known.
     """
-    position, valid = encoder_kind(encoder).suggested, np.ones(len(truth), bool)
+    kind, valid = encoder_kind(encoder), np.ones(len(truth), bool)
+    fixed = kind.threshold if kind.rule == rule and not isinstance(kind.threshold, str) else 0.5
 
     def of(values: np.ndarray) -> list[Histogram]:
-        found = [relevancy_histogram(x, valid, 0.5, position) for x in values.T]
+        found = [relevancy_histogram(x, valid, fixed, kind.suggested) for x in values.T]
         return [h for h in found if h is not None]
 
     there, elsewhere, known = of(present), of(absent), truth >= 0
@@ -107,7 +108,7 @@ def measure(
         x, y = present[known, q], truth[known] == q
         if y.sum() < 30:
             continue
-        thresholds = {"fixed": 0.5, "suggested": h.suggested, "otsu": otsu(present[:, q])}
+        thresholds = {"fixed": fixed, "suggested": h.suggested, "otsu": otsu(present[:, q])}
         for key, threshold in thresholds.items():
             found[key].append(iou(x, y, threshold))
         found["best"].append(max(iou(x, y, t) for t in np.quantile(x, np.linspace(0, 0.9995, 200))))

@@ -99,7 +99,7 @@ class ColorEncoder(LazyTextEncoder):
 
 @cache
 def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
-    """Return the unit mean of the vectors of all colors whose names end in a color name, which itself counts a fifth."""
+    """Return the unit mean of the vectors of all colors whose names end in a name; its own color counts a fifth."""
     shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
     family = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
     (row,) = _normalized(_OWN_SHARE * embed_colors(_names()[name][None]) + (1 - _OWN_SHARE) * family)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int64
 
 from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
+from normlift_ns.options import RelevancyRule
 from normlift_ns.query.presence import Verdict, judge
 from normlift_ns.query.question import Query, as_numpy
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
@@ -81,8 +82,8 @@ class Answer:
     selected: Bool[Tensor, "n q"]
     """True for Gaussians that are valid, above the threshold and reliable enough; none for a prompt that is
     probably not in the scene, if the query is gated."""
-    top_cosines: tuple[float, ...]
-    """Cosine to each prompt that one Gaussian in a thousand exceeds; 0 if no Gaussian has a direction."""
+    verdicts: tuple[Verdict | None, ...]
+    """The verdict on each prompt, whatever it selects."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -98,19 +99,6 @@ class Answer:
     def suggested_threshold(self) -> float | None:
         """One threshold for all prompts, which their relevancies suggest; None if no Gaussian has a direction."""
         return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid), suggested_position(self.field))
-
-    @cached_property
-    def verdicts(self) -> tuple[Verdict | None, ...]:
-        """The verdict on each prompt, whatever it selects."""
-        valid, name = as_numpy(self.valid), encoder_name(self.field)
-        if not valid.any():
-            return (None,) * len(self)
-        tops = np.quantile(as_numpy(self.relevancy)[valid], TOP_QUANTILE, axis=0)
-        rule, manifest = self.question.rule, self.field.manifest
-        return tuple(
-            judge(manifest, name, rule, top_cosine=cosine, top=float(top))
-            for cosine, top in zip(self.top_cosines, tops)
-        )
 
     def __len__(self) -> int:
         return len(self.texts)
@@ -219,8 +207,10 @@ class Finding:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """Whether the prompt is in the scene; None if nothing tells whether its cosines are large. A prompt that
-        selects something is at least a weak match."""
+        """Presence of the prompt in the scene; None if nothing tells whether its cosines are large.
+
+        A prompt that selects something is at least a weak match.
+        """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
@@ -307,11 +297,21 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     negative = field.null_levels(refined=question.refined) if question.rule == "contrast" else cosine[:, count:]
     relevancy = gaussian_relevancy(cosine[:, :count], negative, valid, question.rule)
     means = means if isinstance(means, np.ndarray) else means.detach()
-    labeled = as_numpy(cosine[:, :count][valid])
-    tops = np.quantile(labeled, TOP_QUANTILE, axis=0).tolist() if len(labeled) > 0 else [0.0] * count
+    verdicts = _judge_all(field, question.rule, as_numpy(cosine[:, :count][valid]), as_numpy(relevancy[valid]))
     selected = relevancy[:0] > 0
-    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, tuple(tops))
+    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, verdicts)
     return apply_threshold(unselected, question)
+
+
+def _judge_all(
+    field: HasManifest, rule: RelevancyRule, cosine: Float[np.ndarray, "m q"], relevancy: Float[np.ndarray, "m q"]
+) -> tuple[Verdict | None, ...]:
+    """Return the verdict on every prompt from the Gaussians that have a direction."""
+    if len(cosine) == 0:
+        return (None,) * cosine.shape[1]
+    tops = (np.quantile(values, TOP_QUANTILE, axis=0) for values in (cosine, relevancy))
+    name, manifest = encoder_name(field), field.manifest
+    return tuple(judge(manifest, name, rule, top_cosine=float(c), top=float(r)) for c, r in zip(*tops))
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:

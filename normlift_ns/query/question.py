@@ -20,7 +20,7 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import RelevancyRule, check_bool, check_number, renamed, short_repr
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
 
 
@@ -104,7 +104,8 @@ def make_query(
     if threshold is None:
         general = RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
         threshold = default.threshold if relevancy == default.rule else general
-    negatives = tuple(default.negatives if negatives is None else negatives)
+    needed = CANONICAL_NEGATIVES if RELEVANCY_RULES[relevancy].needs_negatives else ()
+    negatives = tuple((default.negatives or needed) if negatives is None else negatives)
     return Query(
         texts=tuple(texts),
         embeddings=encode(texts),

@@ -283,7 +283,7 @@ class FigureHeader:
     summary: str
     """Size of the selection and strength of its evidence."""
     verdict: Verdict | None = None
-    """Whether the prompt is in the scene."""
+    """Verdict on the presence of the prompt in the scene."""
 
     @property
     def title(self) -> str:
@@ -297,7 +297,7 @@ class FigureHeader:
         threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
             peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", verdict)
+            return FigureHeader(finding.text, f"nothing is selected above {threshold:g}{peak}", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
