@@ -536,7 +536,9 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
     median, top = np.quantile(similar[field.valid()], (0.5, 0.999))
-    assert torch.equal(clicked, (similar > median + 0.8 * (top - median)) & field.valid())
+    assert panel.state.query.threshold == pytest.approx(median + 0.8 * (top - median), abs=1e-4)
+    asked = field.query(panel.state.query.embeddings)[:, 0]
+    assert torch.equal(clicked, (asked > panel.state.query.threshold) & field.valid())
     threshold = panel.answer.question.threshold
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
