@@ -8,15 +8,12 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-from skimage.color import rgb2lab
 
 import normlift_ns as nl
 from normlift_ns.cli import evaluate, export, lift, query
-from normlift_ns.encoders.color import embed_colors
 from tests.cli.conftest import run_entry
-from tests.golden.summary import differences, without_news
+from tests.golden.summary import differences, single_colors, without_news
 from tests.nerfstudio_plugin.stock_run import relocate_config
 
 QUERIES = {"lifted": ("red", "sky blue", "--threshold", 0.4), "trained": ("red", "--threshold", 0.5)}
@@ -32,9 +29,8 @@ def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("nerfstudio")
 def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    name, answers, texts = config.parent.name, tmp_path / "answers.json", tmp_path / "texts.npz"
-    colors = rgb2lab(np.array([[229, 0, 0], [117, 187, 253]]) / 255)  # a name was one color, without other shades
-    np.savez(texts, **dict(zip(("red", "sky blue"), embed_colors(colors).astype(np.float32))))
+    name, answers = config.parent.name, tmp_path / "answers.json"
+    texts = single_colors(tmp_path / "texts.npz")
     flags = ("--load-config", config, "--text-embeddings", texts, "--output-json", answers, "--text", *QUERIES[name])
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     before = json.loads((tmp_path / "old" / f"answers_{name}.json").read_text())
