@@ -65,6 +65,7 @@ from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, make_query, save_query
 from normlift_ns.query.text_encoder import encoder_settings, precomputed_settings
 from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.segmentation.registry import describe_choice, resolve_source
 
 
 @renamed(check="check_alignment")
@@ -213,7 +214,10 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
     """Load encoders, open the scene, and name the new run; nothing is written."""
     device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
-    source = None if request.features is not None else make_source(options, device)  # raises before the scene loads
+    source = None
+    if request.features is None:
+        options = resolve_source(options, device)
+        source = make_source(options, device)  # raises before the scene loads
     if source is not None and len(request.queries) > 0:
         source.text(request.queries)
     scene = request.open_scene()
@@ -245,10 +249,14 @@ def check_target(prepared: PreparedLift) -> None:
 
 
 def announce(prepared: PreparedLift) -> None:
-    """Report the size of the lift, and the warnings of the scene."""
-    scene, most, say = prepared.scene, prepared.lift.max_views, prepared.request.say
+    """Report the size of the lift, the 2D features that were chosen automatically, and the warnings of the scene."""
+    request, scene, most, say = prepared.request, prepared.scene, prepared.lift.max_views, prepared.request.say
     used = "" if most is None else f"{min(most, len(scene.train))} of "
     say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
+    if request.features is None:
+        choice = describe_choice(request.source or SourceOptions(), prepared.device)
+        if choice is not None:
+            say(choice)
     for remark in scene.remarks:
         say(f"Warning: {remark}")
 

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
 from normlift_ns import exports
 from normlift_ns.analysis.explain import RecordedVotes, Why
+from normlift_ns.analysis.inventory import Inventory, as_instances, best_words, find_inventory, mean_directions
 from normlift_ns.analysis.objects import (
     Catalogue,
     Floaters,
@@ -33,6 +34,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
+from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import refuse_run_files
@@ -50,14 +52,19 @@ from normlift_ns.options import (
     check_bool,
     check_number,
     check_path,
+    check_prompt_list,
     renamed,
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
 from normlift_ns.query.question import Query, load_query, make_query, save_query
-from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
+from normlift_ns.query.text_encoder import encoder_name, own_words, text_encoder_for, with_text_source
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
+
+_MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
+"""Of a vocabulary of at least 100 words, so many objects of an inventory may have a wrong name by chance; the scene is
+represented by about 5,000 Gaussians."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -358,6 +365,63 @@ class LiftedRun:
         return make_catalogue(
             self.scene, self.field, instances, transform, meters_per_unit=meters_per_unit, device=self.device
         )
+
+    def inventory(self, vocabulary: Sequence[str] | None = None, *, meters_per_unit: float | None = None) -> Inventory:
+        """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
+
+        An object has a name only if the verdict on the best word of the vocabulary is "found" and the word selects more
+        than half of the object; else it is called "object 3". From 100 words, the word must also stand out from those
+        that would be best by chance, except for colors.
+
+        Args:
+            vocabulary: words to name objects by. If None, use those of the encoder: the 1,000 classes of imagenet, the
+                names of colors, or the texts given with features of your own. Others have none.
+            meters_per_unit: as in `catalogue`.
+        Raises:
+            ValueError: the encoder does not understand a word, or as in `why` and `catalogue`.
+            FileNotFoundError: as in `why` and `catalogue`.
+
+        >>> from normlift_ns import open_run
+        >>> inventory = open_run(config).inventory()
+        >>> [item.id for item in inventory.catalog.objects[:2]], inventory.mask(1).shape == inventory.instance_id.shape
+        ([1, 2], True)
+        """
+        if meters_per_unit is not None:
+            check_number("meters_per_unit", meters_per_unit)
+        words = own_words(self.field) if vocabulary is None else tuple(vocabulary)
+        check_prompt_list("vocabulary", words)
+        (evidence, features), norm = self.votes.table, self.field.scalars.norm
+        spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
+        means = self.scene.gaussians.means
+        instance_id = find_inventory(evidence, features, means, spread)
+        directions = mean_directions(evidence, features, instance_id)
+        names = self._names(instance_id, directions, words)
+        instances = as_instances(instance_id, names)
+        catalog = make_catalogue(
+            self.scene, self.field, instances, self.to_capture, meters_per_unit=meters_per_unit, device=self.device
+        )
+        return Inventory(instance_id, catalog)
+
+    def _names(
+        self, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], words: tuple[str, ...]
+    ) -> tuple[str, ...]:
+        """Return the name of every object of an inventory."""
+        names = [f"object {number}" for number in range(1, len(directions) + 1)]
+        if len(words) == 0 or len(names) == 0:
+            return tuple(names)
+        kind = find_encoder_kind(encoder_name(self.field))
+        absolute = len(words) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
+        sample = self.field.directions(torch.arange(0, len(self.field), max(1, len(self.field) // _SAMPLE)))
+        vectors = torch.from_numpy(self.texts.rows(words))
+        best = best_words(directions, sample, vectors, by_chance=float("inf") if absolute else _FALSE_NAMES)
+        chosen = {number: words[index] for number, index in enumerate(best, 1) if index is not None}
+        if len(chosen) > 0:
+            answer = self.ask(*dict.fromkeys(chosen.values()))
+            for number, word in chosen.items():
+                selected = answer[word].mask[instance_id == number]
+                if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
+                    names[number - 1] = word
+        return tuple(names)
 
     @property
     def to_capture(self) -> SimilarityTransform:

@@ -403,12 +403,12 @@ Background = Literal["black", "white"]
 """Background color behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
 """Storage of directions: the evidence itself (exact), float16, or float16 coordinates in a basis."""
-RelevancyRule = Literal["cosine", "lerf", "margin"]
+RelevancyRule = Literal["contrast", "cosine", "lerf", "margin"]
 """Formula for the relevancy of a prompt from its cosines; see `normlift_ns.relevancy`."""
 UnlabeledMode = Literal["ignore", "dilute"]
 """Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
 
-RegionKind = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
+RegionKind = Literal["auto", "sam", "sam3", "edges", "patches", "superpixel", "grid", "files"]
 """Built-in regions."""
 MASK_GROUP = "normlift_ns.masks"
 """Entry point group of mask sources, whose names are further regions."""
@@ -457,10 +457,13 @@ class SourceOptions:
     (3, True)
     """
 
-    encoder: str = "open_clip"
-    """Encoder of regions and prompts. open_clip: CLIP, on masked crops or on patches. siglip, siglip2, metaclip2: the
-    same with networks of the transformers library. color: mean colors compared with color names, without learned
-    weights. Any other name: an encoder from an installed plugin."""
+    encoder: str = "auto"
+    """Encoder of regions and prompts. auto: the first of open_clip, siglip2, siglip, metaclip2, imagenet and color
+    whose default weights are on this machine; nothing is downloaded. open_clip: CLIP, on masked crops or on patches.
+    siglip, siglip2, metaclip2: the same with networks of the transformers library. imagenet: a small classifier of
+    1,000 things, whose weights ns-normlift-weights --get imagenet fetches; prompts are names of these things or of
+    groups, such as dog. color: mean colors compared with color names, without learned weights. Any other name: an
+    encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
     defaults are google/siglip-base-patch16-224, google/siglip2-base-patch16-224 and
@@ -474,15 +477,17 @@ class SourceOptions:
     mean over seven OpenCLIP templates. {} alone is the bare prompt."""
     regions: str = "auto"
     """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
+    edges: regions between the edges that a small network finds, whose weights ns-normlift-weights --get edges fetches.
     patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
-    neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
-    cases use superpixel. Any other name: a mask source from an installed plugin."""
+    neural network uses sam on a GPU if SAM's weights are on this machine, else edges if those are, else its patches if
+    it has them; on a CPU, one that encodes crops prefers its patches to edges. All other cases use superpixel. Any
+    other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None
-    """Approximate number of regions per image, for superpixel, grid and patches; larger values give smaller regions.
-    Default: 256 for superpixel and grid, 1024 for patches."""
+    """Approximate number of regions per image, for superpixel, grid, patches and edges; larger values give smaller
+    regions. Default: 256 for superpixel and grid, 1024 for patches, the --level for edges."""
     sam_model: str | None = None
     """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of Meta's first SAM, or a name to
     download (such as facebook/sam2.1-hiera-large). Default: facebook/sam-vit-huge, as in LangSplat. --regions sam3
@@ -496,9 +501,10 @@ class SourceOptions:
     regions_resample: bool = False
     """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
     level: str | None = None
-    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
-    for subparts, parts or wholes (l if not given), or default for all of SAM's masks in one map. langsplat also accepts
-    sum, the sum of the vectors of all levels."""
+    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for about
+    300, 120 or 40 regions per image (m if not given). sam and langsplat: s, m or l for subparts, parts or wholes (l if
+    not given), or default for all of SAM's masks in one map. langsplat also accepts sum, the sum of the vectors of all
+    levels."""
     features: FeatureKind = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
     as written by LangSplat's preprocessing."""
@@ -719,12 +725,13 @@ class AskOptions:
     """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
     texture). color: none."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
-    """Relevancy formula. cosine: the cosine itself. lerf: the smallest softmax against any negative. margin:
-    the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
+    """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
+    lerf: the smallest softmax against any negative. margin: the cosine minus that of the best negative. auto: set by
+    the lift, which is contrast if it compared with unrelated words, else lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
-    relevancies. Default: set by the encoder (color: 0.5), else 0.5 for lerf, 0.02 for margin and auto for
-    cosine."""
+    relevancies. Default: set by the encoder (color: 0.7), else 0.5 for contrast and lerf, 0.02 for margin and auto
+    for cosine. A prompt that is probably not in the scene selects nothing, unless a number is given."""
     min_reliability: float = 0.0
     """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""
     refined: bool = True

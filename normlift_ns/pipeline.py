@@ -25,10 +25,12 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.core.null_level import with_null_level
 from normlift_ns.core.refine import clamp_k, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import (
     EvidenceCollection,
@@ -107,8 +109,15 @@ def lift_scene(
         field = SemanticField.build(
             lifted, means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
         )
+        field = add_null_level(field, source, encoder)
         step()
     return LiftResult(with_cost(field, stages, device), stages.seconds)
+
+
+def add_null_level(field: SemanticField, source: FeatureSource, encoder: Mapping[str, Any]) -> SemanticField:
+    """Return the field with the null level of its encoder's null vocabulary, or as it is if there is none."""
+    vectors = null_vectors(source, encoder)
+    return field if vectors is None else with_null_level(field, vectors)
 
 
 def plan_collection(
@@ -204,8 +213,8 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
         raise InputError(
             f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
             f"{_describe(source)}). Likely causes: every value in the label maps is negative or the background "
-            "(--regions-background), the level has no regions (--level), masks exclude everything, or the cameras do "
-            "not see the scene"
+            "(--regions-background), the level has no regions (--level), masks exclude everything, all features are "
+            "zero, or the cameras do not see the scene"
         )
     if lifted == 0:
         raise InputError(

@@ -33,14 +33,16 @@ from normlift_ns.core.refine import clamp_k
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.alignment import in_frustum
 from normlift_ns.encoders.base import FeatureSource, segmentation_workers
-from normlift_ns.encoders.build import make_source, resolve_regions
+from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
+from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
+from normlift_ns.segmentation.registry import resolve_source
 
 # Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
 
@@ -404,9 +406,9 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     """Describe the network weights that the options need and this machine does not have."""
     if options.features != "none":
         return []
-    missing = []
-    if (kind := resolve_regions(options, device)) in ("sam", "sam3"):
-        model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
+    options, missing = resolve_source(options, device), []
+    if options.regions in ("sam", "sam3"):
+        model = options.sam_model or (DEFAULT_SAM if options.regions == "sam" else DEFAULT_SAM3)
         if find_local_sam(model) is None:
             missing.append(f"those of SAM, {model}")
     family = MODEL_FAMILIES.get(options.encoder)
@@ -415,15 +417,21 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     model, weights = options.encoder_model, options.encoder_pretrained
     if options.encoder == "open_clip" and has_local_clip_weights(model, weights) is False:
         missing.append(f"those of OpenCLIP, {model} {weights}")
-    return missing
+    files = [file for file in (IMAGENET, EDGES) if file.name in (options.encoder, options.regions) and not file.is_here]
+    return missing + [f"those of {file.user} ({file.command})" for file in files]
 
 
 def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
-    message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
-    return Diagnostic("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+    message = f"not on this machine: {'; '.join(missing)}. Those of the hub are downloaded at their first use"
+    return Diagnostic(
+        "weights",
+        "warning",
+        message,
+        "fetch them now: see ns-normlift-weights; or give local files: --encoder-pretrained FILE, --sam-model FILE",
+    )
 
 
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
@@ -698,7 +706,8 @@ def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
     if len(missing) > 0:
         raise FileNotFoundError(
             f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
-            "Download them first, or give local files with --encoder-pretrained and --sam-model."
+            "Fetch them first (ns-normlift-weights lists all weights), or give local files with --encoder-pretrained "
+            "and --sam-model."
         )
     opened = open_capture(request, start_time)
     warning = compare_cameras(opened, lift, device) if request.check_alignment else None

@@ -16,7 +16,8 @@ from research.candidates import Candidate
 from research.damage import Observed, observe
 from research.features import LENGTHS, Looks, orthogonal_words, world_looks
 from research.pseudo_regions import Pieces, observe_pieces, pieces
-from research.rule import Cell, damage_of
+from research.real_features import FOX
+from research.rule import REAL, Cell, damage_of
 from research.second_room import second
 from research.synthetic_scenes import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from research.third_room import third
@@ -92,6 +93,8 @@ class Site:
         """What a lift gets in a cell."""
         if cell.statistic == "histogram":
             words, lengths = self.looks, None
+        elif cell.statistic == REAL:
+            return observe(self.world, self.words[REAL], damage_of(cell), seed, FOX)
         else:
             words, lengths = self.words[cell.statistic], LENGTHS[cell.statistic]
         if self.cut is None:
@@ -137,7 +140,8 @@ def base_world(scene: str, settings: Settings) -> World:
 def words_of(scene: str, classes: int) -> dict[str, Words]:
     """Vectors of the classes by statistic: CLIP's for the tabletop, made ones as close to each other for the rooms."""
     close = real_words() if scene == "tabletop" else made_words(classes)
-    return {name: orthogonal_words(classes) if name == "orthogonal" else close for name in LENGTHS}
+    apart = orthogonal_words(classes)
+    return {name: apart if name in ("orthogonal", REAL) else close for name in (*LENGTHS, REAL)}
 
 
 def sample_of(truth: Tensor, settings: Settings) -> Tensor | None:
@@ -165,7 +169,7 @@ def restricted(evidence: Evidence, kept: Tensor | None) -> Evidence:
 
 def ready(world: World, evidence: Evidence, device: str) -> World:
     """The world with other evidence, for observations on a device."""
-    order = world.azimuth_rank
+    kept = {key: getattr(world, key) for key in ("azimuth_rank", "angles", "parts")}
     moved = replace(world, evidence=evidence).to(device)
-    moved.__dict__["azimuth_rank"] = order
+    moved.__dict__.update(kept)
     return moved

@@ -16,7 +16,8 @@ from torch.nn.functional import normalize
 
 from normlift_ns import Evidence
 from research.features import Lengths, Looks, mask_features, mask_looks, mistaken
-from research.synthetic_scenes import Cells, Words, World, block_side
+from research.real_features import Cosines, Regions, real_features
+from research.synthetic_scenes import PARTS, Cells, Words, World, block_side
 
 LATER = 2**20
 """Added to the seed of what the steps after version 0.1's draw, so that the others keep their numbers."""
@@ -89,12 +90,14 @@ class Observed(NamedTuple):
     views: list[int]
 
 
-def observe(world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | None = None) -> Observed:
+def observe(
+    world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | Cosines | None = None
+) -> Observed:
     """Masks and features of the world after the damage. The same arguments give the same result on any device.
 
     Args:
         words: what features are made of; with `Looks` they are histograms of what the damaged masks show.
-        lengths: of the parts of features that are made of words.
+        lengths: of the parts of features that are made of words, or what they measure, in regions of parts of things.
     """
     g, later = (torch.Generator().manual_seed(seed + more) for more in (0, LATER))
     cells = world.cells
@@ -111,15 +114,22 @@ def observe(world: World, words: Words | Looks, damage: Damage, seed: int, lengt
     keep = torch.zeros(len(cells.maps), dtype=torch.bool)
     keep[chosen] = True
     key = torch.where(gone, -1, _key(cells.view, final, world.classes) * 2 + half)
+    pieces = 2
+    if isinstance(lengths, Cosines):  # regions of parts; what joins another mask joins one of its parts
+        pieces = 2 * PARTS
+        key = torch.where(gone, -1, key * PARTS + torch.where(final == label, world.parts, 0))
     present, index = key[keep[cells.view]].unique(return_inverse=True)
     index = index - int(len(present) > 0 and int(present[0]) < 0)
     present = present[present >= 0]
-    masks, view = present // 2 % world.classes, present // (2 * world.classes)
+    masks, view = present // pieces % world.classes, present // (pieces * world.classes)
     forced = _arc(world, words.classes, damage, later)[view, masks] if damage.arc > 0 else torch.full_like(masks, -1)
     if isinstance(words, Looks):
         whole = torch.full((len(cells.view),), -1)
         whole[keep[cells.view]] = index
         features = mask_looks(words, whole, masks, forced, damage.wrong, g)
+    elif isinstance(lengths, Cosines):
+        regions = Regions(view, masks, present % PARTS, forced)
+        features = real_features(words, regions, world.angles, damage.wrong, damage.noise, g, lengths)
     else:
         features = mask_features(words, masks, forced, damage.wrong, damage.noise, lengths or Lengths(), g)
     evidence = world.evidence

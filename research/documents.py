@@ -69,7 +69,8 @@ def documents() -> Documents:
     """All results files that the pages speak of, by their names."""
     names = (
         "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
-        "overhead", "grid", "segments", "planning_gpu", "agreement",
+        "overhead", "grid", "grid_real", "geometry", "segments", "planning_gpu",
+        "agreement",
     )  # fmt: skip
     return {name: read(RESULTS / f"{name}.json") for name in names}
 

@@ -1,4 +1,4 @@
-"""2D features of regions, by what an encoder's features are like: five statistics, pure functions with a generator.
+"""2D features of regions, by what an encoder's features are like: six statistics, pure functions with a generator.
 
 Made of words, the feature of a mask is normalise(t + C c + O o + N n): t the text vector of its class, c one direction
 that all image features share (the modality gap), o a direction of the object's own, n noise of this mask in this view.
@@ -13,6 +13,7 @@ in all directions.
 | low contrast | 0.90 | 0.85 | a long common direction |
 | orthogonal | 0.26 | 0 | texts in random directions, no modality gap |
 | histogram | as it is | as it is | colour and gradient of rendered pictures, see `looks` |
+| real | 0.39 to 0.77 | 0.22 | as measured on photographs, in `research.real_features`; decides nothing |
 
 The cosines are those of step "noise only" with 512 dimensions. The lengths of the noise of isotropic and orthogonal
 features are chosen so that, at step "noise", a single feature is about as often nearest to another class's text as a

@@ -4,6 +4,7 @@
     python -m research.grid --minutes 9           no new cell after so many minutes; the same command goes on later
     python -m research.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
                                                     for CPUs: a sample votes and counts
+    python -m research.grid --statistic real      cells of statistic real, which decide nothing: results/grid_real.json
     python -m research.grid --quick               a small plain room, three cells per kind of region, for the tests
 
 Every finished cell is one line of `--rows`, which a later call reads first. The decision so far is always printed;
@@ -30,7 +31,7 @@ from research.cells import Place, Settings, Site
 from research.grid_report import report_of, show
 from research.report import RESULTS
 from research.rows import append, read_rows
-from research.rule import CHOICE, CONFIRMATION, SEEDS, Cell, cells_of
+from research.rule import CHOICE, CONFIRMATION, REAL, SEEDS, Cell, cells_of, real_cells_of
 
 CHUNK = 50
 """Cells of one place that a worker takes at a time: whoever takes some first builds the place."""
@@ -94,10 +95,11 @@ def run_all(
         pool.starmap(run_cells, jobs, chunksize=1)
 
 
-def cells_to_run(scenes: Sequence[str], quick: bool) -> list[Cell]:
+def cells_to_run(scenes: Sequence[str], quick: bool, real: bool) -> list[Cell]:
     """All cells of the scenes, or a few of them."""
-    cells = [cell for scene in scenes for cell in cells_of(scene)]
-    return [cell for cell in cells if not quick or (cell[1:4] in QUICK_CELLS and cell.views in ("all", "3"))]
+    cells = [cell for scene in scenes for cell in (real_cells_of if real else cells_of)(scene)]
+    few = [(kind, REAL if real else statistic, damage) for kind, statistic, damage in QUICK_CELLS]
+    return [cell for cell in cells if not quick or (cell[1:4] in few and cell.views in ("all", "3"))]
 
 
 @torch.no_grad()
@@ -110,7 +112,8 @@ def main(arguments: argparse.Namespace) -> None:
     seeds = SEEDS[:2] if arguments.quick else SEEDS
     names = [one.name for one in CANDIDATES]
     sizes = {key: value for key, value in asdict(settings).items() if key != "device"}
-    cells = cells_to_run(scenes, arguments.quick)
+    real = arguments.statistic == REAL
+    cells = cells_to_run(scenes, arguments.quick, real)
     rows = finished(arguments.rows, run := {"seeds": list(seeds), "candidates": names, **sizes})
     missing = [cell for cell in cells if cell not in rows]
     print(f"{len(cells)} cells of {len(seeds)} seeds, {len(cells) - len(missing)} of them done before", flush=True)
@@ -121,7 +124,7 @@ def main(arguments: argparse.Namespace) -> None:
     print(f"{len(rows)} of {len(cells)} cells done, {spent:.0f} s in cells so far, {time.time() - start:.0f} s now")
     if len(rows) == 0:
         sys.exit("no cell is done")
-    report = report_of(rows, names, len(cells), sizes)
+    report = report_of(rows, names, len(cells), sizes, real=real)
     if len(rows) == len(cells) or arguments.report:
         report.write(arguments.output)
     show(report, names)
@@ -132,6 +135,7 @@ def main(arguments: argparse.Namespace) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=[*CHOICE, *CONFIRMATION], choices=[*CHOICE, *CONFIRMATION])
+    parser.add_argument("--statistic", choices=[REAL], help="run the cells of this statistic instead of the grid's")
     parser.add_argument("--voters", type=int, help="Gaussians of a scene that vote and count; all by default")
     parser.add_argument("--gaussians", type=int, help="of each room; 40,000 by default")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from research.report import Report
-from research.rule import CHOICE, CONFIRMATION, Cell, Decision, Verdict, cells_of, decide, mean
+from research.rule import CHOICE, CONFIRMATION, Cell, Verdict, cells_of, decide, mean
 
 FACTS = {
     "mean": "points, mean of all cells",
@@ -21,17 +21,22 @@ FACTS = {
     "column": "largest share of a damage or a number of views",
 }
 FINAL = "1: by all cells and Gaussians, 0: by some"
+DEFAULT = "consensus_posterior tau 0.9 gamma 0.05"
+"""What the grid chose, which has a column of its own for statistic real too."""
 AXES = ("kind", "statistic", "damage", "views")
 
 
-def report_of(rows: Mapping[Cell, Mapping[str, Any]], names: Sequence[str], expected: int, sizes: Mapping) -> Report:
+def report_of(
+    rows: Mapping[Cell, Mapping[str, Any]], names: Sequence[str], expected: int, sizes: Mapping, *, real: bool = False
+) -> Report:
     """All metrics of the rows of the grid.
 
     Args:
         expected: how many cells there are, done or not.
         sizes: settings of the run that are numbers or None.
+        real: the rows are of statistic real, and nothing is decided.
     """
-    report = Report("grid")
+    report = Report("grid_real" if real else "grid")
     report.add("cells", len(rows), f"of {expected}")
     for key, value in sizes.items():
         report.add(key, -1 if value is None else value, "-1: all, or the default")
@@ -45,24 +50,25 @@ def report_of(rows: Mapping[Cell, Mapping[str, Any]], names: Sequence[str], expe
         decision = decide(values, names)
         whole = set(rows) == {cell for scene in (*CHOICE, *CONFIRMATION) for cell in cells_of(scene)}
         final = whole and all(value is None for value in sizes.values())
-        report.add(f"decision.default.{decision.default}", final, FINAL)
-        report.add(f"decision.choice.{decision.choice}", final, FINAL)
-        if decision.confirmed is not None:
+        if not real:
+            report.add(f"decision.default.{decision.default}", final, FINAL)
+            report.add(f"decision.choice.{decision.choice}", final, FINAL)
+        if decision.confirmed is not None and not real:
             report.add(
                 "decision.confirmed", decision.confirmed, f"1: by {' and '.join(decision.confirmation)}, 0: refuted"
             )
         for group, verdicts in (("choice", decision.verdicts), *decision.confirmation.items()):
             for name, found in verdicts.items():
                 _add_verdict(report, f"{group}.{name}", name, found, groups[group])
-        for name in shown(names, decision):
+        for name in shown(names, DEFAULT if real else decision.choice):
             _add_columns(report, name, groups["choice"])
     return report
 
 
-def shown(names: Sequence[str], decision: Decision) -> list[str]:
+def shown(names: Sequence[str], choice: str) -> list[str]:
     """Candidates with a column of their own in the table by damage, statistic, kind and views."""
     methods = [name for name in names if " " not in name and name != "none"]
-    return [*methods, *(name for name in (decision.choice,) if name not in (*methods, "none"))]
+    return [*methods, *(name for name in (choice,) if name not in (*methods, "none"))]
 
 
 def _add_verdict(report: Report, key: str, name: str, found: Verdict, rows: Mapping[Cell, Mapping[str, Any]]) -> None:

@@ -5,6 +5,18 @@ from __future__ import annotations
 from research.documents import Document, table
 
 POINTS = {"mean": "mean", "undamaged": "loss undamaged", "three_views": "loss with 3 views", "worst": "worst loss"}
+COSINES = {
+    **{f"drift.{key}": f"one Gaussian, two views {key.replace('-', ' to ')} degrees apart"
+       for key in ("0-3", "3-6", "6-10", "10-20", "20-30", "30-60", "60-180")},
+    "thing.one_view": "two parts of one object, one view",
+    "thing.two_views": "two parts of one object, two views",
+    "two_things.two_views": "two objects, two views",
+    "own": "a feature and its own prompt",
+    "wrong": "a feature and the best wrong prompt of 11",
+    "spread": "spread of the lifted cosines within an object, as a share of their median",
+    "agreement": "agreement B of the regions",
+}  # fmt: skip
+"""Keys of geometry.json, without the capture, and their rows."""
 SHARES = {"worse": "worse cells", "column": "worst column", "copied": "copied"}
 
 
@@ -21,8 +33,21 @@ def verdicts(grid: Document, group: str) -> str:
     return table(("candidate", "gain", *POINTS.values(), *SHARES.values(), "rule"), rows)
 
 
-def columns(grid: Document) -> str:
-    """Gain, and gain in the worst cell, of the methods in every column of the grid."""
+def columns(grid: Document, real: Document) -> str:
+    """Gain, and gain in the worst cell, of the methods in every column of the grid, and of statistic real beside it."""
+    header, rows = _columns(grid)
+    last = max((i for i, row in enumerate(rows) if row[0].startswith("statistic: ")), default=-1)
+    beside = [row for row in _columns(real)[1] if row[0].startswith("statistic: ")]
+    return table(header, [*rows[: last + 1], *beside, *rows[last + 1 :]])
+
+
+def real_columns(real: Document) -> str:
+    """The columns of statistic real."""
+    header, rows = _columns(real)
+    return table(header, [row for row in rows if not row[0].startswith("kind: ")])
+
+
+def _columns(grid: Document) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     v, start, end = grid.values, "column.", ".gain"
     found = [key for key in v if key.startswith(start) and key.endswith(end)]
     keys = [key.removeprefix(start).removesuffix(end).split(".", 2) for key in found]
@@ -30,4 +55,13 @@ def columns(grid: Document) -> str:
     for axis, label in dict.fromkeys((axis, label) for axis, label, _ in keys):
         starts = (f"column.{axis}.{label}.{method}" for method in methods)
         rows.append((f"{axis}: {label}", *(f"{v[f'{x}.gain']:+.1f} ({-v[f'{x}.worst']:+.1f})" for x in starts)))
-    return table(("gain (worst cell)", *methods), rows)
+    return ("gain (worst cell)", *methods), rows
+
+
+def geometry(found: Document) -> str:
+    """Cosines on both captures."""
+    v, rows = found.values, []
+    for key, label in COSINES.items():
+        captures = (f"{v[x]:.3f}" if (x := f"{capture}.{key}") in v else "" for capture in ("fox", "tabletop"))
+        rows.append((label, *captures))
+    return table(("", "fox", "tabletop"), rows)

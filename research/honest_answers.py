@@ -1,4 +1,4 @@
-"""Thresholds suggested from histograms, and the word "probably not in this scene", against the truth.
+"""Thresholds suggested from histograms, and verdicts without a null vocabulary, against the truth.
 
     python -m research.honest_answers           plain room, and the tabletop where the captures are
     python -m research.honest_answers --scenes demo
@@ -10,10 +10,10 @@ the plain room, cut into superpixels and into squares; words that are not in the
 survey whose cosine to every colour of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
-  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5), suggested, Otsu's, and
-                      the best for each class, which nobody knows
-  called_absent       % of the classes of which the answer says that they are probably not in the scene
-  called_present      % of the words that are not in the scene of which it does not say so
+  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
+                      Otsu's, and the best for each class, which nobody knows
+  visible.<verdict>   % of the classes that get a verdict
+  absent.<verdict>    % of the words that are not in the scene that get it
   auc.<statistic>     the chance that a class has more of a statistic than a word that is not in the scene
 """
 
@@ -22,6 +22,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
@@ -32,8 +33,10 @@ from normlift_ns.core.lift import lift
 from normlift_ns.demo.capture import demo_cameras, view_image
 from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.registry import encoder_kind
 from normlift_ns.options import RefineConfig, RelevancyRule
-from normlift_ns.query.engine import Histogram, presence_limit, relevancy_histogram
+from normlift_ns.query.engine import Histogram, relevancy_histogram
+from normlift_ns.query.presence import Verdict, judge
 from normlift_ns.segmentation.regions import Grid, Superpixels
 from research.damage import LADDER, observe
 from research.report import RESULTS, Report
@@ -92,10 +95,11 @@ def measure(
         present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
         truth: [N] class, -1 where it is not known.
     """
-    limit, valid = presence_limit(rule, encoder), np.ones(len(truth), bool)
+    kind, valid = encoder_kind(encoder), np.ones(len(truth), bool)
+    fixed = kind.threshold if kind.rule == rule and not isinstance(kind.threshold, str) else 0.5
 
     def of(values: np.ndarray) -> list[Histogram]:
-        found = [relevancy_histogram(x, valid, threshold=0.5, limit=limit) for x in values.T]
+        found = [relevancy_histogram(x, valid, fixed, kind.suggested) for x in values.T]
         return [h for h in found if h is not None]
 
     there, elsewhere, known = of(present), of(absent), truth >= 0
@@ -104,15 +108,16 @@ def measure(
         x, y = present[known, q], truth[known] == q
         if y.sum() < 30:
             continue
-        thresholds = {"fixed": 0.5, "suggested": h.suggested, "otsu": otsu(present[:, q])}
+        thresholds = {"fixed": fixed, "suggested": h.suggested, "otsu": otsu(present[:, q])}
         for key, threshold in thresholds.items():
             found[key].append(iou(x, y, threshold))
         found["best"].append(max(iou(x, y, t) for t in np.quantile(x, np.linspace(0, 0.9995, 200))))
     for key, values in found.items():
         report.add(f"{name}.{rule}.iou.{key}", float(np.mean(values)), "of 1")
-    if limit is not None:
-        report.add(f"{name}.{rule}.called_absent", 100 * float(np.mean([not h.stands_out for h in there])), "%")
-        report.add(f"{name}.{rule}.called_present", 100 * float(np.mean([bool(h.stands_out) for h in elsewhere])), "%")
+    for key, histograms in (("visible", there), ("absent", elsewhere)):
+        verdicts = [judge({}, encoder, rule, top_cosine=h.top, top=h.top) for h in histograms]
+        for verdict in get_args(Verdict) if None not in verdicts else ():
+            report.add(f"{name}.{rule}.{key}.{verdict}", 100 * verdicts.count(verdict) / len(verdicts), "%")
     for key, statistic in STATISTICS.items():
         a, b = (
             [statistic(h, x) for h, x in zip(hs, values.T)] for hs, values in ((there, present), (elsewhere, absent))

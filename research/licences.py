@@ -1,4 +1,4 @@
-"""Licences of the packages that pyproject.toml names, as they state them: python -m research.licences"""
+"""Licences of the packages that pyproject.toml names, and of weights and words: python -m research.licences"""
 
 from __future__ import annotations
 
@@ -7,20 +7,47 @@ import sys
 from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
+from normlift_ns.cli.weights import WEIGHTS
+
 PAGE = Path(__file__).parents[1] / "docs" / "licences.md"
 _CLASSIFIER = "License :: OSI Approved :: "
-_USES = {"": "always", "sam": "extra `sam`", "siglip": "extra `siglip`", "dev": "development"}
+_USES = {
+    "": "always",
+    "sam": "extra `sam`",
+    "siglip": "extra `siglip`",
+    "imagenet": "extra `imagenet`",
+    "dev": "development",
+}
 _UNSTATED = {"gsplat": "Apache-2.0", "segment-anything": "Apache-2.0", "tomli": "MIT"}
 """As their repositories state it, of packages whose metadata state none, or that not every Python needs."""
 _SHORT = 60
 HEAD = """# Licences
 
 normlift_ns is under the Apache License 2.0. It contains no code of the packages below; pip installs them beside it,
-each under its own licence, here as the package states it. Weights of encoders have licences of their own. This page is
-made of what is installed: `python -m research.licences`.
+each under its own licence, here as the package states it. Weights and words have licences of their own, below. This
+page is made of what is installed: `python -m research.licences`.
 
 | package | licence | needed |
 |---|---|---|
+"""
+
+
+WEIGHTS_HEAD = """
+## Weights
+
+normlift_ns contains no weights. `ns-normlift-weights` lists them and `--get` fetches them from their publishers. Their
+licences are those that the publishers state. Whether terms of training data bind those who use the weights is a
+question of law that this page cannot answer.
+
+"""
+WORDS = """
+## Words
+
+`normlift_ns/encoders/imagenet_words.json`, the words that `--encoder imagenet` understands, is made from
+[WordNet 3.0](https://wordnet.princeton.edu) by `research/imagenet_words.py`. WordNet is copyright 2006 by Princeton
+University, and the file holds its license in full: use, copies, changes and distribution are free for any purpose, with
+the notice kept and without use of Princeton's name in advertising. `normlift_ns/encoders/xkcd.json` has the names of
+the [XKCD color survey](https://xkcd.com/color/rgb/), which are in the public domain (CC0).
 """
 
 
@@ -55,7 +82,13 @@ def licence(package: str) -> str:
 
 def page() -> str:
     """The whole page."""
-    return HEAD + "".join(f"| {name} | {licence(name)} | {use} |\n" for name, use in packages().items())
+    table = "".join(f"| {name} | {licence(name)} | {use} |\n" for name, use in packages().items())
+    weights = "".join(
+        f"- `{name}`, for `{entry.user}`, {entry.size} from {entry.origin}. License: {entry.license}. Training data: "
+        f"{entry.data}.\n"
+        for name, entry in WEIGHTS.items()
+    )
+    return HEAD + table + WEIGHTS_HEAD + weights + WORDS
 
 
 if __name__ == "__main__":

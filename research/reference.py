@@ -23,12 +23,14 @@ from normlift_ns.cli.export import NormLiftExport
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.query import NormLiftQuery
 from normlift_ns.cli.view import NormLiftView
+from normlift_ns.cli.weights import NormLiftWeights
 from normlift_ns.options import OPTION_RANGES, VOTE_FLAGS, RefineConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 COMMANDS: dict[str, type] = {
     "ns-normlift": NormLift,
     "ns-normlift-check": NormLiftCheck,
+    "ns-normlift-weights": NormLiftWeights,
     "ns-normlift-query": NormLiftQuery,
     "ns-normlift-view": NormLiftView,
     "ns-normlift-export": NormLiftExport,

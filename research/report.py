@@ -21,6 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
+NAMED = ("--quick", "--statistic", "real")
+"""Arguments that a report names."""
 PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat", "transformers")
 
 
@@ -48,7 +50,7 @@ class Report:
             "hardware": hardware(),
             "versions": {"python": platform.python_version(), **{x: version(x) for x in PACKAGES if find_spec(x)}},
             "command": " ".join(
-                ["python -m", f"research.{Path(sys.argv[0]).stem}", *(a for a in sys.argv[1:] if a == "--quick")]
+                ["python -m", f"research.{Path(sys.argv[0]).stem}", *(a for a in sys.argv[1:] if a in NAMED)]
             ),
             "metrics": [_row(metric) for metric in self.metrics],
         }

@@ -26,6 +26,10 @@ say nothing else than they do for masks; arc needs things. There remain "noise o
 Statistics are CLIP-like and histograms: isotropic, low contrast and orthogonal ones are left out to keep the run within
 minutes, because what distinguishes pieces is what they show, and these two span it from a word to a picture.
 
+*Statistic real* (`research.real_features`) came later, when a trained network had been measured on photographs. Its
+cells are those of masks again, 43 per scene, but regions are parts of objects. They are run and shown next to the
+others (`research.grid --statistic real`). They have no part in a decision: its grid stays as it was.
+
 That is 212 cells of masks and 87 of pieces per scene, 299 x 4 x 4 seeds = 4,784 observations.
 
 *Candidates* are those of `candidates.CANDIDATES`. One is **eligible** if, on the cells of tabletop and plain room,
@@ -63,6 +67,8 @@ VIEWS = {"all": None, "6": 6, "3": 3}
 FEW = "few views"
 PIECE_DAMAGES = ("noise only", "mild", "noise", "wrong classes", "dropped masks", FEW)
 PIECE_STATISTICS = ("clip", "histogram")
+REAL = "real"
+"""Statistic of cells that decide nothing."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,11 @@ class Cell(NamedTuple):
     def limit(self) -> int | None:
         """Number of views, None for all."""
         return STEPS[FEW].views if self.damage == FEW else VIEWS[self.views]
+
+
+def real_cells_of(scene: str) -> list[Cell]:
+    """The cells of a scene with statistic real, beside the grid."""
+    return [cell._replace(statistic=REAL) for cell in cells_of(scene) if cell[1:3] == ("masks", "clip")]
 
 
 def cells_of(scene: str) -> list[Cell]:

@@ -33,6 +33,8 @@ PIXEL_STEP = 4
 """Every so many pixels of held-out views, across and down, one is looked at."""
 SHADE = 0.3
 """Optical depth of all floaters together in the median view: they take a quarter of its light."""
+PARTS = 4
+"""Of every object, where regions are of parts."""
 PURITY, WEIGHT = 0.75, 1.0
 """A Gaussian has the class that holds this share of its weight in the exact masks of all training views, background
 included, if that weight is at least this many pixels; otherwise it does not count."""
@@ -101,6 +103,26 @@ class World:
             ranks.append(torch.atan2(beside[:, 1], beside[:, 0]).argsort().argsort())
         return torch.stack(ranks, dim=1)
 
+    @cached_property
+    def angles(self) -> Tensor:
+        """[K, V, V] degrees between the directions from the middle of each object to the training cameras."""
+        eyes = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in self.cameras])
+        means, truth, found = self.scene.means.double().cpu(), self.truth.cpu(), []
+        for c in range(self.classes):
+            of_class = truth == c
+            toward = normalize(eyes - means[of_class if bool(of_class.any()) else slice(None)].mean(0), dim=1)
+            found.append(torch.rad2deg((toward @ toward.T).clamp(-1, 1).acos()))
+        return torch.stack(found)
+
+    @cached_property
+    def parts(self) -> Tensor:
+        """[C] part of an object that most of a cell shows, see `Cells` and `parts_of`."""
+        part = parts_of(self.scene.means.cpu(), self.truth.cpu(), self.classes)
+        rows = self.evidence.rows.to("cpu")
+        weights = torch.zeros(len(self.cells.view), PARTS)
+        weights.index_put_((rows.column.long(), part[rows.row_index()]), rows.weight, accumulate=True)
+        return weights.argmax(1)
+
     def to(self, device: str) -> World:
         """Tensors of the lift on another device."""
         scene, evidence, truth = (x.to(device) for x in (self.scene, self.evidence, self.truth))
@@ -137,6 +159,24 @@ def cell_evidence(
     view = torch.repeat_interleave(torch.arange(views), counts)
     of_pixel = torch.stack(labels) + (counts.cumsum(0) - counts).int()[:, None, None]
     return evidence, Cells(view, torch.cat(masks), torch.cat(centres), maps.cpu(), of_pixel)
+
+
+def parts_of(means: Tensor, thing: Tensor, count: int) -> Tensor:
+    """[N] part of every Gaussian of a thing, 0 where it is of none: the nearest of points far from each other."""
+    part = torch.zeros(len(means), dtype=torch.int64)
+    for k in range(count):
+        of_thing = (thing == k).nonzero().squeeze(1)
+        if len(of_thing) == 0:
+            continue
+        places = means[of_thing]
+        nearest = torch.full((len(places),), torch.inf)
+        chosen = int((places - places.mean(0)).norm(dim=1).argmax())
+        for p in range(PARTS):
+            distance = (places - places[chosen]).norm(dim=1)
+            part[of_thing[distance < nearest]] = p
+            nearest = torch.minimum(nearest, distance)
+            chosen = int(nearest.argmax())
+    return part
 
 
 def truth_of(evidence: Evidence, cells: Cells, classes: int) -> Tensor:

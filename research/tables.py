@@ -5,7 +5,7 @@ from __future__ import annotations
 from research.accuracy_report import OTHERS
 from research.agreement import by_regions
 from research.documents import PRESETS, TITLES, Document, Documents, steps, table
-from research.grid_tables import columns, verdicts
+from research.grid_tables import columns, geometry, real_columns, verdicts
 from research.hard_case import DOUBLE, QUANTITIES
 from research.numerics import CASES
 from research.segments_tables import segments, segments_objects
@@ -48,7 +48,9 @@ def tables(found: Documents) -> dict[str, str]:
         "grid-choice": verdicts(found["grid"], "choice"),
         "grid-second": verdicts(found["grid"], "second"),
         "grid-third": verdicts(found["grid"], "third"),
-        "grid-columns": columns(found["grid"]),
+        "grid-columns": columns(found["grid"], found["grid_real"]),
+        "geometry": geometry(found["geometry"]),
+        "grid-real": real_columns(found["grid_real"]),
         "segments": segments(found["segments"]),
         "segments-objects": segments_objects(found["segments"]),
         "plans": plans(found["planning_gpu"]),

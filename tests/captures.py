@@ -1,7 +1,5 @@
 """The trained captures and fixtures that stand next to the repository on some machines, never in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

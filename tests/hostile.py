@@ -3,8 +3,6 @@
 Every loader raises `InputError`, or `FileNotFoundError`, or reads the file: see `survives`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import warnings

@@ -3,8 +3,6 @@
 Figures rest on it to the last bit, so it stays as it is. `normlift_ns.demo.room.demo_room` is the room that people see.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

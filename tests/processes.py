@@ -1,7 +1,5 @@
 """Processes for tests of what happens when several of them write at once, or are killed."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -6,8 +6,6 @@ It finds docstrings that begin with a question word, "is no X" for "is not an X"
 "if", and British spelling. `ALLOWED` and `SKIPPED` list the exceptions with their reasons.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import re

@@ -1,7 +1,5 @@
 """Small random scenes, cameras, label maps and evidence for tests; all from a seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

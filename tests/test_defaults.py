@@ -5,8 +5,6 @@ Changing one is a decision, so that it must be recorded; functions keep the test
 After a wanted change: NORMLIFT_WRITE=1 .venv/bin/pytest tests/test_defaults.py
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os

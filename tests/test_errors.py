@@ -1,7 +1,5 @@
 """What is said of errors, and where tracebacks go."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

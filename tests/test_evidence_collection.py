@@ -1,8 +1,6 @@
 """A lift with more views encodes and rasterizes the new ones only. Stored evidence is used again only if it is whole
 and that of the same views, rules and backend."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The front door: a run lifted, opened, asked, drawn and exported from Python."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings
@@ -138,6 +136,20 @@ def test_features_by_name_and_without_texts(trained: Path, scene: nl.Scene, tmp_
         run.ask("left")
 
 
+def test_zero_vectors_are_no_features(scene: nl.Scene, tmp_path: Path) -> None:
+    labels = torch.arange(160).expand(120, 160) // 80
+    zero, none = (labels, torch.eye(2) * torch.tensor([[1.0], [0.0]])), (-labels, torch.eye(2))
+    lift = nl.LiftOptions(refine=False, max_views=4)
+    runs = [
+        nl.lift_run(scene, features=[half] * 12, output_dir=tmp_path / name, lift=lift)
+        for name, half in (("zero", zero), ("none", none))
+    ]
+    first, second = (run.field.scalars.reliability for run in runs)
+    assert torch.equal(first, second) and 0 < int((first > 0).sum()) < len(first)
+    with pytest.raises(ValueError, match="nothing was labeled"):
+        nl.lift_run(scene, features=[(labels, 0 * torch.eye(2))] * 12, output_dir=tmp_path / "all", lift=lift)
+
+
 def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_path: Path) -> None:
     labels, vectors = torch.arange(160).expand(120, 160) // 80, torch.eye(2)
     half = (labels, vectors)
@@ -146,7 +158,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": {"nowhere.png": half}}, r"nowhere\.png"),
         ({"features": [(labels[:, :80], vectors)] * 12}, r"images/0000\.png .*\(120, 80\), .*\(120, 160\)"),
         ({"features": [(labels + 1, vectors)] * 12}, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
-        ({"features": [(labels, 0 * vectors)] * 12}, r"images/0000\.png must be \[regions, D\], finite"),
+        ({"features": [(labels, torch.nan * vectors)] * 12}, r"images/0000\.png must be \[regions, D\] and finite"),
         ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
         ({"features": []}, "^0 .* 12"),
         ({"features": {}}, "empty"),
@@ -235,7 +247,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
         run.ask(["red", "blue"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")
-    with pytest.raises(ValueError, match="auto, cosine, lerf, margin; got 'LERF'"):
+    with pytest.raises(ValueError, match="auto, contrast, cosine, lerf, margin; got 'LERF'"):
         run.ask("red", relevancy="LERF")  # type: ignore[arg-type]
     for wrong in (
         *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),

@@ -1,7 +1,5 @@
 """The table of options: what is in no range is refused by every dataclass of options, with a message that names it."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

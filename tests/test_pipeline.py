@@ -1,8 +1,6 @@
 """What a lift refuses or warns of, on a scene made by hand: nothing labelled, files shared by two images, label maps of
 photographs that were undistorted."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -17,16 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import (
-    Camera,
-    GaussianScene,
-    InputError,
-    LiftOptions,
-    RasterSettings,
-    RefineConfig,
-    evidence_collection,
-    pipeline,
-)
+import normlift_ns as nl
 from normlift_ns.core.consensus import consensus
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
@@ -46,13 +35,13 @@ from tests.random_scenes import Photographs, generator, made_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
 POSE = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
-CAMERA = Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), POSE, WIDTH, HEIGHT)
+CAMERA = nl.Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), POSE, WIDTH, HEIGHT)
 
 
 def scene(*names: str, count: int = N, held_out: Sequence[str] = (), mask: Any = None, **more: Any) -> Any:
     g = generator(0)
     means = torch.rand(count, 3, generator=g) - 0.5
-    gaussians = GaussianScene(
+    gaussians = nl.GaussianScene(
         means, torch.randn(count, 4, generator=g), torch.full((count, 3), 0.05), torch.full((count,), 0.8)
     )
     train, other = (
@@ -64,7 +53,7 @@ def scene(*names: str, count: int = N, held_out: Sequence[str] = (), mask: Any =
 
 def lifted(source: FeatureSource, cache: Path, made: Any = None, **options: Any) -> Any:
     export = options.pop("export", None)
-    given = LiftOptions(refine=False, **{"storage": "evidence", **options})
+    given = nl.LiftOptions(refine=False, **{"storage": "evidence", **options})
     return lift_scene(scene() if made is None else made, source, given, cache, encoder={}, export=export)
 
 
@@ -82,12 +71,12 @@ def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_
     for value in (0, -1, -5):
         for unlabeled in ("ignore", "dilute"):
             source = files(tmp_path / "maps", value * FULL)
-            with pytest.raises(InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
+            with pytest.raises(nl.InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
                 lifted(source, tmp_path / "cache", unlabeled=unlabeled)
     hidden, away = scene(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)), scene()
     away.gaussians.means[:] -= 100
     for made, why in ((hidden, "masks"), (away, "cameras")):
-        with pytest.raises(InputError, match=rf"nothing was labeled: .*{why}"):
+        with pytest.raises(nl.InputError, match=rf"nothing was labeled: .*{why}"):
             lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
     made = scene(count=3000)
     made.gaussians.means[5:, 2] -= 100  # behind the camera
@@ -101,15 +90,15 @@ def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_
 def test_images_that_share_a_label_map_or_exported_files_are_refused(tmp_path: Path) -> None:
     made = scene("a/0000.png", "b/0000.png")
     source = files(tmp_path / "maps", FULL, "0000")
-    with pytest.raises(InputError, match=r"a/0000\.png and b/0000\.png .*label map .*0000\.npy"):
+    with pytest.raises(nl.InputError, match=r"a/0000\.png and b/0000\.png .*label map .*0000\.npy"):
         lifted(source, tmp_path / "cache", made)
     lifted(files(tmp_path / "maps", FULL, "a/0000", "b/0000"), tmp_path / "cache", made)
     (tmp_path / "maps" / "b" / "0000.npy").unlink()
     (tmp_path / "maps" / "b" / "0000.npy").symlink_to(tmp_path / "maps" / "a" / "0000.npy")
-    with pytest.raises(InputError, match="label map"):
+    with pytest.raises(nl.InputError, match="label map"):
         lifted(source, tmp_path / "cache", made)
     made, source = scene("a/0.left.png", "b/0.right.png"), files(tmp_path / "maps", FULL, "a/0.left", "b/0.right")
-    with pytest.raises(InputError, match=r"a/0\.left\.png and b/0\.right\.png .*0_s\.npy"):
+    with pytest.raises(nl.InputError, match=r"a/0\.left\.png and b/0\.right\.png .*0_s\.npy"):
         lifted(source, tmp_path / "cache", made, export=FeatureExport(tmp_path / "out", True))
     assert not (tmp_path / "out").exists()
 
@@ -118,15 +107,15 @@ def test_images_that_share_an_instance_mask_and_labels_of_nothing_are_refused(tm
     (tmp_path / "labels.json").write_text('{"1": "a"}')
     np.save(tmp_path / "0000.npy", FULL)
     made = scene("a/0000.png", held_out=("b/0000.png",))
-    with pytest.raises(InputError, match=r"a/0000\.png and b/0000\.png .*instance mask .*0000\.npy"):
+    with pytest.raises(nl.InputError, match=r"a/0000\.png and b/0000\.png .*instance mask .*0000\.npy"):
         mask_truth(made, tmp_path, MaskOptions(names=tmp_path / "labels.json"))
     (tmp_path / "labels.json").write_text('{"2": "a"}')
-    with pytest.raises(InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
+    with pytest.raises(nl.InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
         mask_truth(scene("0000.png"), tmp_path, MaskOptions(names=tmp_path / "labels.json"))
     info = {"width": WIDTH, "height": HEIGHT}
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
     run = EvaluatedRun(scene("a/0000.png"), None, ColorEncoder(), True)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="have no objects"):
+    with pytest.raises(nl.InputError, match="have no objects"):
         run_lerf([run], [tmp_path], LerfOptions())
 
 
@@ -155,7 +144,7 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
                 for resample in (False, True)
             )
             message = rf"{kind}\S+ (of images/a\.png )?is {width}x{height} .*{what}; "
-            with pytest.raises(InputError, match=message + r".*24x18\. .*--regions-resample True"):
+            with pytest.raises(nl.InputError, match=message + r".*24x18\. .*--regions-resample True"):
                 lifted(refused, tmp_path / "cache", scene(original=RAW))
             with pytest.warns(UserWarning, match=message + ".*stretched"):
                 lifted(stretched, tmp_path / "cache", scene(original=RAW))
@@ -179,7 +168,7 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match="without changing its size"):
             lifted(source, cache, scene(original=(WIDTH, HEIGHT)))
     mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
-    with pytest.raises(InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera is \(18, 24\)"):
+    with pytest.raises(nl.InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera is \(18, 24\)"):
         lifted(files(tmp_path / "maps", FULL), cache, scene(mask=mask))
 
 
@@ -200,7 +189,7 @@ def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
         assert list(training_cameras(made, [name])) == ["b_0000"]
     assert list(training_cameras(made, ["0001", "a_0000"])) == ["0001", "a_0000"]
     for name, message in (("0000", "2 .*'0000'.* a_0000, b_0000"), ("c", "'c'.* 3 names from 'a_0000' to '0001'")):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(nl.InputError, match=message):
             training_cameras(made, [name])
 
 
@@ -220,15 +209,15 @@ def test_costs_are_seconds_their_sum_and_the_memory_of_this_process(monkeypatch)
 
 def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
     seen: list[torch.Tensor] = []
-    rasterize = pipeline.rasterize_evidence
+    rasterize = nl.pipeline.rasterize_evidence
 
     def watched(scene: Any, cameras: Any, labels: list[torch.Tensor], **how: Any) -> Any:
         seen.extend(labels)
         return rasterize(scene, cameras, labels, **how)
 
-    monkeypatch.setattr(pipeline, "rasterize_evidence", watched)
+    monkeypatch.setattr(nl.pipeline, "rasterize_evidence", watched)
     config = RasterConfig("1.4", "numba", torch.float32, "classic", 1)
-    pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, LiftOptions(), config).join()
+    nl.pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, nl.LiftOptions(), config).join()
     assert seen[0].shape == (HEIGHT, WIDTH)
     assert torch.bincount(seen[0].flatten()).tolist() == [HEIGHT * WIDTH // 4] * 4
 
@@ -237,7 +226,7 @@ def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
     """A stage that counts its own steps starts at none and ends with all of them."""
     monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 10)
     told: list[tuple[str, int, int]] = []
-    made, given = scene("a.png"), LiftOptions(refine=True, vote=RefineConfig(k=4))
+    made, given = scene("a.png"), nl.LiftOptions(refine=True, vote=nl.RefineConfig(k=4))
     source = files(tmp_path / "maps", FULL)
     lift_scene(made, source, given, tmp_path / "cache", encoder={}, report=lambda *step: told.append(step))
     for stage in ("neighbors", "vote"):
@@ -253,7 +242,7 @@ def test_the_manifest_says_what_rasterized_and_by_which_rules(tmp_path):
         found = lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made, gsplat_version=asked, backend="auto")
         assert found.field.manifest["gsplat_rules"] == rules
         assert found.field.manifest["backend"] == "numba"
-        assert RasterSettings.recorded(found.field.manifest) == RasterSettings.of_gsplat(rules)
+        assert nl.RasterSettings.recorded(found.field.manifest) == nl.RasterSettings.of_gsplat(rules)
 
 
 THREE = ("a.png", "b.png", "c.png")
@@ -273,10 +262,10 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
     told: list[str] = []
     results = []
     for on in (False, True, False):
-        given = LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
+        given = nl.LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
         how: Any = {"encoder": {}, "report": lambda stage, *_: told.append(stage)}
         results.append(lift_scene(scene(*THREE), source, given, tmp_path / "cache", **how))
-        monkeypatch.setattr(evidence_collection, "rasterize_evidence", None)
+        monkeypatch.setattr(nl.evidence_collection, "rasterize_evidence", None)
     assert "consensus" in told
     _, on, off = results
     assert "consensus" not in off.seconds and "consensus" not in off.field.manifest["statistics"]
@@ -300,11 +289,11 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
 def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """R and own evidence are those of the lift without consensus, directions those with it; voting again on the stored
     run takes the same numbers."""
-    source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=pipeline.refine)
-    monkeypatch.setattr(pipeline, "refine", watched)
+    source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=nl.pipeline.refine)
+    monkeypatch.setattr(nl.pipeline, "refine", watched)
     fields = []
     for on in (False, True):
-        options = LiftOptions(consensus=on, reliability_beta=0.7, vote=RefineConfig(vote="posterior", k=3))
+        options = nl.LiftOptions(consensus=on, reliability_beta=0.7, vote=nl.RefineConfig(vote="posterior", k=3))
         fields.append(lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field)
     first, second = watched.call_args_list
     assert torch.equal(first.args[2], second.args[2]) and torch.equal(first.kwargs["own"], second.kwargs["own"])
@@ -332,7 +321,7 @@ def test_levels_agree_each_for_itself(tmp_path: Path) -> None:
             own = rows[[0, 1, 2]] if name == "a.png" else rows[[2, 1, 0]]
             return ViewFeatures(cells, own, torch.tensor([[0, 0], [1, 2]], dtype=torch.int32))
 
-    given = LiftOptions(refine=False, consensus=True, storage="evidence")
+    given = nl.LiftOptions(refine=False, consensus=True, storage="evidence")
     found = lift_scene(scene("a.png", "b.png"), Both(), given, tmp_path, encoder={}).field
     assert len(found.manifest["statistics"]["consensus"]["agreement"]) == 2
     whole = torch.nn.functional.normalize(rows[0] + rows[2], dim=0)

@@ -1,7 +1,5 @@
 """What another system or an environment without nerfstudio lacks is not needed to load anything."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

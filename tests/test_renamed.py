@@ -156,7 +156,7 @@ def test_manifests_and_keys_of_version_0_2_stay_valid(tmp_path):
 def test_the_encoder_color_has_two_names():
     color, colour = (make_encoder(SourceOptions(encoder=name)) for name in ("color", "colour"))
     assert color.identity == colour.identity == {"kind": "colour", "sigma": 30.0}
-    with pytest.raises(InputError, match="unknown encoder 'purple'; --encoder is one of color, metaclip2"):
+    with pytest.raises(InputError, match="unknown encoder 'purple'; --encoder is one of color, imagenet, metaclip2"):
         make_encoder(SourceOptions(encoder="purple"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

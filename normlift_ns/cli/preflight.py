@@ -180,18 +180,20 @@ def check_unused_options(lift: LiftOptions) -> None:
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     """Check the folders, weights, levels and prompts of 2D features."""
-    from normlift_ns.encoders.registry import encoder_kind  # noqa: PLC0415 (not needed for --help)
+    from normlift_ns.encoders.registry import encoder_kind, with_encoder  # noqa: PLC0415 (not needed for --help)
     from normlift_ns.encoders.weights import is_local_path  # noqa: PLC0415
     from normlift_ns.segmentation.registry import check_mask_options, requested_regions  # noqa: PLC0415
 
-    texts = tuple(queries)
+    texts, source = tuple(queries), with_encoder(source)
     check_prompt_list("queries", texts)
     check_readable_folder(source.regions_dir, "--regions-dir")
     check_readable_folder(source.features_dir, "--features-dir")
     check_readable_file(source.text_embeddings, "--text-embeddings")
     name = requested_regions(source) if source.features == "none" else source.features
     if name != "auto":
-        check_mask_options(source.looking_for(texts), name)
+        masks = check_mask_options(source.looking_for(texts), name)
+        if masks.weights is not None:
+            masks.weights.check()
     if source.sam_model is not None and is_local_path(source.sam_model, 2):
         _existing_mode(Path(source.sam_model), "--sam-model")
     if source.prompt_template not in ("{}", "ensemble") and "{}" not in source.prompt_template:

@@ -99,6 +99,15 @@ class NormLiftQuery(CheckedOptions):
     boxes as meshes (objects.ply, objects_scene.ply). docs/objects.md explains every column."""
     meters_per_unit: float | None = None
     """Length of one capture unit in meters for --objects, > 0; positions and sizes are then in meters."""
+    inventory: bool = False
+    """List the objects of the scene without prompts: at most 20, those with the most evidence first, with the columns
+    of --objects. An object has a name if a word of the vocabulary is found there, else it is called object 3."""
+    vocabulary: Path | None = None
+    """Text file of words to name objects by with --inventory, one per line. Default: the words of the encoder, which
+    are the 1,000 classes for imagenet and the names of colors for color; none for others."""
+    image: Path | None = None
+    """PNG file of --inventory: the scene, from the training image that shows the most objects, with their outlines and
+    numbers."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -110,6 +119,8 @@ class NormLiftQuery(CheckedOptions):
         """Run the query, write files, print the table and return its rows."""
         self._check()
         common.info_opening(self.load_config)
+        if self.inventory:
+            return self._list_inventory()
         run = self._open()
         if self.stdin:
             answer_lines(run, self.ask.rules())
@@ -260,6 +271,28 @@ class NormLiftQuery(CheckedOptions):
             objects.write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
         return lambda: print_catalog(catalog)
 
+    def _list_inventory(self) -> list[dict[str, Any]]:
+        """Find the objects of the scene, write files, print the table and return its rows."""
+        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.rendering.figures import save_inventory  # noqa: PLC0415
+
+        words = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
+        run = open_run(self.load_config, data=self.data, device=self.device, **self.ask.encoding())
+        found = run.inventory(words, meters_per_unit=self.meters_per_unit)
+        document = found.catalog.to_json()
+        if self.output_json is not None:
+            write_text_file(self.output_json, json.dumps(document, indent=2) + "\n", overwrite=self.overwrite)
+        if self.objects_dir is not None:
+            write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
+        if self.image is not None:
+            save_inventory(run.scene, found, self.image, manifest=run.field.manifest, overwrite=self.overwrite)
+        print_catalog(found.catalog)
+        written = [path for path in (self.output_json, self.objects_dir, self.image) if path is not None]
+        if len(written) > 0:
+            common.info("Written: " + ", ".join(map(str, written)))
+        return document["objects"]
+
     def _check(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
@@ -268,7 +301,8 @@ class NormLiftQuery(CheckedOptions):
         outputs = [os.path.realpath(path) for path in (self.output_json, self.output_npz) if path is not None]
         if len(set(outputs)) < len(outputs):
             raise InputError(f"--output-json and --output-npz name the same file, {self.output_npz}")
-        for flag, path in (("--output-json", self.output_json), ("--output-npz", self.output_npz)):
+        files = (("--output-json", self.output_json), ("--output-npz", self.output_npz), ("--image", self.image))
+        for flag, path in files:
             check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.explain_dir, "--explain-dir")
@@ -278,7 +312,7 @@ class NormLiftQuery(CheckedOptions):
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
-        flags = [f"--{name}" for name in ("text", "stdin", "interactive") if getattr(self, name)]
+        flags = [f"--{name}" for name in ("text", "stdin", "interactive", "inventory") if getattr(self, name)]
         if len(flags) == 0:
             raise InputError(
                 'no prompts given; name at least one object to search for, such as --text "orange", or enter prompts '
@@ -287,7 +321,7 @@ class NormLiftQuery(CheckedOptions):
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
         for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
-            if flags != ["--text"] and getattr(self, name):
+            if flags != ["--text"] and getattr(self, name) and not (self.inventory and name == "output_json"):
                 raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
         self._check_dependent_options()
         if self.interactive and not sys.stdin.isatty():
@@ -302,8 +336,10 @@ class NormLiftQuery(CheckedOptions):
             ("explain_dir", self.explain, "--explain True"),
             ("segment_model", self.segment, "--segment sam3"),
             ("segment_views", self.segment, "--segment sam3"),
-            ("objects_dir", self.objects, "--objects True"),
-            ("meters_per_unit", self.objects, "--objects True"),
+            ("objects_dir", self.objects or self.inventory, "--objects True"),
+            ("meters_per_unit", self.objects or self.inventory, "--objects True"),
+            ("vocabulary", self.inventory, "--inventory True"),
+            ("image", self.inventory, "--inventory True"),
         ):
             if not needed and getattr(self, name) != getattr(type(self), name):
                 raise InputError(f"--{name.replace('_', '-')} has no effect without {flag}; add that flag")
@@ -314,6 +350,25 @@ class NormLiftQuery(CheckedOptions):
         views += ["contact_sheet"] if len(views) > 1 else []
         names = [f"{view}_{i}_{safe_file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
+
+
+def read_vocabulary(path: Path) -> list[str]:
+    """Read the words of a text file, one per line; empty lines are skipped.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not a text file in UTF-8, or has no word.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"--vocabulary {path} does not exist; give a text file with one word per line")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"--vocabulary {path} is not a text file in UTF-8 ({error}); save it as UTF-8") from error
+    words = list(dict.fromkeys(filter(None, map(str.strip, lines))))
+    if len(words) == 0:
+        raise InputError(f"--vocabulary {path} has no words; write one per line")
+    return words
 
 
 def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> None:
@@ -401,17 +456,14 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
-    """Print the table of an answer, and a note for each prompt that is probably not in the scene."""
+    """Print the table of an answer, and a note for each prompt that is not found."""
     rule = f"{question.rule} > {question.threshold:.4g}"
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
-        if row["stands_out"] is False:
-            top, limit = row["histogram"]["top"], row["histogram"]["limit"]
+        if row["verdict"] in ("weak match", "probably not here"):
+            top = row["histogram"]["top"]
             position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
-            common.info(
-                f"{row['text']}: probably not in this scene. The nearest match{position} has relevancy {top:.3f}; "
-                f"objects in a scene usually reach at least {limit:.3g}."
-            )
+            common.info(f"{row['text']}: {row['verdict']}. The nearest match{position} has relevancy {top:.3f}.")
 
 
 def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
@@ -421,7 +473,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         rows: Rows of `Answer.to_json`.
         rule: Selection rule for the title, such as lerf > 0.5.
         threshold: Threshold that each histogram marks with a bar |.
-        narrow: Leave out the histograms.
+        narrow: Leave out the histograms and the verdicts.
     """
     from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
@@ -432,14 +484,21 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         result.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
     if not narrow:
         result.add_column("histogram", no_wrap=True)
+        result.add_column("verdict", no_wrap=True)
     result.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         names = ("centroid", "extent", "peak", "mean_reliability", "suggested_threshold")
         *cells, suggested = (common.format_number(row[name]) for name in names)
         bins = row["histogram"]
         bars = "-" if bins is None else draw_histogram(bins["counts"], bins["low"], bins["high"], threshold)
-        histogram = () if narrow else (common.plain_text(bars),)
-        result.add_row(common.plain_text(row["text"]), f"{row['fraction']:.2%}", *cells, *histogram, suggested)
+        wide = () if narrow else (common.plain_text(bars), row["verdict"] or "-")
+        result.add_row(
+            common.plain_text(row["text"]),
+            f"{row['fraction']:.2%}",
+            *cells,
+            *wide,
+            suggested,
+        )
     return result
 
 

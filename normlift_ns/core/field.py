@@ -60,6 +60,8 @@ class SemanticField(TensorRecord):
     the means, and provenance."""
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
+    null_level: Float[Tensor, " n"] | None = None
+    """Null level of every Gaussian's own direction, see `core.null_level`; None without a null vocabulary."""
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -159,6 +161,12 @@ class SemanticField(TensorRecord):
         cosine = self.store.products(vectors / length, self.scalars)
         return cosine[self.source.long()] if refined else cosine
 
+    def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
+        """Return the null level of every Gaussian as one column; no column if the field has no null vocabulary."""
+        if self.null_level is None:
+            return self.scalars.norm.new_zeros(len(self), 0)
+        return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
+
     def relevancy(
         self,
         text_vectors: Float[Tensor, "q d"],
@@ -178,7 +186,8 @@ class SemanticField(TensorRecord):
         cosine = self.query(
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
         )
-        return gaussian_relevancy(cosine[:, :count], cosine[:, count:], self.valid(refined=refined), rule)
+        negative = self.null_levels(refined=refined) if rule == "contrast" else cosine[:, count:]
+        return gaussian_relevancy(cosine[:, :count], negative, self.valid(refined=refined), rule)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
@@ -207,7 +216,13 @@ class SemanticField(TensorRecord):
         # a folder without a manifest is incomplete and may be overwritten
         (folder / MANIFEST_FILE).unlink(missing_ok=True)
         stored = {"features": self.store.features} if isinstance(self.store, StoredEvidence) else vars(self.store)
-        named = {"source": self.source, "means": self.means, **vars(self.scalars), **stored}
+        named = {
+            "source": self.source,
+            "means": self.means,
+            "null_level": self.null_level,
+            **vars(self.scalars),
+            **stored,
+        }
         tensors = {name: tensor for name, tensor in named.items() if tensor is not None}
         digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, tensors, overwrite=True)}
         if isinstance(self.store, StoredEvidence):
@@ -240,7 +255,9 @@ class SemanticField(TensorRecord):
             store = StoredEvidence(Evidence.of_arrays(evidence), tensors["features"])
         else:
             store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
-        return SemanticField(scalars, tensors["source"], store, manifest, tensors.get("means"))
+        return SemanticField(
+            scalars, tensors["source"], store, manifest, tensors.get("means"), tensors.get("null_level")
+        )
 
 
 def choose_form(

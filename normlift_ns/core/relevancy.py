@@ -19,6 +19,8 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 """torch.Tensor or numpy.ndarray."""
 TEMPERATURE = 10.0
 """Factor of the cosines inside LERF's softmax."""
+TOP_QUANTILE = 0.999
+"""Quantile over Gaussians that is the best match of a text; a single stray Gaussian does not affect it."""
 _PRESENT = 0.62
 """Relevancy of rule lerf that objects in a scene usually reach."""
 
@@ -31,7 +33,7 @@ class RuleSettings(NamedTuple):
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     needs_negatives: bool
-    """True if the rule needs negative prompts."""
+    """True if the rule needs negative prompts. Rule contrast needs a null level instead, see `core.null_level`."""
     no_direction: float
     """Relevancy of a Gaussian without a direction, which no threshold selects."""
     display_min: float
@@ -58,6 +60,16 @@ def _namespace(array: Any) -> Any:
 
 
 RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
+    # As lerf, with the null level of the Gaussian as the only negative: at the threshold, the prompt is as near as the
+    # nearest unrelated words are.
+    "contrast": RuleSettings(
+        lambda positive, level, temperature: _sigmoid(temperature * _margin(positive, level)),
+        0.5,
+        False,
+        no_direction=0.0,
+        display_min=0.0,
+        presence_limit=_PRESENT,
+    ),
     # The threshold suits the color encoder, and queries without further information: see `query.question.make_query`.
     "cosine": RuleSettings(
         lambda positive, _, __: positive, 0.5, False, no_direction=0.0, display_min=0.0, presence_limit=None
@@ -96,7 +108,8 @@ def relevancy(
     Args:
         positive: cosine to each prompt, as tensor or NumPy array.
         negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
-        rule: "cosine" is the cosine itself, in -1..1. "lerf" is the softmax of the prompt against one negative, in
+        rule: "contrast" is "lerf" with a null level [..., 1] as the only negative. "cosine" is the cosine itself, in
+            -1..1. "lerf" is the softmax of the prompt against one negative, in
             0..1, at its minimum over the negatives; 0.5 is a draw (LERF, section 3.4). "margin" is the cosine minus
             the largest background cosine, in -2..2.
         temperature: factor of the cosines inside the softmax.
@@ -110,6 +123,8 @@ def relevancy(
     """
     if rule not in RELEVANCY_RULES:
         raise InputError(f"rule must be one of {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
+        raise InputError('rule "contrast" compares with the null level, which the field does not have; choose "cosine"')
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(
             f'rule "{rule}" compares with negative prompts; '

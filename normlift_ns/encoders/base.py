@@ -168,8 +168,9 @@ class Encoder(TextEncoder, Protocol):
     """A joint embedding space of image regions and text."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """Return one unit row per region, on the CPU. `labels` is one level of `Regions.labels`; a region consists of
-        all pixels that have its id at any depth."""
+        """Return one unit row per region, on the CPU; a zero row: the region has no feature, so its pixels count as
+        unlabeled. `labels` is one level of `Regions.labels`; a region consists of all pixels that have its id at any
+        depth."""
         ...
 
     def encode_each(
@@ -218,7 +219,9 @@ class RegionFeatures:
             cells, regions = pending.popleft()
             features = [rows, *islice(encoded, len(regions) - 1)]
             offsets = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
-            yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + offsets, -1))
+            yield ViewFeatures(
+                cells, *drop_zero_rows(torch.cat(features), torch.where(regions >= 0, regions + offsets, -1))
+            )
 
     def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
         """Return the image, on the CPU, and its label maps; check that they contain the selected levels."""
@@ -234,6 +237,19 @@ class RegionFeatures:
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
+
+
+def drop_zero_rows(
+    features: Float32[Tensor, "r d"], regions: Int32[Tensor, "*n"]
+) -> tuple[Float32[Tensor, "s d"], Int32[Tensor, "*n"]]:
+    """Return the features that are not zero, and the regions renumbered for them; -1: none.
+
+    >>> drop_zero_rows(torch.tensor([[0.0], [1.0]]), torch.tensor([0, 1, -1], dtype=torch.int32))
+    (tensor([[1.]]), tensor([-1,  0, -1], dtype=torch.int32))
+    """
+    found = features.any(dim=1)
+    number = torch.cat([torch.where(found, found.cumsum(0) - 1, -1), torch.tensor([-1])]).int()  # row -1
+    return features[found], number[regions.long()]
 
 
 def segmentation_workers(source: FeatureSource) -> int:
@@ -327,7 +343,7 @@ class DenseEncoder(Encoder, Protocol):
         ...
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """Return one unit row per patch of a grid over the image, row by row, on the CPU.
+        """Return one row per patch of a grid over the image, row by row, as `encode` does for regions.
 
         Raises:
             FileNotFoundError, ValueError: As `Encoder.encode`.
@@ -362,7 +378,8 @@ class PatchFeatures:
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         """Return the regions and features of one image; raises like `features`."""
-        return ViewFeatures(self.labels(image), self.features(image, name))
+        features, labels = drop_zero_rows(self.features(image, name), self.labels(image))
+        return ViewFeatures(labels, features)
 
     def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:
         """Return the nearest patch of every pixel, numbered row by row."""
@@ -372,7 +389,7 @@ class PatchFeatures:
         return torch.from_numpy(resample_nearest(patches, height, width)[0])
 
     def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float32[Tensor, "r d"]:
-        """Return one unit row per patch.
+        """Return one unit row per patch, or a zero row if it has no feature.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
@@ -415,7 +432,7 @@ class PrecomputedFeatures:
     """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings, on the CPU."""
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length > 0."""
+    """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length, 0 for none."""
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embeddings by text."""
 
@@ -445,7 +462,8 @@ class PrecomputedFeatures:
                 f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
                 "width, undistorted, after lift_downscale); pass labels of that size"
             )
-        return ViewFeatures(labels.int(), torch.from_numpy(unit_rows(vectors)))
+        vectors, labels = drop_zero_rows(vectors, labels.int())
+        return ViewFeatures(labels, torch.from_numpy(unit_rows(vectors)))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
@@ -461,8 +479,8 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
         texts: Vectors by text.
         names: Names of all training images.
     Raises:
-        ValueError: If `features` is empty or a list of another length. If vectors are zero, not finite, or not
-            [regions, D] ([D] for a text) with the same D everywhere. Also if labels are not an integer matrix, or name
+        ValueError: If `features` is empty or a list of another length. If vectors are not finite, or not [regions, D]
+            ([D] for a text, and not zero) with the same D everywhere. Also if labels are not an integer matrix, or name
             a region without a vector. Also if a text is empty, or cannot be a file name in an archive. The message
             names the image or the text.
     """
@@ -488,8 +506,8 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
 
 
 def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
-    """Return the labels and vectors of one image; raise InputError unless the labels name regions that have a vector
-    with a direction."""
+    """Return the labels and vectors of one image; raise InputError unless the labels name regions that have a
+    vector."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
     try:
@@ -499,8 +517,8 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     if labels.dtype.kind not in "iub":
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
-    if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
-        raise InputError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
+    if vectors.ndim != 2 or not bool(vectors.isfinite().all()):
+        raise InputError(f"vectors of {name} must be [regions, D] and finite; got {vectors.shape}")
     low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
     if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from normlift_ns.encoders.plugins import PluginRegions
 from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
-from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_regions
+from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_source
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -36,7 +36,8 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
         )
     if (file := options.text_embeddings) is not None:
         raise InputError(f"--text-embeddings {file} is for imported features; add --features langsplat")
-    name = resolve_regions(options, device)
+    options = resolve_source(options, device)
+    name = options.regions
     masks = _make_masks(options, name, device)
     return masks if MASK_SOURCES.load(name).has_features else RegionFeatures(masks, make_encoder(options, device))
 
@@ -56,8 +57,7 @@ _PATHS = ("regions_dir", "features_dir", "text_embeddings")
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
     """Return the options of a lift for its manifest, as JSON-serializable values. "auto" is resolved, and paths are
     absolute."""
-    if options.features == "none":
-        options = replace(options, regions=resolve_regions(options, device))
+    options = resolve_source(options, device)
     settings = {**asdict(options), **absolute_paths(options)}
     settings["sam_model"] = None if options.sam_model is None else absolute_if_exists(options.sam_model)
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}

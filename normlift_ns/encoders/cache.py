@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures
+from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures, drop_zero_rows
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import load_arrays, save_arrays
@@ -140,6 +140,7 @@ class CachedPatches(_Cached):
         if features is None:
             features = self.inner.features(image, name)
             _write(path, "features", features)
+        features, labels = drop_zero_rows(features, labels)
         return ViewFeatures(labels, features)
 
 
@@ -210,10 +211,11 @@ def _are_labels(labels: Tensor, image: Tensor) -> bool:
 
 
 def _are_units(rows: Tensor, count: int) -> bool:
-    """Return whether a cached tensor has `count` unit rows."""
+    """Return whether a cached tensor has `count` rows, each a unit vector or zero."""
     if rows.dtype != torch.float32 or rows.ndim != 2 or rows.shape[-1] == 0 or len(rows) != count:
         return False
-    return bool(((torch.linalg.vector_norm(rows, dim=-1) - 1).abs() < UNIT_TOLERANCE).all())
+    length = torch.linalg.vector_norm(rows, dim=-1)
+    return bool((((length - 1).abs() < UNIT_TOLERANCE) | (length == 0)).all())
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:

@@ -47,6 +47,8 @@ _STRONG_CHROMA = 40.0
 _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Above 1, the lattice is denser among dark colors, whose coordinates change fast."""
+_OWN_SHARE = 0.2
+"""Weight of a color name's own color beside the mean of its shades; with less, pure blue would be nearer to purple."""
 _JITTER = 1e-10
 _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
 """Words of the survey that are accepted in prompts, but not suggested."""
@@ -64,6 +66,8 @@ class ColorEncoder(LazyTextEncoder):
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.
 
+        A name means every color of the survey whose name ends in it: "red" is also brick red and dull red.
+
         Raises:
             ValueError: If `prompts` or a prompt is empty, or one contains no color name.
         """
@@ -73,7 +77,7 @@ class ColorEncoder(LazyTextEncoder):
             names = find_color_names(prompt)
             if len(names) == 0:
                 raise InputError(_no_color_message(prompt))
-            rows.append(embed_colors(np.stack([_names()[name] for name in names])).mean(axis=0))
+            rows.append(np.mean([_family_vector(name) for name in names], axis=0))
         return _normalized(np.stack(rows)).astype(np.float32)
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
@@ -91,6 +95,15 @@ class ColorEncoder(LazyTextEncoder):
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
         return (self.encode(image, labels) for image, labels in views)
+
+
+@cache
+def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
+    """Return the unit mean of the vectors of all colors whose names end in a name; its own color counts a fifth."""
+    shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
+    family = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
+    (row,) = _normalized(_OWN_SHARE * embed_colors(_names()[name][None]) + (1 - _OWN_SHARE) * family)
+    return row
 
 
 def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"]:
@@ -182,5 +195,6 @@ def _no_color_message(prompt: str) -> str:
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
         f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD "
-        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip for other words"
+        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip or imagenet for other "
+        "words (ns-normlift-weights lists their weights)"
     )

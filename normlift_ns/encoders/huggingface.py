@@ -413,7 +413,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
     return weights.third_party_errors(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded",
-        "connect to the internet once, give a folder with --encoder-model, or use the encoder that needs no weights: "
-        "--encoder color",
+        f"{weights.CONNECT_ONCE}, give a folder with --encoder-model, or use --encoder imagenet, whose weights come "
+        "from the Python index, or --encoder color, which needs none",
         FileNotFoundError,
     )

@@ -18,7 +18,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from normlift_ns.encoders.weights import check_hub_access, check_not_local, find_in_hub_cache, third_party_errors
+from normlift_ns.encoders.weights import (
+    CONNECT_ONCE,
+    check_hub_access,
+    check_not_local,
+    find_in_hub_cache,
+    third_party_errors,
+)
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
@@ -81,7 +87,7 @@ def _folder() -> Path:
 
 OPEN_CLIP_REMEDY = (
     "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
-    "the encoder that needs no weights: --encoder color"
+    "--encoder imagenet, whose weights come from the Python index, or --encoder color, which needs none"
 )
 
 
@@ -96,7 +102,7 @@ def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
     """
     if os.path.isfile(pretrained):
         return True
-    location = _hub_location(model, pretrained)
+    location = hub_location(model, pretrained)
     return find_cached_clip_weights(location) is not None if location else None
 
 
@@ -110,7 +116,7 @@ def find_cached_clip_weights(location: str) -> Path | None:
     return find_in_hub_cache(repository, *([name] if name else _WEIGHT_FILES))
 
 
-def _hub_location(model: str, tag: str) -> str | None:
+def hub_location(model: str, tag: str) -> str | None:
     """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
 
     The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
@@ -203,7 +209,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
         return path, published
     origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
     problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
-    remedy = f"connect to the internet once, {OPEN_CLIP_REMEDY}"
+    remedy = f"{CONNECT_ONCE}, {OPEN_CLIP_REMEDY}"
     with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
         if published.get("hf_hub"):
             check_hub_access()

@@ -26,7 +26,7 @@ from normlift_ns.encoders.open_clip import (
     open_clip_model_config,
 )
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
-from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.encoders.weights import CONNECT_ONCE, third_party_errors
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
 
@@ -92,7 +92,7 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     with third_party_errors(
         f"the tokenizer of OpenCLIP model {model} cannot be loaded",
-        "connect to the internet once, use a model with OpenCLIP's own tokenizer such as "
+        f"{CONNECT_ONCE}, use a model with OpenCLIP's own tokenizer such as "
         f"{DEFAULT_MODEL}, or use the encoder that needs none: --encoder color",
         FileNotFoundError,
     ):

@@ -50,8 +50,8 @@ class PluginEncoder(Encoder):
         return self._check_rows(rows, len(prompts), "texts")
 
     def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
-        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length
-        1."""
+        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length 1.
+        Rows of regions and patches may be zero."""
         if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
             received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
             raise InputError(
@@ -60,6 +60,7 @@ class PluginEncoder(Encoder):
             )
         rows = rows.detach().float().cpu()
         length = torch.linalg.vector_norm(rows, dim=1)
+        length = length if units == "texts" else length.where(length != 0, 1.0)
         if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
             raise InputError(
                 f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "

@@ -7,8 +7,9 @@ heavy.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,11 +20,19 @@ from normlift_ns.encoders.huggingface import (
     ModelFamily,
     check_huggingface_options,
     check_transformers_version,
+    find_local_model,
     resolve_model_name,
 )
-from normlift_ns.encoders.weights import check_hub_access, is_local_path, third_party_errors
+from normlift_ns.encoders.package_files import IMAGENET
+from normlift_ns.encoders.weights import CONNECT_ONCE, check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
-from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions
+from normlift_ns.options import (
+    CANONICAL_NEGATIVES,
+    DEFAULT_MODEL,
+    DEFAULT_PRETRAINED,
+    RelevancyRule,
+    SourceOptions,
+)
 from normlift_ns.registry import Registry
 
 if TYPE_CHECKING:
@@ -59,8 +68,20 @@ class EncoderKind:
     prompts, and the embeddings are cached."""
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
+    has_null_words: bool = True
+    """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
+    words: Callable[[], Sequence[str]] = tuple
+    """Returns the words that an inventory names objects by; (): none."""
+    suggested: float = 0.6
+    """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
+    present_from: tuple[float, float] | None = None
+    """Best cosines from which a prompt is a weak match, and from which it is found. None: see `query.presence`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
+    pools: bool = False
+    """True if it encodes an image once and averages inside regions, so that regions cost no more than patches."""
+    is_here: Callable[[], bool] = lambda: False
+    """Returns whether `--encoder auto` may choose it: its default weights and its packages are on this machine."""
     paths: tuple[str, ...] = ()
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
@@ -131,7 +152,7 @@ def _check_weights(options: SourceOptions) -> None:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
     if open_clip.has_local_clip_weights(model, pretrained) is False:
         problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
-        with third_party_errors(problem, f"connect to the internet once, {remedy}", FileNotFoundError):
+        with third_party_errors(problem, f"{CONNECT_ONCE}, {remedy}", FileNotFoundError):
             check_hub_access()
 
 
@@ -140,6 +161,7 @@ OPEN_CLIP = EncoderKind(
     check=_check_weights,
     texts=_make_texts,
     has_patches=lambda options: open_clip.missing_patches_reason(options.encoder_model) is None,
+    is_here=lambda: open_clip.has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED) is True,
     paths=("encoder_pretrained",),
 )
 """CLIP features of masked crops, or of patches."""
@@ -164,11 +186,46 @@ def _make_kind(family: ModelFamily) -> EncoderKind:
         model = resolve_model_name(options, family)
         return HuggingFaceEncoder(family, model, options.crop_fill, device, options.prompt_template)
 
+    def is_here() -> bool:
+        with suppress(InputError):
+            check_transformers_version(family)
+            return find_local_model(family.default_model) is not None
+        return False
+
     check = partial(check_huggingface_options, family=family)
-    return EncoderKind(make, check=check, has_patches=lambda options: True, paths=("encoder_model",))
+    return EncoderKind(make, check=check, has_patches=lambda options: True, is_here=is_here, paths=("encoder_model",))
 
 
 SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(MODEL_FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))
+
+
+def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
+    from normlift_ns.encoders.imagenet_network import ImageNetEncoder  # noqa: PLC0415 (needs torch)
+
+    for name in _options_of_clip(options):
+        flag = f"--{name.replace('_', '-')} {getattr(options, name)}"
+        raise InputError(f"{flag} has no effect on --encoder imagenet; leave it out")
+    return ImageNetEncoder(device)
+
+
+def _imagenet_words() -> Sequence[str]:
+    from normlift_ns.encoders.imagenet import class_names  # noqa: PLC0415 (a file to read)
+
+    return tuple(dict.fromkeys(class_names()))
+
+
+IMAGENET_CLASSES = EncoderKind(
+    _make_imagenet_encoder,
+    words=_imagenet_words,
+    rule="cosine",
+    negatives=(),
+    threshold="auto",
+    check=lambda options: IMAGENET.check(),
+    has_patches=lambda options: True,
+    pools=True,
+    is_here=lambda: IMAGENET.is_here,
+)
+"""Dense features of a classifier, compared with the vectors of its classes."""
 
 
 def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
@@ -179,14 +236,33 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     return ColorEncoder()
 
 
-COLOR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_make_color_encoder, learned=False)
-"""Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""
+def _color_words() -> Sequence[str]:
+    from normlift_ns.encoders.color import xkcd_colors  # noqa: PLC0415 (needs numpy)
+
+    return [name for name in xkcd_colors() if "/" not in name]
+
+
+COLOR = EncoderKind(
+    _make_color_encoder,
+    words=_color_words,
+    rule="cosine",
+    negatives=(),
+    threshold=0.7,
+    texts=_make_color_encoder,
+    has_null_words=False,
+    suggested=0.8,
+    present_from=(0.66, 0.74),
+    learned=False,
+    is_here=lambda: True,
+)
+"""Mean colors compared with color names: a shade has a cosine of 0.7 or more, another color less."""
 
 
 ENCODERS = Registry(
     "normlift_ns.encoders",
     {
         **{name: f"normlift_ns.encoders.registry:{name.upper()}" for name in ("open_clip", *MODEL_FAMILIES)},
+        "imagenet": "normlift_ns.encoders.registry:IMAGENET_CLASSES",
         "color": "normlift_ns.encoders.registry:COLOR",
     },
     EncoderKind,
@@ -195,6 +271,28 @@ ENCODERS = Registry(
     "open_clip",
 )
 """Encoders by their `--encoder` names."""
+
+
+_PREFERENCE = ("open_clip", "siglip2", "siglip", "metaclip2", "imagenet", "color")
+"""Encoders of `--encoder auto`, the best first; the last is on every machine."""
+
+
+def _options_of_clip(options: SourceOptions) -> list[str]:
+    """Return the names of options that are set and that networks trained with captions alone take."""
+    names, default = ("encoder_model", "encoder_pretrained", "prompt_template"), SourceOptions()
+    return [name for name in names if getattr(options, name) != getattr(default, name)]
+
+
+def with_encoder(options: SourceOptions) -> SourceOptions:
+    """Return the options with an encoder in place of "auto": the best that is on this machine.
+
+    Options of OpenCLIP, and features of LangSplat, which are OpenCLIP's, stand for `open_clip`.
+    """
+    if options.encoder != "auto":
+        return options
+    if options.features == "langsplat" or len(_options_of_clip(options)) > 0:
+        return replace(options, encoder="open_clip")
+    return replace(options, encoder=next(name for name in _PREFERENCE if ENCODERS.load(name).is_here()))
 
 
 def canonical_name(encoder: str) -> str:
@@ -246,6 +344,7 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     """
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)
 
+    options = with_encoder(options)
     kind = encoder_kind(options.encoder)
     if canonical_name(options.encoder) in ENCODERS.built_in:
         return kind.make(options, device)

@@ -19,6 +19,8 @@ CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
+CONNECT_ONCE = "connect to the internet once (ns-normlift-weights lists all weights and fetches them)"
+"""Advice in messages about missing weights."""
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 """Names of the weight files of SAM in the format of transformers."""
@@ -56,13 +58,18 @@ def find_cached_model(name: str, weight_files: Sequence[str]) -> Path | None:
 def find_in_hub_cache(repository: str, *names: str) -> Path | None:
     """Return the path of the first of these files that the Hugging Face hub cache holds in the main revision of a
     repository, or None. Needs no network."""
-    constants = importlib.import_module("huggingface_hub.constants")
-    folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
+    folder = hub_folder(repository)
     try:
         snapshot = folder / "snapshots" / (folder / "refs" / "main").read_text("utf8").strip()
         return next((snapshot / name for name in names if os.path.isfile(snapshot / name)), None)
     except (OSError, ValueError):
         return None
+
+
+def hub_folder(repository: str) -> Path:
+    """Return the folder of a repository in the Hugging Face hub cache, which may not exist."""
+    constants = importlib.import_module("huggingface_hub.constants")
+    return Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
 
 
 def check_hub_access() -> None:

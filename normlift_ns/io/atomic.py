@@ -76,7 +76,7 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
 _NO_REPLACE, _EXCHANGE = 1, 2
 _AT_FDCWD = -100
 """Relative paths start at the working directory."""
-_LOCK_TIMEOUT = 10.0
+_LOCK_TIMEOUT = 60.0
 """Seconds to wait for a lock; normlift_ns itself holds one only briefly."""
 _UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
 """Errors of kernels, file systems and containers that do not support renameat2."""
@@ -115,7 +115,7 @@ def release_lock(descriptor: int | None) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, after waiting for it for at most 10 seconds.
+    """Hold the lock of a folder, after waiting for it for at most a minute.
 
     If the lock is still taken then, continue without it: another program may hold it for as long as it runs.
     """

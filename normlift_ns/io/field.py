@@ -157,6 +157,8 @@ def _check_field(
             check_array("means", np.nan_to_num(arrays["means"]), "float32", (n, 3), -FLOAT32_MAX)
         for name in SCALAR_NAMES:
             check_array(name, arrays[name], "int32" if name == "view_count" else "float32", (n,), 0)
+        if "null_level" in arrays:
+            check_array("null_level", arrays["null_level"], "float32", (n,), -1.001, 1.001)
         if evidence is not None:
             check_array("features", arrays["features"], "float32", (len(evidence.region_view), dimension), -FLOAT32_MAX)
             if len(evidence.rows.offsets) - 1 != n:

@@ -210,7 +210,7 @@ class PanelWidgets(ActionWidgets):
                 hint = "Prompts to compare with, separated by commas."
                 self.negatives = gui.add_text("Negatives", "", hint=hint)
                 rules = ("auto", *RELEVANCY_RULES)
-                self.rule = gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
+                self.rule = gui.add_dropdown("Relevancy", rules, "auto", hint="Only lerf and margin use negatives.")
                 refined = gui.add_checkbox("Refined", True, hint="Use refined features.")
                 self.refined = self._input(Action.REFINED, refined)
         gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=KEYS_SCRIPT))
@@ -326,7 +326,7 @@ class SearchPanel(Controller):
         self._host = host
         self._viewer: Any = None
         self._folder: Path | None = None
-        self._negatives = ""
+        self._negatives = self._default_negatives = ""
         self._colormap: Colormap = COLORMAPS[0]
         self._overlay_due = False
         self._detail_turns = RequestTokens()
@@ -357,9 +357,8 @@ class SearchPanel(Controller):
         """
         with self._lock:
             self._folder, state = folder, State(SelectionContext(field, means))
-            if question is None:
-                self._set_default_negatives(field)
-            else:
+            self._set_default_negatives(field)
+            if question is not None:
                 state = actions.ask(state, prompts_of_query(question), question)
                 self._negatives = join_prompts(question.negatives)
                 self._set_prompts(join_prompts(question.texts))
@@ -396,7 +395,7 @@ class SearchPanel(Controller):
 
     def _set_default_negatives(self, field: SemanticField) -> None:
         with suppress(ValueError, OSError):  # a missing file of text embeddings is reported when it is needed
-            self._negatives = join_prompts(default_rule(field).negatives)
+            self._negatives = self._default_negatives = join_prompts(default_rule(field).negatives)
 
     def _discard(self) -> None:
         super()._discard()
@@ -434,7 +433,8 @@ class SearchPanel(Controller):
         return vectors
 
     def _query_settings(self) -> dict[str, Any]:
-        settings: dict[str, Any] = {"negatives": split_prompts(self._negatives)}
+        usual = self._negatives == self._default_negatives
+        settings: dict[str, Any] = {"negatives": None if usual else split_prompts(self._negatives)}
         if (widgets := self._widgets) is not None:
             chosen = {"relevancy": widgets.rule, "min_reliability": widgets.reliability, "refined": widgets.refined}
             settings |= {name: widget.value for name, widget in chosen.items()}

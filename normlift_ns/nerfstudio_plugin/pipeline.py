@@ -32,6 +32,7 @@ from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.query.question import save_query
 from normlift_ns.query.text_encoder import encoder_settings
+from normlift_ns.segmentation.registry import describe_choice
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -169,6 +170,9 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     pipeline: Any = trainer.pipeline
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
+    choice = describe_choice(_source_options(trainer.config), str(pipeline.device))
+    if choice is not None:
+        CONSOLE.print(choice, markup=False, soft_wrap=True)
     scene = load_nerfstudio_scene(path)
     source = feature_source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)

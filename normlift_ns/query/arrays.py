@@ -42,6 +42,13 @@ class ArrayField(FieldArrays):
         mask = self.arrays["norm"] > 0
         return mask[self.arrays["source"]] if refined else mask
 
+    def null_levels(self, *, refined: bool = True) -> Float[np.ndarray, "n levels"]:
+        """Return the null levels, as `SemanticField.null_levels`."""
+        level = self.arrays.get("null_level")
+        if level is None:
+            return np.zeros((len(self.arrays["norm"]), 0), np.float32)
+        return (level[self.arrays["source"]] if refined else level)[:, None]
+
     def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Float32[np.ndarray, "n q"]:
         """Return the cosines of `SemanticField.query`.
 

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from normlift_ns.core.relevancy import RELEVANCY_RULES, gaussian_relevancy
+from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy
+from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.options import RelevancyRule
+from normlift_ns.query.presence import Verdict, judge
 from normlift_ns.query.question import Query, as_numpy
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
 
@@ -44,6 +46,10 @@ class QueryField(HasManifest, Protocol):
 
     def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Any:
         """Return the cosine of every Gaussian's direction to Q vectors."""
+        ...
+
+    def null_levels(self, *, refined: bool = True) -> Any:
+        """Return the null level of every Gaussian as one column, or no column."""
         ...
 
 
@@ -74,7 +80,10 @@ class Answer:
     valid: Bool[Tensor, " n"]
     """True for Gaussians that have a direction."""
     selected: Bool[Tensor, "n q"]
-    """True for Gaussians that are valid, above the threshold and reliable enough."""
+    """True for Gaussians that are valid, above the threshold and reliable enough; none for a prompt that is
+    probably not in the scene, if the query is gated."""
+    verdicts: tuple[Verdict | None, ...]
+    """The verdict on each prompt, whatever it selects."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -89,7 +98,7 @@ class Answer:
     @property
     def suggested_threshold(self) -> float | None:
         """One threshold for all prompts, which their relevancies suggest; None if no Gaussian has a direction."""
-        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid))
+        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid), suggested_position(self.field))
 
     def __len__(self) -> int:
         return len(self.texts)
@@ -188,19 +197,22 @@ class Finding:
     def histogram(self) -> Histogram | None:
         """Histogram of the relevancies, with the threshold; None if no Gaussian has a direction."""
         question = self.answer.question
-        limit = presence_limit(question.rule, encoder_name(self.answer.field))
         relevancy, valid = as_numpy(self.relevancy), as_numpy(self.answer.valid)
-        return relevancy_histogram(relevancy, valid, threshold=question.threshold, limit=limit)
+        return relevancy_histogram(relevancy, valid, question.threshold, suggested_position(self.answer.field))
 
     @property
     def suggested_threshold(self) -> float | None:
         """Threshold that the histogram suggests for this prompt."""
         return None if self.histogram is None else self.histogram.suggested
 
-    @property
-    def stands_out(self) -> bool | None:
-        """False if the prompt is probably not in the scene; None if there is no limit to decide by."""
-        return None if self.histogram is None else self.histogram.stands_out
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Presence of the prompt in the scene; None if nothing tells whether its cosines are large.
+
+        A prompt that selects something is at least a weak match.
+        """
+        verdict = self.answer.verdicts[self.index]
+        return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def nearest(self) -> list[float] | None:
@@ -226,7 +238,7 @@ class Finding:
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as plain Python types."""
-        names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "stands_out", "nearest")
+        names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest")
         values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
         return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}
 
@@ -282,10 +294,24 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     if RELEVANCY_RULES[question.rule].needs_negatives and question.negative_embeddings is not None:
         vectors = np.concatenate([vectors, question.negative_embeddings])
     valid, cosine = field.valid(refined=question.refined), field.query(vectors, refined=question.refined)
-    relevancy = gaussian_relevancy(cosine[:, :count], cosine[:, count:], valid, question.rule)
+    negative = field.null_levels(refined=question.refined) if question.rule == "contrast" else cosine[:, count:]
+    relevancy = gaussian_relevancy(cosine[:, :count], negative, valid, question.rule)
     means = means if isinstance(means, np.ndarray) else means.detach()
-    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected=relevancy[:0] > 0)
+    verdicts = _judge_all(field, question.rule, as_numpy(cosine[:, :count][valid]), as_numpy(relevancy[valid]))
+    selected = relevancy[:0] > 0
+    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, verdicts)
     return apply_threshold(unselected, question)
+
+
+def _judge_all(
+    field: HasManifest, rule: RelevancyRule, cosine: Float[np.ndarray, "m q"], relevancy: Float[np.ndarray, "m q"]
+) -> tuple[Verdict | None, ...]:
+    """Return the verdict on every prompt from the Gaussians that have a direction."""
+    if len(cosine) == 0:
+        return (None,) * cosine.shape[1]
+    tops = (np.quantile(values, TOP_QUANTILE, axis=0) for values in (cosine, relevancy))
+    name, manifest = encoder_name(field), field.manifest
+    return tuple(judge(manifest, name, rule, top_cosine=float(c), top=float(r)) for c, r in zip(*tops))
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
@@ -299,32 +325,29 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
             question, threshold=question.threshold if suggested is None else suggested, suggest_threshold=False
         )
     reliable = answer.valid & (answer.field.scalars.reliability >= question.min_reliability)
-    return replace(answer, question=question, selected=(answer.relevancy > question.threshold) & reliable[:, None])
+    selected = (answer.relevancy > question.threshold) & reliable[:, None]
+    if question.gated:
+        for index, verdict in enumerate(answer.verdicts):
+            if verdict == "probably not here":
+                selected[:, index] = False
+    return replace(answer, question=question, selected=selected)
 
 
-# Histogram of the relevancies of one prompt, with a suggested threshold and a test for absence from the scene.
+# Histogram of the relevancies of one prompt, with a suggested threshold.
 #
 # Let m be the median relevancy of the Gaussians that have a direction, and t their top: the relevancy that one in a
 # thousand exceeds. If more than half of them are at the top, m is the minimum instead, so that a threshold can still
 # separate them.
 #
-# * The suggested threshold is m + 0.6 (t - m). It adapts to the range of relevancies, so it suits any encoder and rule.
-# * The prompt is probably not in the scene if t is below a limit that depends on the rule; see `presence_limit`.
-#
-# docs/honest_answers.md has the error rates of both, and of alternatives that did worse.
+# The suggested threshold is m + f (t - m), with a fraction f of the encoder. docs/honest_answers.md has its errors, and
+# those of alternatives.
 
 
 HISTOGRAM_BINS = 32
-_TOP_QUANTILE = 0.999
-"""Quantile of relevancies that defines the top; a single stray Gaussian does not affect it."""
-_SUGGESTED_FRACTION = 0.6
-"""Position of the suggested threshold between the median (0) and the top (1)."""
 _AT_TOP = 1e-3
 """The median counts as being at the top if it is closer than this fraction of the range of relevancies."""
 _EPSILON = 1e-6
 """Relevancies that differ by less count as equal; if all are equal and positive, the threshold is this far below."""
-_COLOR_LIMIT = 0.9
-"""Limit of the top for plain cosines of the color encoder."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -335,9 +358,9 @@ class Histogram:
     >>> import numpy as np
     >>> from normlift_ns.query.engine import relevancy_histogram
     >>> values = np.array([0.1] * 60 + [0.2] * 30 + [0.9] * 10)
-    >>> hist = relevancy_histogram(values, np.ones(100, bool), threshold=0.5, limit=0.62)
-    >>> int(hist.counts.sum()), round(hist.suggested, 6), hist.stands_out
-    (100, 0.58, True)
+    >>> hist = relevancy_histogram(values, np.ones(100, bool), 0.5, 0.6)
+    >>> int(hist.counts.sum()), round(hist.suggested, 6)
+    (100, 0.58)
     """
 
     edges: Float[np.ndarray, " bins_plus_1"]
@@ -348,35 +371,25 @@ class Histogram:
     median: float
     top: float
     """Relevancy that one Gaussian in a thousand exceeds."""
-    limit: float | None
-    """A prompt with a lower top is probably not in the scene; None if this encoder and rule have no such limit."""
-
-    @property
-    def suggested(self) -> float:
-        """Suggested threshold for this prompt."""
-        return _suggest(self.median, self.top)
-
-    @property
-    def stands_out(self) -> bool | None:
-        """False if the prompt is probably not in the scene; None if there is no limit to decide by."""
-        return None if self.limit is None else self.top >= self.limit
+    suggested: float
+    """Suggested threshold for this prompt."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the range, counts and statistics as plain Python types."""
         low, high = float(self.edges[0]), float(self.edges[-1])
-        statistics = {"median": self.median, "top": self.top, "limit": self.limit}
+        statistics = {"median": self.median, "top": self.top}
         return {"low": low, "high": high, "counts": self.counts.tolist(), **statistics}
 
 
 def relevancy_histogram(
-    relevancy: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], *, threshold: float, limit: float | None
+    relevancy: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], threshold: float, position: float
 ) -> Histogram | None:
     """Return the histogram of one prompt; None if no Gaussian has a direction.
 
     Args:
         valid: True for Gaussians that have a direction.
         threshold: relevancy above which a Gaussian is selected.
-        limit: result of `presence_limit`.
+        position: as in `suggest_threshold`.
     """
     values = relevancy[valid].astype(np.float64)
     if len(values) == 0:
@@ -386,7 +399,7 @@ def relevancy_histogram(
         low, high = low - _EPSILON / 2, high + _EPSILON / 2
     counts, edges = np.histogram(values, HISTOGRAM_BINS, (low, high))
     median, top = _median_and_top(values)
-    return Histogram(edges, counts.astype(np.int64), threshold, median, top, limit)
+    return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(median, top, position))
 
 
 def draw_histogram(
@@ -404,40 +417,38 @@ def draw_histogram(
     return f"{line[:position]}|{line[position:]}"
 
 
-def suggest_threshold(relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndarray, " n"]) -> float | None:
+def suggested_position(field: HasManifest) -> float:
+    """Return the position of suggested thresholds between the median (0) and the top (1), for the field's encoder."""
+    kind = find_encoder_kind(encoder_name(field))
+    return EncoderKind.suggested if kind is None else kind.suggested
+
+
+def suggest_threshold(
+    relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndarray, " n"], position: float
+) -> float | None:
     """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
-    >>> suggest_threshold(np.array([[0.0, 0.0], [0.0, 0.1], [0.0, 1.0]]), np.ones(3, bool)) > 0.5
+    Args:
+        position: result of `suggested_position`.
+
+    >>> suggest_threshold(np.array([[0.0, 0.0], [0.0, 0.1], [0.0, 1.0]]), np.ones(3, bool), 0.6) > 0.5
     True
-    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool)) < 1  # all alike: all are selected
+    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), 0.5) < 1  # all alike: all are selected
     True
     """
     values = relevancy[valid].astype(np.float64).ravel()
     if len(values) == 0:
         return None
-    return _suggest(*_median_and_top(values))
+    return _suggest(*_median_and_top(values), position)
 
 
-def presence_limit(rule: RelevancyRule, encoder: str | None) -> float | None:
-    """Return the limit of the top below which a prompt is probably not in the scene; None if there is no such limit.
-
-    Relevancies of the rules lerf and margin measure the lead over the negatives, which has a meaning with any encoder.
-    Plain cosines have a meaning only if their distribution is known, as it is for the color encoder, where 0.9 is a
-    neighboring shade. Cosines of CLIP lie between 0.1 and 0.4, and vary by prompt, in the scene or not.
-
-    >>> presence_limit("lerf", "open_clip"), presence_limit("cosine", "colour"), presence_limit("cosine", "open_clip")
-    (0.62, 0.9, None)
-    """
-    return _COLOR_LIMIT if rule == "cosine" and encoder == "colour" else RELEVANCY_RULES[rule].presence_limit
-
-
-def _suggest(median: float, top: float) -> float:
-    threshold = median + _SUGGESTED_FRACTION * (top - median)
+def _suggest(median: float, top: float, position: float) -> float:
+    threshold = median + position * (top - median)
     return min(threshold, top - _EPSILON) if top > 0 else threshold  # if nothing is relevant, select nothing
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:
     """Return the median and the top; the minimum in place of the median if that is at the top."""
-    median, top = np.quantile(values, (0.5, _TOP_QUANTILE)).tolist()
+    median, top = np.quantile(values, (0.5, TOP_QUANTILE)).tolist()
     least = float(values.min())
     return (least if top - median < _AT_TOP * (top - least) else median), top

@@ -20,7 +20,7 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import RelevancyRule, check_bool, check_number, renamed, short_repr
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
 
 
@@ -52,6 +52,8 @@ class Query:
     """Replace the threshold with the one that the histogram of all relevancies suggests, when the query runs. The query
     stored in the result has that threshold.
     """
+    gated: bool = False
+    """Select nothing for a prompt that is probably not in the scene, unless a threshold was given."""
 
     def __post_init__(self) -> None:
         for name in ("embeddings", "negative_embeddings"):
@@ -98,10 +100,12 @@ def make_query(
     default = default_rule(field)
     if relevancy == "auto":
         relevancy = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
+    gated = threshold is None or threshold == "auto"
     if threshold is None:
         general = RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
         threshold = default.threshold if relevancy == default.rule else general
-    negatives = tuple(default.negatives if negatives is None else negatives)
+    needed = CANONICAL_NEGATIVES if RELEVANCY_RULES[relevancy].needs_negatives else ()
+    negatives = tuple((default.negatives or needed) if negatives is None else negatives)
     return Query(
         texts=tuple(texts),
         embeddings=encode(texts),
@@ -110,6 +114,7 @@ def make_query(
         rule=relevancy,
         threshold=RELEVANCY_RULES[relevancy].threshold if threshold == "auto" else threshold,
         suggest_threshold=threshold == "auto",
+        gated=gated,
         min_reliability=min_reliability,
         refined=refined,
         encoder=encoder_digest(field.manifest),
@@ -152,6 +157,7 @@ class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "for
     threshold: float
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)]
     encoder: str | None = None
+    gated: bool = False
 
 
 def save_query(folder: Path, question: Query) -> Path:

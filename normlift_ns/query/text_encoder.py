@@ -17,11 +17,12 @@ from normlift_ns.encoders.registry import (
     encoder_kind,
     find_encoder_kind,
     make_encoder,
+    with_encoder,
 )
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
-from normlift_ns.options import RelevancyRule, SourceOptions, names_of_0_2
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that determine the encoder or the text embeddings of a field; its manifest records them by their
@@ -41,6 +42,7 @@ class DefaultRule(NamedTuple):
 
 
 _PLAIN_COSINE = DefaultRule("cosine", (), "auto")
+_CONTRAST = DefaultRule("contrast", (), 0.5)
 
 
 class HasManifest(Protocol):
@@ -57,6 +59,7 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
     """Return the settings that `text_encoder_for` needs, as JSON types, with absolute paths."""
+    options = with_encoder(options)
     stored = names_of_0_2(options)
     settings = {key: stored[key] for key in ENCODER_KEYS} | absolute_paths(options)
     vectors = options.text_embeddings
@@ -69,7 +72,8 @@ def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
     Args:
         text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
     """
-    return {**encoder_settings(SourceOptions()), "encoder": PRECOMPUTED, "text_vectors": text_vectors}
+    settings = encoder_settings(SourceOptions(encoder="open_clip"))
+    return {**settings, "encoder": PRECOMPUTED, "text_vectors": text_vectors}
 
 
 def with_text_source(field: FieldT, *, text_embeddings: Path | None = None, template: str | None = None) -> FieldT:
@@ -200,11 +204,28 @@ def encoder_name(field: HasManifest) -> str | None:
     return name if isinstance(name, str) else None
 
 
+def own_words(field: HasManifest) -> tuple[str, ...]:
+    """Return the words that an inventory names objects by: those of the encoder, or of the file of text embeddings.
+
+    Raises:
+        ValueError, FileNotFoundError: the file is damaged or does not exist.
+    """
+    stored = field.manifest.get("encoder")
+    vectors = stored.get("text_vectors") if isinstance(stored, Mapping) else None
+    if vectors is not None:
+        return tuple(text for text in TextEmbeddingFile(Path(vectors)).texts if text not in CANONICAL_NEGATIVES)
+    kind = find_encoder_kind(encoder_name(field))
+    return () if kind is None else tuple(kind.words())
+
+
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of a field's encoder.
 
-    For an unknown encoder, or a file of text embeddings without the default negatives, the rule is plain cosine.
+    With a null level it is rule contrast. For an unknown encoder, or a file of text embeddings without the default
+    negatives, the rule is plain cosine.
     """
+    if field.manifest.get("null_words") is not None:
+        return _CONTRAST
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping):
         return _PLAIN_COSINE

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
-from normlift_ns.analysis.objects import evidence_weights
+from normlift_ns.analysis.inventory import Inventory, as_instances
+from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color, view_shares
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.relevancy import RELEVANCY_RULES
@@ -24,6 +26,7 @@ from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer, Finding
+from normlift_ns.query.presence import Verdict
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
@@ -279,27 +282,29 @@ class FigureHeader:
     """The prompt."""
     summary: str
     """Size of the selection and strength of its evidence."""
-    absent: bool = False
-    """True if the prompt is probably not in the scene."""
+    verdict: Verdict | None = None
+    """Verdict on the presence of the prompt in the scene."""
 
     @property
     def title(self) -> str:
-        """The prompt, and a note if it is probably not in the scene."""
-        return colors.clip_text(self.text, 60) + self.absent * "   ·   probably not in this scene"
+        """The prompt, and the verdict on it."""
+        return colors.clip_text(self.text, 60) + ("" if self.verdict is None else f"   ·   {self.verdict}")
 
     @staticmethod
     def of(finding: Finding) -> FigureHeader:
         """Summarize the answer to one prompt."""
         mask, scalars = finding.mask, finding.answer.field.scalars
-        threshold, absent = finding.answer.question.threshold, finding.stands_out is False
+        threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
             peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", absent)
+            return FigureHeader(finding.text, f"nothing is selected above {threshold:g}{peak}", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
         below = f" (R < {WEAK_RELIABILITY:g})"
-        return FigureHeader(finding.text, f"{100 * finding.fraction:.1f} % of the Gaussians; {evidence}{below}", absent)
+        return FigureHeader(
+            finding.text, f"{100 * finding.fraction:.1f} % of the Gaussians; {evidence}{below}", verdict
+        )
 
 
 def view_figure(
@@ -516,6 +521,67 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
             )
         selected[unique[matches[0]]] = cameras[matches[0]]
     return selected
+
+
+_OUTLINE_FRACTION = 1 / 320
+"""Width of the outlines of an inventory, relative to the longer side of the image."""
+
+
+def save_inventory(
+    scene: Scene, inventory: Inventory, path: Path, *, manifest: Mapping[str, Any], overwrite: bool = False
+) -> str:
+    """Write a PNG of the scene with the outlines and numbers of the objects of an inventory, and names after these.
+
+    The camera is that of the training image that shows the most objects and, of several, the largest share of each.
+
+    Args:
+        manifest: of the field, for the rules of the rasterizer.
+        overwrite: replace an existing file.
+    Returns:
+        The name of the training image.
+    Raises:
+        FileExistsError: the file exists, and `overwrite` is False.
+        OSError: the file cannot be written.
+    """
+    settings, count = RasterSettings.recorded(manifest), len(inventory)
+    instances = as_instances(inventory.instance_id, tuple(item.text for item in inventory.catalog.objects))
+    shares = view_shares(scene, instances, settings, str(scene.gaussians.means.device))
+    shares = shares / shares.amax(dim=1, keepdim=True).clamp(min=1e-12)
+    shown = (shares >= MIN_VIEW_SHARE).sum(dim=0) + shares.sum(dim=0) / max(count, 1)  # the second term is below 1
+    view = int(shown.argmax())
+    camera, mode = scene.train.cameras[view], scene.rasterize_mode
+    image = render_image(scene, camera, settings=settings)
+    values = torch.nn.functional.one_hot(inventory.instance_id.long(), count + 1)[:, 1:].to(scene.gaussians.means)
+    weights, alpha = render(scene.gaussians, camera, values, rasterize_mode=mode, settings=settings)
+    masks = (pixel_relevancy(weights, alpha) > 0.5).permute(2, 0, 1)
+    drawn = _numbered(image, masks, [item.text for item in inventory.catalog.objects])
+    with atomic_file(path, overwrite=overwrite) as draft:
+        drawn.save(draft, format="PNG")
+    return scene.train.names[view]
+
+
+def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names: Sequence[str]) -> Image.Image:
+    """Draw the outline of every mask, with its number and name where it is widest."""
+    height, width = image.shape[:2]
+    line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
+    canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)
+    outside = torch.nn.functional.pad((~masks).float(), (line,) * 4, value=1.0)
+    border = masks & (torch.nn.functional.max_pool2d(outside, 2 * line + 1, stride=1) > 0)
+    for number, edge in enumerate(border.cpu(), 1):
+        canvas[edge] = torch.tensor(object_color(number), dtype=torch.uint8)
+    picture = Image.fromarray(canvas.numpy())
+    draw, font, reach = ImageDraw.Draw(picture), colors.load_font(size), max(1, min(height, width) // 16)
+    for number, (mask, name) in enumerate(zip(masks, names), 1):
+        if not bool(mask.any()):
+            continue
+        inner = torch.nn.functional.avg_pool2d(mask[None].float(), 2 * reach + 1, stride=1, padding=reach)[0]
+        y, x = divmod(int(inner.where(mask, -1.0).argmax()), width)
+        text = str(number) if name == f"object {number}" else f"{number} {colors.clip_text(name, 24)}"
+        place = {"text": text, "font": font, "anchor": "mm"}
+        left, top, right, bottom = draw.textbbox((x, y), **place)
+        draw.rectangle((left - line, top - line, right + line, bottom + line), fill=(0, 0, 0))
+        draw.text((x, y), fill=object_color(number), **place)
+    return picture
 
 
 def write_masks(

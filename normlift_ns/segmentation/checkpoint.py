@@ -320,7 +320,7 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
         return local
     title, files = _title(kinds), [WEIGHTS_FILE, *more]
     problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
-    with weights.third_party_errors(problem, f"connect to the internet once, or {_REMEDIES[title]}", FileNotFoundError):
+    with weights.third_party_errors(problem, f"{weights.CONNECT_ONCE}, or {_REMEDIES[title]}", FileNotFoundError):
         return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 

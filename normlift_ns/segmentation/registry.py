@@ -8,13 +8,15 @@ heavy.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, get_args
 
-from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts
+from normlift_ns.encoders.package_files import EDGES, PackageFile
+from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts, with_encoder
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, MASK_GROUP, FeatureKind, SourceOptions, short_repr
@@ -46,6 +48,8 @@ class MaskSource:
     """Names from `MASK_OPTIONS` that the source accepts."""
     has_features: bool = False
     """True if `make` returns a `FeatureSource`, which needs no encoder of regions."""
+    weights: PackageFile | None = None
+    """Weight file that a lift needs, which `ns-normlift-weights` fetches."""
 
 
 _COUNT, _PATCH_COUNT = 256, 1024
@@ -95,14 +99,30 @@ SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", 
 """Masks of SAM 3 for text prompts."""
 
 
+_make_edges = _make("segmentation.edges:EdgeRegions", lambda o, device: (o.level or "m", o.region_count, device))
+
+
+def _check_edges(options: SourceOptions) -> None:
+    _check_level(options, "edges", ("s", "m", "l"))
+    if options.level is not None and options.region_count is not None:
+        raise InputError(
+            f"--level {options.level} and --region-count {options.region_count} both choose the number of regions of "
+            "--regions edges; leave one of them out"
+        )
+
+
+EDGE_REGIONS = MaskSource(_make_edges, _check_edges, ("level",), weights=EDGES)
+"""Regions between learned edges."""
+
+
 def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
     from normlift_ns.encoders.base import PatchFeatures  # noqa: PLC0415 (needs torch)
 
     encoder: Any = make_encoder(options, device)
     if not hasattr(encoder, "patches"):
         raise InputError(
-            f"--regions patches needs an encoder with patch features; --encoder {options.encoder} has none. Use "
-            "--regions superpixel or --encoder open_clip"
+            f"--regions patches needs an encoder with patch features; --encoder {with_encoder(options).encoder} has "
+            "none. Use --regions superpixel or --encoder open_clip"
         )
     return PatchFeatures(encoder, options.region_count or _PATCH_COUNT)
 
@@ -154,7 +174,7 @@ def _check_langsplat(options: SourceOptions) -> None:
         raise InputError(
             "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
         )
-    if not encoder_kind(options.encoder).learned and options.text_embeddings is None:
+    if not encoder_kind(with_encoder(options).encoder).learned and options.text_embeddings is None:
         raise InputError(
             f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
             "that did with --encoder-model and --encoder-pretrained, or give --text-embeddings"
@@ -170,6 +190,7 @@ MASK_SOURCES = Registry(
     {
         "sam": "normlift_ns.segmentation.registry:SAM_MASKS",
         "sam3": "normlift_ns.segmentation.registry:SAM3_MASKS",
+        "edges": "normlift_ns.segmentation.registry:EDGE_REGIONS",
         "patches": "normlift_ns.segmentation.registry:PATCHES",
         "superpixel": "normlift_ns.segmentation.registry:SUPERPIXEL",
         "grid": "normlift_ns.segmentation.registry:GRID",
@@ -193,17 +214,61 @@ def requested_regions(options: SourceOptions) -> str:
     return "auto" if options.sam_model is None else "sam"
 
 
+_PACKAGES = {"sam": "transformers", "edges": "h5py"}
+"""Packages of the extras that regions need."""
+_NEXT_ENCODER = {"color": "imagenet", "imagenet": "open_clip"}
+"""The encoder to recommend to those who have only this one."""
+
+
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
-    """Return the regions of the options, with "auto" resolved."""
+    """Return the regions of the options, with "auto" resolved: the best that are on this machine."""
     name = requested_regions(options)
-    if name != "auto":
-        return name
-    kind = encoder_kind(options.encoder)
+    return name if name != "auto" else next(filter(_is_here, _preferred_regions(with_encoder(options), device)))
+
+
+def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
+    """Return the regions of "auto" for the encoder, the best first, whether their weights are here or not.
+
+    On a CPU, SAM takes minutes per image, and crops of edges far longer than patches.
+    """
+    kind, on_gpu = encoder_kind(options.encoder), device.startswith("cuda")
     if not kind.learned:
-        return "superpixel"
-    if device.startswith("cuda") and find_spec("transformers") is not None and find_local_sam(DEFAULT_SAM) is not None:
-        return "sam"
-    return "patches" if kind.has_patches(options) else "superpixel"
+        return ["superpixel"]
+    patches = kind.has_patches(options)
+    edges = on_gpu or kind.pools or not patches
+    return [*["sam"] * on_gpu, *["edges"] * edges, "patches" if patches else "superpixel"]
+
+
+def _is_here(regions: str) -> bool:
+    """Return whether "auto" may choose regions: their default weights and their packages are on this machine."""
+    if regions in _PACKAGES and find_spec(_PACKAGES[regions]) is None:
+        return False
+    return EDGES.is_here if regions == "edges" else regions != "sam" or find_local_sam(DEFAULT_SAM) is not None
+
+
+def resolve_source(options: SourceOptions, device: str = "cpu") -> SourceOptions:
+    """Return the options with encoder and regions in place of "auto"; imported features have no regions."""
+    options = with_encoder(options)
+    return options if options.features != "none" else replace(options, regions=resolve_regions(options, device))
+
+
+def describe_choice(options: SourceOptions, device: str) -> str | None:
+    """Describe in one line what "auto" stands for on this machine, and the command that gets the next better weights;
+    None if neither the encoder nor the regions of a network are automatic."""
+    any_encoder, any_regions = options.encoder == "auto", requested_regions(options) == "auto"
+    named = not any_encoder and not (any_regions and encoder_kind(options.encoder).learned)
+    if named or options.features != "none":
+        return None
+    chosen = resolve_source(options, device)
+    better = [_NEXT_ENCODER[chosen.encoder]] if any_encoder and chosen.encoder in _NEXT_ENCODER else []
+    if any_regions:
+        encoder = "imagenet" if better == ["imagenet"] else chosen.encoder
+        preferred = _preferred_regions(replace(chosen, encoder=encoder), device)
+        better += list(takewhile(lambda name: not _is_here(name), preferred))[-1:]
+    packages = [name for regions, name in _PACKAGES.items() if regions in better and find_spec(name) is None]
+    install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
+    advice = f"; for better ones: {install}ns-normlift-weights --get {' '.join(better)}" if len(better) > 0 else ""
+    return f"2D features: --encoder {chosen.encoder} --regions {chosen.regions}, chosen automatically{advice}"
 
 
 def check_mask_options(options: SourceOptions, name: str) -> MaskSource:

@@ -39,7 +39,7 @@ The score is that of the instance times the presence score of the prompt.
 """
 _MASK_THRESHOLD = 0.5
 """Probability above which a pixel is in a mask."""
-_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
+TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
 _MAX_TOKENS = 32
 _TOGETHER = 16
 """Number of masks per batch at the size of the image."""
@@ -79,7 +79,7 @@ class Sam3Network:
             ValueError: If the checkpoint is damaged or of another network, or if the installed torch or transformers
                 cannot run it.
         """
-        path = locate_sam(checkpoint, TEXT_PROMPT_FAMILIES, _TOKENIZER_FILES)
+        path = locate_sam(checkpoint, TEXT_PROMPT_FAMILIES, TOKENIZER_FILES)
         with checkpoint_errors(path, "SAM 3"):
             folder = transformers_folder(path)
             if folder is None:
@@ -143,7 +143,7 @@ class Sam3Network:
 def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto") -> dict[str, Any]:
     """Return everything except the prompt that changes the masks of SAM 3; files are identified by their content."""
     path = Path(checkpoint)
-    files = (path / name for name in ("config.json", WEIGHTS_FILE, *_TOKENIZER_FILES))
+    files = (path / name for name in ("config.json", WEIGHTS_FILE, *TOKENIZER_FILES))
     content = file_digest(*(file for file in files if file.is_file())) if path.is_dir() else checkpoint
     resolved = resolve_precision(precision, device)
     return {"kind": "sam3", "checkpoint": content, "precision": resolved, "score": SCORE_THRESHOLD}

@@ -32,8 +32,8 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Warning that the prompt is probably not in the scene, or that nothing reaches the threshold, with the nearest
-    match; empty if a selected match stands out, or if presence cannot be judged."""
+    """Verdict on a prompt that is not found, or warning that nothing reaches the threshold, with the nearest match;
+    empty otherwise."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
@@ -57,14 +57,11 @@ def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagn
 
 
 def _warning(finding: Finding, histogram: Histogram) -> str:
-    if is_click(finding.text) or histogram.stands_out is None:
+    if is_click(finding.text):
         return ""
     position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
-    if not histogram.stands_out:
-        return (
-            f"{finding.text}: probably not in this scene. The nearest match{position} has relevancy "
-            f"{histogram.top:.2f}; objects in a scene reach {histogram.limit:.2g} or more."
-        )
+    if finding.verdict in ("weak match", "probably not here"):
+        return f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {histogram.top:.2f}."
     if finding.peak is None or bool(finding.mask.any()):
         return ""
     return (
@@ -94,7 +91,7 @@ def carry_threshold(state: State, question: Query) -> Query:
         threshold_suggestion(replace(state, shown=None)),
     ):
         return question
-    return replace(question, threshold=previous.threshold, suggest_threshold=False)
+    return replace(question, threshold=previous.threshold, suggest_threshold=False, gated=previous.gated)
 
 
 def _only_clicks(question: Query) -> bool:
@@ -152,7 +149,7 @@ def set_threshold(state: State, value: float) -> State:
     value = min(MAX_THRESHOLD, max(MIN_THRESHOLD, value))
     if state.query is None or value == state.query.threshold:
         return state
-    question = replace(state.query, threshold=value, suggest_threshold=False)
+    question = replace(state.query, threshold=value, suggest_threshold=False, gated=False)
     return replace(state, query=question, action=f"Threshold {value:.3g}")
 
 

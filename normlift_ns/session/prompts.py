@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
 from normlift_ns.query.question import Query, make_query
@@ -116,13 +115,14 @@ def build_query(
     *,
     negatives: Sequence[str] | None = None,
     relevancy: RelevancyRule | Literal["auto"] = "auto",
-    threshold: float | None = None,
+    threshold: float | Literal["auto"] | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> tuple[tuple[Prompt, ...], Query]:
     """Build the query of all rows that have a vector.
 
-    Clicks alone are compared by cosine, above 0.9 by default. Together with texts, clicks need the rule cosine.
+    Clicks alone are compared by cosine, above the suggested threshold by default; they are in the scene, so the query
+    is not gated. Together with texts, clicks need the rule cosine.
 
     Args:
         read: encoder of the negatives. The other arguments are those of `make_query`.
@@ -136,15 +136,15 @@ def build_query(
     if len(clicks) == 0:
         raise InputError(rows[0].error if len(rows) > 0 else "Type a prompt, then press Ask.")
     if all(clicks):
-        negatives, relevancy, threshold = (), "cosine", CLICK_THRESHOLD if threshold is None else threshold
+        negatives, relevancy, threshold = (), "cosine", "auto" if threshold is None else threshold
     options = {"negatives": negatives, "relevancy": relevancy, "threshold": threshold}
     options |= {"min_reliability": min_reliability, "refined": refined}
     question = _question(field, rows, read, options)
-    if any(clicks) and RELEVANCY_RULES[question.rule].needs_negatives:
+    if any(clicks) and question.rule != "cosine":
         error: dict[str, Any] = {"vector": None, "error": _CLICK_RULE}
         rows = tuple(replace(p, **error) if p.is_click and p.vector is not None else p for p in rows)
         question = _question(field, rows, read, options)
-    return rows, question
+    return rows, replace(question, gated=question.gated and not all(clicks))
 
 
 def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, options: Mapping[str, Any]) -> Query:

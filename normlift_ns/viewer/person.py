@@ -357,7 +357,7 @@ class Panel(ActionWidgets):
             self.centre.value, self.size.value = state.box.center, state.box.size
 
     def judge(self, histograms: str, found: Sequence[PromptDiagnostics]) -> None:
-        """Shows histograms as MDX, and a button to go to the nearest match of what is probably not in the scene."""
+        """Shows histograms as MDX, and a button to go to the nearest match of each prompt that is not found."""
         self.histograms.content = histograms
         for button in self._nearest:
             button.remove()
@@ -402,7 +402,7 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
     lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}{why}")
     if state.answer is not None:
         counts = zip(state.answer.texts, state.answer.selected.sum(dim=0).tolist())
-        rows = prompt_rows(state.prompts, ["found"], {text: [f"{count:,}"] for text, count in counts}, max_rows=20)
+        rows = prompt_rows(state.prompts, ["selected"], {text: [f"{count:,}"] for text, count in counts}, max_rows=20)
         lines.append("\n".join(rows))
     if state.warning:
         lines.append(escape_mdx(f"{state.warning} Below R = {WEAK_RELIABILITY:g} few views saw it, or they disagree."))
@@ -615,8 +615,7 @@ class Person(Controller):
         if not link.prompts:
             return
         self._set_prompts(link.prompts)
-        how = {"min_reliability": link.min_reliability}
-        how |= {} if link.threshold is None else {"threshold": link.threshold}
+        how = {"min_reliability": link.min_reliability, "threshold": link.threshold}
         self._run("Reading the prompts of the link.", partial(self._answer, line=link.prompts, **how))
 
     def _show(self, history: History[State], message: str = "", *, answered: bool = False) -> None:

@@ -304,6 +304,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     clicks: dict[str, Annotated[int, msgspec.Meta(ge=0)]] = {}
     """The clicks among the prompts, by the Gaussians that were clicked."""
     threshold: Finite | None = None
+    """The threshold that the person chose; None: the default one."""
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     look: str = "overlay"
     view: View | None = None
@@ -330,7 +331,8 @@ def link_of(state: State, clicks: Mapping[str, int], view: View) -> Link:
         return Link(view=view, look=state.color_mode)
     asked = {name: gaussian for name, gaussian in clicks.items() if name in question.texts}
     line = join_prompts(question.texts)
-    return Link(line, asked, question.threshold, question.min_reliability, state.color_mode, view)
+    threshold = None if question.gated else question.threshold
+    return Link(line, asked, threshold, question.min_reliability, state.color_mode, view)
 
 
 def write_link(link: Link) -> str:

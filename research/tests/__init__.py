@@ -1,7 +1,5 @@
 """Tests of research/: what its numbers mean. The package itself is tested elsewhere."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

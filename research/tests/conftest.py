@@ -1,7 +1,5 @@
 """Research is not even collected in the default tiers: its imports take a second."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

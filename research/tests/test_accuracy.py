@@ -6,18 +6,13 @@ import pytest
 import torch
 
 from normlift_ns import RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine_variant
+from research import variants
 from research.accuracy import Bench
 from research.accuracy_report import METHODS, summarize
 from research.damage import LADDER, STEPS, Damage, observe
 from research.report import Report
 from research.tests import quick
 from research.tests.tiny import CLASSES, WORDS
-from research.variants import (
-    VARIANTS,
-    lifted_scores,
-    only,
-    refined_scores,
-)
 from tests.random_scenes import dense
 
 
@@ -59,17 +54,17 @@ def test_each_damage_does_what_its_name_says(world):
 def test_scores_of_variants_are_those_of_refined_directions(world):
     observed = observe(world, WORDS, LADDER["hard"], 0)
     lifted = lift(observed.evidence, observed.features)
-    plain, config = lifted_scores(lifted, WORDS.classes), RefineConfig(k=9)
+    plain, config = variants.lifted_scores(lifted, WORDS.classes), RefineConfig(k=9)
     neighbors = nearest_neighbors(world.scene.means, 9)
-    for variant in VARIANTS:
-        found = refined_scores(variant, world.scene.means, lifted, plain, neighbors, config)
+    for variant in variants.VARIANTS:
+        found = variants.refined_scores(variant, world.scene.means, lifted, plain, neighbors, config)
         expected = refine_variant(variant, world.scene.means, lifted, config, neighbors=neighbors)
         cosine = expected @ WORDS.classes.T
         scale = cosine.norm(dim=1, keepdim=True) / found.cosine.norm(dim=1, keepdim=True).clamp(min=1e-9)
         assert torch.allclose(found.cosine * scale, cosine, atol=2e-5)  # the arg-max does not see the length
         assert torch.equal(found.valid, (expected != 0).any(1))
         some = torch.arange(0, 300, 7)
-        few = refined_scores(variant, world.scene.means, lifted, plain, only(neighbors, some), config)
+        few = variants.refined_scores(variant, world.scene.means, lifted, plain, variants.only(neighbors, some), config)
         assert torch.equal(few.cosine[some], found.cosine[some])
 
 

@@ -1,7 +1,5 @@
 """Parts of research.coverage: what a choice of views answers is a sum over views, and its percentile."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -5,16 +5,22 @@ import sys
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.evaluation.studies import variant_source
 from research.batched_votes import _parts, voters_of
 from research.candidates import Candidate
 from research.damage import GROUP, LADDER, Damage, observe
+from research.documents import read
 from research.features import LENGTHS, mask_features, orthogonal_words
+from research.geometry import Seen, geometry, spread
 from research.pseudo_regions import KINDS, observe_pieces, pieces
+from research.real_features import FOX, NOISE, Regions, real_features
+from research.report import RESULTS
+from research.rule import cells_of, real_cells_of
 from research.second_room import second
-from research.synthetic_scenes import World, made_words
+from research.synthetic_scenes import PARTS, World, made_words
 from research.tests import ROOT, quick
 from research.tests.tiny import CLASSES, WORDS
 from tests.random_scenes import generator
@@ -94,3 +100,37 @@ def test_quick_grid(tmp_path):
     values = quick("grid", tmp_path, *flags)
     assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
     assert quick("grid", tmp_path, *flags) == values  # from the rows
+
+
+def test_real_features_have_the_cosines_of_the_fox():
+    values = {key.removeprefix("fox."): x for key, x in read(RESULTS / "geometry.json").values.items()}
+    paired = {"two_things": "two_things.two_views", "two_parts": "thing.two_views",
+              "two_parts_one_view": "thing.one_view"}  # fmt: skip
+    measured = {key: values[paired.get(key, key)] for key in vars(FOX)}
+    assert measured == pytest.approx(vars(FOX), abs=5.1e-4, rel=2e-3)
+    things, views, words = 12, 40, orthogonal_words(12)
+    toward = normalize(torch.randn(views, 3, generator=generator(1)) + torch.tensor([0, 0, 1.5]), dim=1)
+    view, thing, part = (x.flatten() for x in torch.meshgrid(*map(torch.arange, (views, things, PARTS)), indexing="ij"))
+    angles = torch.rad2deg((toward @ toward.T).clamp(-1, 1).acos()).expand(things, -1, -1)
+    regions = Regions(view, thing, part, torch.full_like(view, -1))
+    features = real_features(words, regions, angles, 0.0, NOISE, generator(0))
+    home = torch.arange(len(view)).view(views, -1).T  # of every part one Gaussian
+    seen = Seen(home, features, toward.expand(len(home), -1, -1))
+    made = geometry(seen, {str(k): torch.arange(k * PARTS, (k + 1) * PARTS) for k in range(things)}, generator(0))
+    for key in (x for x in made if x.startswith(("drift.", "thing.", "two_things.two", "near", "far"))):
+        assert made[key] == pytest.approx(values[key], abs=0.04), key
+    cosines = (features @ words.classes.T).view(views, things * PARTS, things)
+    own = cosines[:, torch.arange(things * PARTS), thing[: things * PARTS]]
+    assert float(own.mean()) == pytest.approx(FOX.own, abs=0.02)
+    lifted = normalize(features.view(views, -1, 512).mean(0), dim=1) @ words.classes.T
+    assert spread(lifted[torch.arange(len(home)), thing[: len(home)]]) == pytest.approx(FOX.spread, abs=0.12)
+    wrong = cosines.mean(0).view(things, PARTS, things).mean(1).fill_diagonal_(-1).amax(1)
+    assert float(wrong.mean()) == pytest.approx(FOX.wrong, abs=0.04) and bool((wrong > 0.02).all())
+
+
+def test_regions_of_real_features_are_parts_of_things(room):
+    plain, real = (observe(room, orthogonal_words(16), Damage(noise=0.0), 0, like) for like in (None, FOX))
+    alike = (real.features @ real.features.T > 1 - 1e-5).unique(dim=0)
+    assert 2 * 16 < len(alike) <= 16 * PARTS
+    assert len(plain.features) < real.evidence.num_regions == len(real.features)
+    assert len(beside := real_cells_of("demo")) == 43 and len(set(cells_of("demo")) - set(beside)) == 299

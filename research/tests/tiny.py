@@ -1,7 +1,5 @@
 """A small world for the tests of benchmarks."""
 
-from __future__ import annotations
-
 import torch
 
 from research.synthetic_scenes import World, cell_evidence, made_words

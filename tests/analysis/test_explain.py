@@ -1,7 +1,5 @@
 """Votes for a selection against sums in float64, and identities that they keep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Scores of floaters: each term does what it says, and what cannot be scored is left alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

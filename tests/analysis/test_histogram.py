@@ -1,7 +1,5 @@
 """Histograms of relevancy: every Gaussian is in one bin, and the rules are those that the module says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,11 +8,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from normlift_ns import InputError, SemanticField
+from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.query import engine
 from normlift_ns.query.engine import (
     HISTOGRAM_BINS,
     draw_histogram,
-    presence_limit,
     relevancy_histogram,
     suggest_threshold,
 )
@@ -30,7 +28,7 @@ VALUES = arrays(np.float32, st.integers(1, 60), elements=st.floats(-2, 2, width=
 @given(values=VALUES, threshold=st.floats(-3, 3), seed=st.integers(0, 9))
 def test_every_valid_gaussian_is_in_one_bin(values, threshold, seed):
     valid = np.random.default_rng(seed).random(len(values)) < 0.7
-    found = relevancy_histogram(values, valid, threshold=threshold, limit=0.3)
+    found = relevancy_histogram(values, valid, threshold, 0.5)
     if not valid.any():
         assert found is None
         return
@@ -39,7 +37,6 @@ def test_every_valid_gaussian_is_in_one_bin(values, threshold, seed):
     assert found.edges[0] <= min(threshold, values[valid].min())
     assert found.edges[-1] >= max(threshold, values[valid].max())
     assert min(found.median, found.top - 1e-6) <= found.suggested <= found.top <= values[valid].max() + 1e-6
-    assert found.stands_out == (found.top >= 0.3)
     line = draw_histogram(found.counts, found.edges[0], found.edges[-1], threshold)
     assert (len(line), line.count("|")) == (HISTOGRAM_BINS // 2 + 1, 1)
 
@@ -59,7 +56,7 @@ def test_every_encoder_has_a_default_that_selects_something():
         ("open_clip", {"relevancy": "cosine", "threshold": 0.3}, 0.3, False),
         ("open_clip", {"relevancy": "margin"}, 0.02, False),
         ("open_clip", {"threshold": "auto"}, 0.5, True),
-        ("color", {}, 0.5, False),
+        ("color", {}, 0.7, False),
         ("color", {"threshold": "auto"}, 0.5, True),
         (None, {}, 0.5, True),
     ):
@@ -74,7 +71,7 @@ def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
     field = SemanticField.build(lifted, means, source)
     question = Query(("a", "b"), unit_rows(2, D, 3).float().numpy(), suggest_threshold=True)
     found = engine.run_query(field, means, question)
-    wanted = suggest_threshold(found.relevancy.numpy(), found.valid.numpy())
+    wanted = suggest_threshold(found.relevancy.numpy(), found.valid.numpy(), 0.6)
     assert (found.question.threshold, found.question.suggest_threshold) == (wanted, False)
     assert torch.equal(found.selected, (found.relevancy > wanted) & found.valid[:, None])
     assert bool(found.mask.any())
@@ -84,11 +81,12 @@ def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
 
 
 def test_a_text_that_most_of_the_scene_is_selects_it_and_limits_go_by_the_lead():
-    lerf, margin = presence_limit("lerf", None), presence_limit("margin", None)
+    lerf, margin = (RELEVANCY_RULES[rule].presence_limit for rule in ("lerf", "margin"))
+    assert margin is not None
     assert 1 / (1 + np.exp(-10 * margin)) == pytest.approx(lerf, abs=1e-12)
     values = np.repeat([0.2, 0.9, 0.9 + 1e-9], [30, 60, 10])
-    found = relevancy_histogram(values, np.ones(100, bool), threshold=0.5, limit=None)
+    found = relevancy_histogram(values, np.ones(100, bool), 0.5, 0.6)
     assert found is not None
     assert found.suggested == pytest.approx(0.2 + 0.6 * 0.7)
-    assert suggest_threshold(values[:, None], np.ones(100, bool)) == pytest.approx(found.suggested)
+    assert suggest_threshold(values[:, None], np.ones(100, bool), 0.6) == pytest.approx(found.suggested)
     assert int((values > found.suggested).sum()) == 70

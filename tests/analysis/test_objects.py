@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import InputError
-from normlift_ns.analysis.objects import (
-    OrientedBox,
-    SimilarityTransform,
-    connected_components,
-    find_instances,
-    find_objects,
-    oriented_box,
-)
+from normlift_ns.analysis import objects
 from research.box_overlap import box_iou, half_spaces
 from tests.examples import examples
 from tests.random_scenes import generator
@@ -27,7 +20,7 @@ def blob(count: int, centre: tuple[float, float, float], seed: int) -> torch.Ten
 
 def test_blobs_apart_are_objects_by_size():
     means = torch.cat([blob(60, (0, 0, 0), 0), blob(150, (5, 0, 0), 1), blob(20, (0, 9, 0), 2)])
-    labels = connected_components(means, torch.ones(230, dtype=torch.bool))
+    labels = objects.connected_components(means, torch.ones(230, dtype=torch.bool))
     truth = torch.tensor([1] * 60 + [0] * 150 + [2] * 20)
     assert (labels == truth).float().mean() > 0.97
     assert torch.bincount(labels[labels >= 0]).diff().le(0).all()
@@ -36,36 +29,40 @@ def test_blobs_apart_are_objects_by_size():
 def test_only_what_is_selected_connects():
     line = torch.arange(30)[:, None] * torch.tensor([[1.0, 0, 0]])
     selected = torch.ones(30, dtype=torch.bool)
-    assert connected_components(line, selected).tolist() == [0] * 30
+    assert objects.connected_components(line, selected).tolist() == [0] * 30
     selected[10:16] = False
-    assert connected_components(line, selected).tolist() == [1] * 10 + [-1] * 6 + [0] * 14
-    assert connected_components(line, selected, max_gap=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
+    assert objects.connected_components(line, selected).tolist() == [1] * 10 + [-1] * 6 + [0] * 14
+    assert objects.connected_components(line, selected, max_gap=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
 
 
 def test_parts_smaller_than_one_gaussian_are_refused():
     for min_size in (0, 1.5):
         with pytest.raises(InputError, match="object_min_gaussians"):
-            find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
+            objects.find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
         with pytest.raises(InputError, match="object_min_gaussians"):
-            find_instances(("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_gaussians=min_size)
+            objects.find_instances(
+                ("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_gaussians=min_size
+            )
 
 
 def test_scale_and_order_do_not_matter():
     means = torch.cat([blob(40, (0, 0, 0), 3), blob(80, (4, 0, 0), 4)])
     selected = torch.rand(120, generator=generator(5)) < 0.9
-    labels = connected_components(means, selected)
-    assert torch.equal(connected_components(1000 * means, selected), labels)
+    labels = objects.connected_components(means, selected)
+    assert torch.equal(objects.connected_components(1000 * means, selected), labels)
     order = torch.randperm(120, generator=generator(6))
-    sizes, shuffled = (torch.bincount(x[x >= 0]) for x in (labels, connected_components(means[order], selected[order])))
+    sizes, shuffled = (
+        torch.bincount(x[x >= 0]) for x in (labels, objects.connected_components(means[order], selected[order]))
+    )
     assert torch.equal(sizes, shuffled)
 
 
 def test_nothing_one_and_the_same_place():
     means = torch.tensor([[0.0, 0, 0], [0, 0, 0], [torch.nan, 0, 0], [1, 1, 1]])
     none = torch.zeros(4, dtype=torch.bool)
-    assert connected_components(means, none).tolist() == [-1] * 4
-    assert connected_components(means, torch.tensor([False, False, True, True])).tolist() == [-1, -1, -1, 0]
-    assert connected_components(means, torch.tensor([True, True, True, False])).tolist() == [0, 0, -1, -1]
+    assert objects.connected_components(means, none).tolist() == [-1] * 4
+    assert objects.connected_components(means, torch.tensor([False, False, True, True])).tolist() == [-1, -1, -1, 0]
+    assert objects.connected_components(means, torch.tensor([True, True, True, False])).tolist() == [0, 0, -1, -1]
 
 
 def cuboid(seed: int, count: int = 3000, size: tuple[float, float, float] = (4.0, 2.0, 1.0)) -> np.ndarray:
@@ -80,8 +77,8 @@ def turned(seed: int) -> np.ndarray:
 @given(st.integers(0, 2**16), st.floats(0.01, 100))
 def test_the_box_of_a_turned_cuboid_is_the_cuboid(seed, scale):
     rotation, shift = turned(seed), np.array([3.0, -2, 7])
-    box = oriented_box(scale * cuboid(seed) @ rotation.T + shift)
-    truth = OrientedBox(shift, scale * 0.98 * np.array([4.0, 2, 1]), rotation.T)  # 1 % is cut off at each end
+    box = objects.oriented_box(scale * cuboid(seed) @ rotation.T + shift)
+    truth = objects.OrientedBox(shift, scale * 0.98 * np.array([4.0, 2, 1]), rotation.T)  # 1 % is cut off at each end
     assert box_iou(box, truth) > 0.9
     assert np.allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(box.axes) == pytest.approx(1)
@@ -91,18 +88,18 @@ def test_the_box_of_a_turned_cuboid_is_the_cuboid(seed, scale):
 def test_strays_decide_nothing():
     """One Gaussian in 120, as far away as it likes; without percentiles each would stretch the box to itself."""
     points = cuboid(1, 6000) @ turned(1).T
-    clean = oriented_box(points)
+    clean = objects.oriented_box(points)
     far = np.random.default_rng(2).normal(size=(50, 3))
     for distance in (6.0, 1e3, 1e6):
         strays = distance * far / np.linalg.norm(far, axis=1, keepdims=True)
-        assert box_iou(oriented_box(np.concatenate([points, strays])), clean) > 0.93
+        assert box_iou(objects.oriented_box(np.concatenate([points, strays])), clean) > 0.93
     one = np.concatenate([points, [[1e9, 1e9, -1e9]]])
-    assert box_iou(oriented_box(one), clean) > 0.97
+    assert box_iou(objects.oriented_box(one), clean) > 0.97
 
 
 def test_the_box_reaches_from_percentile_to_percentile_of_all_points():
     points = cuboid(3) @ turned(3).T
-    box = oriented_box(points)
+    box = objects.oriented_box(points)
     along = (points - box.center) @ box.axes.T
     for k in range(3):
         assert np.quantile(along[:, k], [0.01, 0.99]) == pytest.approx([-box.size[k] / 2, box.size[k] / 2], abs=1e-9)
@@ -110,20 +107,20 @@ def test_the_box_reaches_from_percentile_to_percentile_of_all_points():
 
 def test_points_lines_and_planes_have_boxes():
     line = np.linspace(0, 1, 101)[:, None] * [[2.0, 2, 0]]
-    assert oriented_box(line).size == pytest.approx([0.98 * 8**0.5, 0, 0], abs=1e-9)
+    assert objects.oriented_box(line).size == pytest.approx([0.98 * 8**0.5, 0, 0], abs=1e-9)
     plane = cuboid(4) * [1, 1, 0]
-    assert oriented_box(plane).size[2] == pytest.approx(0, abs=1e-9)
-    assert oriented_box(np.ones((5, 3))).size.tolist() == [0, 0, 0]
-    assert oriented_box(np.array([[1.0, 2, 3]])).center.tolist() == pytest.approx([1, 2, 3])
+    assert objects.oriented_box(plane).size[2] == pytest.approx(0, abs=1e-9)
+    assert objects.oriented_box(np.ones((5, 3))).size.tolist() == [0, 0, 0]
+    assert objects.oriented_box(np.array([[1.0, 2, 3]])).center.tolist() == pytest.approx([1, 2, 3])
     for wrong in (np.empty((0, 3)), np.array([[np.nan, 0, 0]])):
         with pytest.raises(InputError, match="finite"):
-            oriented_box(wrong)
+            objects.oriented_box(wrong)
 
 
 def test_boxes_move_with_their_points():
     points, rotation = cuboid(5), turned(5)
-    moved = oriented_box(points).transformed(SimilarityTransform(rotation, 3.0, np.array([1.0, 2, 3])))
-    again = oriented_box(3 * points @ rotation.T + [1, 2, 3])
+    moved = objects.oriented_box(points).transformed(objects.SimilarityTransform(rotation, 3.0, np.array([1.0, 2, 3])))
+    again = objects.oriented_box(3 * points @ rotation.T + [1, 2, 3])
     assert box_iou(moved, again) > 0.95
     inside = half_spaces(moved) @ np.append(moved.center, 1)
     assert inside == pytest.approx(np.repeat(-moved.size[None] / 2, 2, 0).ravel())

@@ -1,7 +1,5 @@
 """The votes of a lifted run, opened again from the run and its cache."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

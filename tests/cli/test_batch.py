@@ -1,7 +1,5 @@
 """Many captures by several workers: each is lifted once, whoever dies, and a rerun does only what is missing."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -18,20 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.cli import batch
-from normlift_ns.cli.batch import (
-    WHOLE_LIST,
-    Capture,
-    Outcome,
-    OutcomeState,
-    Shard,
-    is_lifted,
-    largest_exit_code,
-    latest_outcomes,
-    lift_captures,
-    make_shard,
-    read_captures,
-    run_logged,
-)
 from normlift_ns.errors import InputError
 from normlift_ns.io.file_lock import ClaimState, read_claim_states, read_jsonl, try_claim
 from normlift_ns.lifted_run import open_run
@@ -57,8 +41,8 @@ class Batch:
             config.with_name("what.txt").write_text(text)
         self.list.write_text("# captures\n\n" + "".join(f"{config}\n" for config in self.configs))
 
-    def work(self, *options: str, patience: float = PATIENCE) -> dict[str, Outcome]:
-        return lift_captures(read_captures(self.list, options), self.results, patience, command=STAND_IN)
+    def work(self, *options: str, patience: float = PATIENCE) -> dict[str, batch.Outcome]:
+        return batch.lift_captures(batch.read_captures(self.list, options), self.results, patience, command=STAND_IN)
 
     def start(self) -> FORK.Process:  # type: ignore[name-defined]
         process = FORK.Process(target=self.work)
@@ -75,13 +59,13 @@ class Batch:
 
     def states(self, *options: str) -> list[str]:
         """The last outcomes, in the order of the list."""
-        found = latest_outcomes(read_jsonl(self.results, Outcome))
-        return [found[capture.key].state for capture in read_captures(self.list, options)]
+        found = batch.latest_outcomes(read_jsonl(self.results, batch.Outcome))
+        return [found[capture.key].state for capture in batch.read_captures(self.list, options)]
 
     def check_lifted_once(self, *options: str) -> None:
         runs = [sorted(config.parents[2].glob("normlift/batch_*")) for config in self.configs]
-        assert [len(found) for found in runs] == [1] * len(runs) and all(is_lifted(found[0]) for found in runs)
-        lines = read_jsonl(self.results, Outcome)
+        assert [len(found) for found in runs] == [1] * len(runs) and all(batch.is_lifted(found[0]) for found in runs)
+        lines = read_jsonl(self.results, batch.Outcome)
         done = Counter(line.key for line in lines if line.state == "done")
         assert set(self.states(*options)) <= {"done", "skipped"} and set(done.values()) <= {1}
         known = {line.key for line in lines}  # a worker may be killed between its line and the end of its claim
@@ -143,16 +127,16 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
     killed = set()
     for step in count(1, stride):
         made = Batch(tmp_path / str(step), ["0"] * 2)
-        captures = read_captures(made.list, ())
+        captures = batch.read_captures(made.list, ())
         made.results.mkdir()
 
-        def first(made: Batch = made, captures: Sequence[Capture] = captures) -> None:
-            lift_captures(captures, made.results, 0.3, command=STAND_IN)
+        def first(made: Batch = made, captures: Sequence[batch.Capture] = captures) -> None:
+            batch.lift_captures(captures, made.results, 0.3, command=STAND_IN)
 
         if not killed_at(step, first, made.results):
             break
         killed.add(tuple(sorted(read_claim_states(made.results / "claims").values(), key=str)))
-        lift_captures(captures, made.results, 0.3, command=STAND_IN)
+        batch.lift_captures(captures, made.results, 0.3, command=STAND_IN)
         made.check_lifted_once()
     assert step > 24
     one, done = ClaimState(1, None), ClaimState(1, "done")
@@ -182,7 +166,7 @@ def test_a_process_that_ends_has_time_to_clean_up_but_not_for_ever(seconds, tmp_
     ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
     monkeypatch.setattr(batch, "_GRACE", batch._GRACE if seconds < 1 else 0.1)
     words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready), str(seconds)]
-    assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), interval=0.01) is None
+    assert batch.run_logged(words, tmp_path / "log", lambda: not ready.exists(), interval=0.01) is None
     assert cleaned.exists() == (seconds < 1)
 
 
@@ -190,14 +174,14 @@ def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
     made = Batch(tmp_path, ["0", "fail", "crash", "bug"])
     outcomes = made.work()
     assert made.states() == ["done", "failed", "failed", "failed"]
-    found = [outcomes[capture.key] for capture in read_captures(made.list, ())]
+    found = [outcomes[capture.key] for capture in batch.read_captures(made.list, ())]
     assert [outcome.code for outcome in found] == [0, 1, 128 + signal.SIGSEGV, 70]
     assert [outcome.message for outcome in found[1:4:2]] == ["the photographs are [/gone]", "This is a bug"]
     assert "SIGSEGV" in found[2].message and "logs" in found[2].message
     assert (
-        largest_exit_code(found) == 128 + signal.SIGSEGV
-        and largest_exit_code(found[:2]) == 1
-        and largest_exit_code(found[:1]) == 0
+        batch.largest_exit_code(found) == 128 + signal.SIGSEGV
+        and batch.largest_exit_code(found[:2]) == 1
+        and batch.largest_exit_code(found[:1]) == 0
     )
     made.set(1, "0")
     made.work()
@@ -210,7 +194,7 @@ def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
 def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     made = Batch(tmp_path, ["0"] * 4)
     made.work()
-    captures = read_captures(made.list, ())
+    captures = batch.read_captures(made.list, ())
     shutil.rmtree(captures[1].run_dir)  # type: ignore[arg-type]
     (captures[2].run_dir / "normlift" / "manifest.json").write_text("{")  # type: ignore[operator]
     checkpoint = made.configs[3].parent / "nerfstudio_models" / "step-000000009.ckpt"
@@ -226,7 +210,7 @@ def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     shutil.rmtree(made.results)  # the runs themselves say that they are there
     made.work("--encoder", "color")
     assert sum(made.begun().values()) == 10
-    assert {outcome.state for outcome in read_jsonl(made.results, Outcome)} == {"skipped"}
+    assert {outcome.state for outcome in read_jsonl(made.results, batch.Outcome)} == {"skipped"}
 
 
 def test_an_interrupted_capture_is_free_at_once(tmp_path, in_process):
@@ -244,7 +228,7 @@ def test_an_interrupted_capture_is_free_at_once(tmp_path, in_process):
 
 def test_who_was_taken_for_dead_writes_nothing_and_takes_over_where_the_other_dies(tmp_path, in_process):
     made = Batch(tmp_path, ["0"])
-    (capture,) = read_captures(made.list, ())
+    (capture,) = batch.read_captures(made.list, ())
 
     def taken_over(beat: Callable[[], bool]) -> int | None:
         assert beat()
@@ -254,7 +238,7 @@ def test_who_was_taken_for_dead_writes_nothing_and_takes_over_where_the_other_di
     in_process.append(taken_over)
     made.work(patience=0.3)
     assert read_claim_states(made.results / "claims") == {capture.key: ClaimState(3, "done")}
-    assert [(line.attempt, line.state) for line in read_jsonl(made.results, Outcome)] == [(3, "done")]
+    assert [(line.attempt, line.state) for line in read_jsonl(made.results, batch.Outcome)] == [(3, "done")]
     assert made.begun() == {"c00": 1}
 
 
@@ -269,7 +253,7 @@ def test_an_interrupt_ends_the_program(tmp_path):
 
     words = [sys.executable, "-S", "-c", f"{program}; p.Path({str(end)!r}).touch()"]
     with pytest.raises(KeyboardInterrupt):
-        run_logged(words, tmp_path / "log", beat, 0.05)
+        batch.run_logged(words, tmp_path / "log", beat, 0.05)
     assert not end.exists() and not alive(int(pid.read_text() or "0"))
 
 
@@ -278,7 +262,7 @@ def test_lines_of_the_list(tmp_path, monkeypatch):
     lines = ["\ufeff# a list", "", "a/config.yml", '  "b c.ply" --colmap "b c" --reliability-beta 2  ']
     lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
     Path("list.txt").write_text("\r\n".join(lines), "utf8")
-    found = read_captures(Path("list.txt"), ("--encoder", "color"))
+    found = batch.read_captures(Path("list.txt"), ("--encoder", "color"))
     assert [capture.arguments[2:-2] for capture in found] == [
         ("--load-config", "a/config.yml"),
         ("--load-ply", "b c.ply", "--colmap", "b c", "--reliability-beta", "2"),
@@ -298,7 +282,7 @@ def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
 
     def key(text: str, *options: str) -> str:
         line.write_text(text)
-        return read_captures(line, options)[0].key
+        return batch.read_captures(line, options)[0].key
 
     path = str(tmp_path / "a.ply")
     first = key(path)
@@ -339,7 +323,7 @@ def test_lists_that_cannot_be(tmp_path, monkeypatch):
     ):
         Path("list.txt").write_bytes(text.encode("utf8", "surrogateescape"))
         with pytest.raises(InputError) as told:
-            read_captures(Path("list.txt"), options)
+            batch.read_captures(Path("list.txt"), options)
         assert all(fact in str(told.value) for fact in facts), (text, options, told.value)
 
 
@@ -369,7 +353,7 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
             monkeypatch.setenv(name, value)
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
         assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
-    lines = read_jsonl(made.results, Outcome)
+    lines = read_jsonl(made.results, batch.Outcome)
     assert len(lines) == len({line.key for line in lines}) == 5
     assert len(list(made.results.glob("*.jsonl"))) == 3
 
@@ -396,16 +380,16 @@ def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsy
 
 
 def test_the_last_attempt_counts_whatever_the_clocks_say():
-    def outcome(attempt: int, state: OutcomeState, clock: float) -> Outcome:
-        return Outcome("fox", "a", attempt, state, 1.0, "", 0, None, "w", clock)
+    def outcome(attempt: int, state: batch.OutcomeState, clock: float) -> batch.Outcome:
+        return batch.Outcome("fox", "a", attempt, state, 1.0, "", 0, None, "w", clock)
 
     failed, done, found = outcome(1, "failed", 9e9), outcome(2, "done", 5.0), outcome(3, "skipped", 1.0)
     broken = outcome(4, "failed", 0.0)
     for order in permutations([failed, done, found]):
-        assert latest_outcomes(order) == {"a": done}
+        assert batch.latest_outcomes(order) == {"a": done}
     for order in permutations([failed, found]):
-        assert latest_outcomes(order) == {"a": found}
-    assert latest_outcomes([broken, done, found]) == {"a": broken}
+        assert batch.latest_outcomes(order) == {"a": found}
+    assert batch.latest_outcomes([broken, done, found]) == {"a": broken}
 
 
 def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str]:
@@ -414,7 +398,7 @@ def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str
     return {f"SLURM_ARRAY_TASK_{name}": str(number) for name, number in numbers.items()}
 
 
-def held(parts: list[Shard], size: int) -> list[int]:
+def held(parts: list[batch.Shard], size: int) -> list[int]:
     """How many parts hold each entry of a list; no part is larger than another by more than one."""
     sizes = [sum(map(part.contains, range(size))) for part in parts]
     assert max(sizes) - min(sizes) <= 1
@@ -423,15 +407,17 @@ def held(parts: list[Shard], size: int) -> list[int]:
 
 @given(st.integers(1, 50), st.integers(0, 200))
 def test_shards_hold_everything_exactly_once(count, size):
-    words = held([make_shard(f"{i}/{count}", {}) for i in range(1, count + 1)], size)
-    ranks = held([make_shard("auto", {"RANK": str(i), "WORLD_SIZE": str(count)}) for i in range(count)], size)
+    words = held([batch.make_shard(f"{i}/{count}", {}) for i in range(1, count + 1)], size)
+    ranks = held([batch.make_shard("auto", {"RANK": str(i), "WORLD_SIZE": str(count)}) for i in range(count)], size)
     assert words == ranks == [1] * size
 
 
 @given(st.integers(1, 12), st.integers(0, 5), st.integers(1, 4), st.integers(1, 4), st.integers(0, 100))
 def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(count, least, step, ranks, size):
     parts = [
-        make_shard("auto", array(least + i * step, count, least, step) | {"RANK": str(r), "WORLD_SIZE": str(ranks)})
+        batch.make_shard(
+            "auto", array(least + i * step, count, least, step) | {"RANK": str(r), "WORLD_SIZE": str(ranks)}
+        )
         for i in range(count)
         for r in range(ranks)
     ]
@@ -439,14 +425,14 @@ def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(co
 
 
 def test_what_the_environment_says_and_cannot_say():
-    assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == WHOLE_LIST
-    assert make_shard("auto", array(5, 4, least=4)) == Shard(1, 4)
-    assert make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == Shard(2, 3)
-    assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
+    assert batch.make_shard("auto", {}) == batch.make_shard("none", array(1, 3)) == batch.WHOLE_LIST
+    assert batch.make_shard("auto", array(5, 4, least=4)) == batch.Shard(1, 4)
+    assert batch.make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == batch.Shard(2, 3)
+    assert batch.make_shard("3/3", array(1, 5)) == batch.Shard(2, 3)
 
     for word in ("", "1", "0/3", "4/3", "-1/3", "1/3/2", "a/b", "٣/٣", "1/99999999", " 1/2"):
         with pytest.raises(InputError, match="--shard must be auto, none, or i/n"):
-            make_shard(word, {})
+            batch.make_shard(word, {})
     for environment, *facts in (
         ({"RANK": "0"}, "RANK is set", "WORLD_SIZE is not"),
         ({"WORLD_SIZE": "2"}, "WORLD_SIZE is set", "RANK is not"),
@@ -459,5 +445,5 @@ def test_what_the_environment_says_and_cannot_say():
         (array(0, 2, least=1), "without gaps"),
     ):
         with pytest.raises(InputError) as told:
-            make_shard("auto", environment)
+            batch.make_shard("auto", environment)
         assert [fact for fact in facts if fact not in str(told.value)] == [], told.value

@@ -1,7 +1,5 @@
 """ns-normlift-check and ns-normlift --dry-run: what they tell, what they refuse, and that they leave nothing behind."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable
@@ -81,7 +79,18 @@ def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, tr
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
     assert code == 0 and states(found)["weights"] == "warning" and found["plan"] is None
     assert "ViT-B-16" in next(row for row in found["findings"] if row["what"] == "weights")["found"]
-    flags = ("--load-config", trained, "--regions", "patches", "--output-dir", tmp_path / "out", "--dry-run", "True")
+    flags = (
+        "--encoder",
+        "open_clip",
+        "--load-config",
+        trained,
+        "--regions",
+        "patches",
+        "--output-dir",
+        tmp_path / "out",
+        "--dry-run",
+        "True",
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     assert "weights are not on this machine" in said(capsys)
 

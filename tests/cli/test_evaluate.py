@@ -1,7 +1,5 @@
 """ns-normlift-eval on a lifted demo room: its protocols as a user types them, with stand-in vectors and labels."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import get_args

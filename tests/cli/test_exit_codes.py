@@ -1,7 +1,5 @@
 """How commands end: exit codes, what is said where, and what happens to output that cannot be written."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """The commands have the options of their dataclasses, each with a text; and they start."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """The commands on LangSplat's files, with real vectors of CLIP, and on the trained captures."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

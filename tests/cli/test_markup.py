@@ -1,7 +1,5 @@
 """Text is text: no markup, emoji code or escape of a prompt, path, name or label is interpreted by a command."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -21,7 +19,7 @@ HOSTILE = [
 ]  # fmt: skip
 NUMBERS = {
     "fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None,
-    "suggested_threshold": None, "histogram": None,
+    "suggested_threshold": None, "histogram": None, "verdict": "probably not here",
 }  # fmt: skip
 OBJECT = {
     "instance_id": 1, "size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3},
@@ -89,17 +87,9 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     """From the flag to the table, the files and their names; the colour is what the encoder reads."""
     texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
     folder = tmp_path / "[x] :smile: [/red]"
-    flags = (
-        "--load-config",
-        lifted,
-        "--output-json",
-        folder / "a.json",
-        "--render-dir",
-        folder,
-        "--render-views",
-        "0003",
-    )
-    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
+    monkeypatch.setattr(common.CONSOLE, "_width", 200)
+    flags = ("--output-json", folder / "a.json", "--render-dir", folder, "--render-views", "0003", "--text", *texts)
+    assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, *flags) == 0
     shown = capsys.readouterr().out
     for text in texts:
         assert escape_unprintable(text) in shown

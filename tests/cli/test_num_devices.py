@@ -1,7 +1,5 @@
 """Several processes lift one scene: the same files, whoever is killed meanwhile."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

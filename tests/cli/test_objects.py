@@ -150,18 +150,19 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
 
 
 def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    flags = ("--load-config", lifted, "--text", "red", "bright magenta", "--output-json", tmp_path / "x.json")
+    flags = ("--load-config", lifted, "--text", "red", "hot pink", "--output-json", tmp_path / "x.json")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = said(capsys)
-    assert "bright magenta: probably not in this scene" in shown
-    assert "red: probably not" not in shown
+    assert "hot pink: probably not here" in shown
+    assert "red: " not in shown
     there, absent = json.loads((tmp_path / "x.json").read_text())["queries"]
-    assert (there["stands_out"], absent["stands_out"]) == (True, False)
-    assert absent["histogram"]["top"] < 0.9 < there["histogram"]["top"]
+    assert (there["verdict"], absent["verdict"]) == ("found", "probably not here")
+    assert absent["histogram"]["top"] < 0.66 and there["histogram"]["top"] > 0.74
+    assert there["fraction"] > 0.005 and absent["fraction"] == 0
     assert sum(there["histogram"]["counts"]) == sum(absent["histogram"]["counts"]) > 1000
-    nothing = ("--load-config", lifted, "--text", "bright magenta", "--explain")
+    nothing = ("--load-config", lifted, "--text", "hot pink", "--explain")
     assert run_entry(monkeypatch, query.entrypoint, *nothing, "--threshold", "0.999") == 0
-    assert "bright magenta: nothing is selected" in said(capsys)
+    assert "hot pink: nothing is selected" in said(capsys)
 
 
 def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch) -> None:

@@ -1,7 +1,5 @@
 """Mistakes that show before torch is imported: what they say, and what they cost."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -51,7 +49,7 @@ def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"normlift_ns.{name}", None)
 
 
-COLOUR = ("--encoder", "color")
+COLOUR, CLIP = ("--encoder", "color"), ("--encoder", "open_clip")
 LIFT = [
     ("--encoder color --reliability-beta nan", "--reliability-beta", "got nan"),
     ("--encoder words", "'words'", "--encoder"),
@@ -218,7 +216,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
             return there
 
         monkeypatch.setattr(open_clip, "has_local_clip_weights", at_hand, raising=False)
-        code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, "--timestamp", "old")
+        code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *CLIP, "--timestamp", "old")
         assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
         text = said(capsys)
         assert ("laion2b_s34b_b88k" in text and "https://hub cannot be reached" in text) == (there is False)

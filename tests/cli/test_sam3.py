@@ -77,7 +77,7 @@ def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
 
     def ask(*more: str) -> dict:
         flags = ("--load-config", lifted, "--output-json", table, "--overwrite", "True", "--segment", "sam3")
-        flags = (*flags, "--segment-model", weights, "--segment-views", 4)
+        flags = (*flags, "--segment-model", weights, "--segment-views", 4, "--threshold", 0.6)
         assert run_entry(monkeypatch, query.entrypoint, *flags, *more) == 0
         return json.loads(table.read_text())["queries"][0]["segment"]
 

@@ -1,7 +1,5 @@
 """nerfstudio's own commands on lifted runs, in this process and as a user starts them, on the CPU."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What the commands print, and where: --quiet, --log-file, colours, warnings of others, errors that can be copied."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -12,23 +10,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from normlift_ns.cli import evaluate, export, lift, query, view
-from normlift_ns.cli.common import (
-    OutputSettings,
-    info,
-    info_opening,
-    info_progress,
-    one_line_errors,
-    split_output_flags,
-)
+from normlift_ns.cli import common, evaluate, export, lift, query, view
 from normlift_ns.errors import InputError
 from tests.cli.conftest import SMALL, run_entry
 
 
 def talk(word: str) -> None:
-    info_opening(Path("run"))
-    info_progress("lift")
-    info(f"answer {word}")
+    common.info_opening(Path("run"))
+    common.info_progress("lift")
+    common.info(f"answer {word}")
     for text, category in (("old", FutureWarning), ("wrong", UserWarning)):
         warnings.warn_explicit(text, category, "/site-packages/torch/jit.py", 7)
     sys.stdout.write("\x1b[31mred\x1b[0m\n")
@@ -69,16 +59,16 @@ def test_mistakes_are_messages(ended) -> None:
         (("--log-file",), "--log-file"),
         (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
     ):
-        code, out, err = ended(info, *flags)
+        code, out, err = ended(common.info, *flags)
         assert (code, out) == (1, "") and "Traceback" not in err
         assert [fact for fact in facts if fact not in err] == [], flags
 
 
 def test_words_for_another_command_stay() -> None:
     words = ["list.txt", "--quiet", "False", "--", "--quiet", "--log-file", "x"]
-    assert split_output_flags(words) == (["list.txt", *words[3:]], OutputSettings())
+    assert common.split_output_flags(words) == (["list.txt", *words[3:]], common.OutputSettings())
     with pytest.raises(InputError):
-        split_output_flags(["--log-file", "--vote-k"])
+        common.split_output_flags(["--log-file", "--vote-k"])
 
 
 def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
@@ -162,7 +152,7 @@ def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
 def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> None:
     assert run_entry(monkeypatch, lift.entrypoint, "--help") == 0
     assert "usage: " in capsys.readouterr().out
-    with one_line_errors("command"):
+    with common.one_line_errors("command"):
         print("k is lowered", file=sys.stderr)
     assert capsys.readouterr().err == "k is lowered\n"
 

@@ -1,7 +1,5 @@
 """Files of splats and cameras, written as the tools of others write them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import replace

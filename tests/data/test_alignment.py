@@ -1,7 +1,5 @@
 """Photographs, cameras and Gaussians that belong together, and such that do not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

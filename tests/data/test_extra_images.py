@@ -1,7 +1,5 @@
 """Photographs that were added after the training: their cameras in the world of the scene, and worlds that differ."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

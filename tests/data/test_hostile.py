@@ -1,7 +1,5 @@
 """Files of splats, cameras and images that somebody has damaged or made up: only our own errors leave a loader."""
 
-from __future__ import annotations
-
 import codecs
 import io
 import json

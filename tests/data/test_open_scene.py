@@ -1,7 +1,5 @@
 """One scene by every way in: evidence and answers are those of the nerfstudio run."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -13,17 +11,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from normlift_ns import (
-    InputError,
-    LiftOptions,
-    RefineConfig,
-    SourceOptions,
-    SplatOptions,
-    lift_run,
-    open_run,
-    open_scene,
-    open_splat,
-)
+import normlift_ns as nl
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.open_scene import open_saved_splat
@@ -38,14 +26,14 @@ from tests.random_scenes import generator
 ROUNDED = 5e-4
 """Where the Gaussians themselves were moved to another world in float32, single pixels cross thresholds: 9e-5 seen."""
 OPTIONS = {
-    "source": SourceOptions(encoder="color", regions="grid"),
-    "lift": LiftOptions(storage="evidence", max_views=4, vote=RefineConfig(k=12)),
+    "source": nl.SourceOptions(encoder="color", regions="grid"),
+    "lift": nl.LiftOptions(storage="evidence", max_views=4, vote=nl.RefineConfig(k=12)),
 }
 
 
 @pytest.fixture(scope="module")
 def native(trained: Path):
-    return open_scene(trained)
+    return nl.open_scene(trained)
 
 
 @pytest.fixture(scope="module")
@@ -78,15 +66,15 @@ def difference(native, scene, views=(0, 3, 6, 9)) -> float:
 
 
 @pytest.fixture
-def of_run(native, trained: Path) -> SplatOptions:
+def of_run(native, trained: Path) -> nl.SplatOptions:
     """Cameras and world of the run."""
     world = trained.parent / "dataparser_transforms.json"
-    return SplatOptions(transforms=native.location.folder, world_transform=world)
+    return nl.SplatOptions(transforms=native.location.folder, world_transform=world)
 
 
 def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_path: Path) -> None:
     said: list[str] = []
-    scene = open_splat(write_ply(tmp_path / "s.ply", ply_columns(splat)), of_run, say=said.append)
+    scene = nl.open_splat(write_ply(tmp_path / "s.ply", ply_columns(splat)), of_run, say=said.append)
     assert scene.train.names == native.train.names
     assert scene.held_out.names == native.held_out.names  # transforms.json names them
     for fact in ("2 of 14", "classic", "Inria"):
@@ -101,9 +89,9 @@ def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_pa
 
 
 @pytest.fixture
-def given(native) -> SplatOptions:
+def given(native) -> nl.SplatOptions:
     """Images and held-out names of the run."""
-    return SplatOptions(
+    return nl.SplatOptions(
         colmap=Path("p"), images=native.location.folder / "images", eval_images=tuple(native.held_out.names),
         gsplat_normalize=False,
     )  # fmt: skip
@@ -116,7 +104,7 @@ def test_a_ply_file_with_a_colmap_project(native, splat, frames, given, tmp_path
     there = in_file_world(frames, matrix)
     for binary, turned, world in ((True, frames, None), (False, there, tmp_path / "world.json")):
         project = write_colmap(tmp_path / f"p{binary}", turned, "PINHOLE", binary=binary)
-        scene = open_splat(path, replace(given, colmap=project, world_transform=world))
+        scene = nl.open_splat(path, replace(given, colmap=project, world_transform=world))
         assert scene.train.names == native.train.names
         assert difference(native, scene) < 1e-5
 
@@ -138,7 +126,7 @@ def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, ki
         points = points @ back[:3, :3].T + back[:3, 3]
         write_gsplat(path, _in_world(splat, _normalization(frames, points) @ back))
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
-    scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=kind == "normalized"))
+    scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=kind == "normalized"))
     assert scene.step == 29999
     assert difference(native, scene) < (ROUNDED if kind == "normalized" else 1e-5)
 
@@ -192,7 +180,7 @@ def test_a_normalized_world_is_found(native, splat, frames, given, tmp_path: Pat
         else:
             path = write_gsplat(tmp_path / f"ckpt_{number}_rank0.pt", there)
         said: list[str] = []
-        scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
+        scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
         assert any(("normalized world" if number == 0 else "half a turn") in text for text in said)
         assert not any("have no camera" in text for text in said)
         assert difference(native, scene) < ROUNDED
@@ -202,13 +190,13 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     monkeypatch.chdir(tmp_path)
     capture = shutil.copytree(native.location.folder, tmp_path / "capture")
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    scene = open_splat(path, replace(of_run, transforms=capture))
-    run = lift_run(scene, timestamp="t", **OPTIONS)
+    scene = nl.open_splat(path, replace(of_run, transforms=capture))
+    run = nl.lift_run(scene, timestamp="t", **OPTIONS)
     assert run.folder == tmp_path / "outputs" / "capture" / "normlift" / "t"
     path.unlink()  # the run holds its own copy
-    of_native = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check_alignment=False, **OPTIONS)
+    of_native = nl.lift_run(native, output_dir=tmp_path / "native", timestamp="t", check_alignment=False, **OPTIONS)
     expected = of_native.ask("red", "yellow")
-    again = open_run(run.config)
+    again = nl.open_run(run.config)
     assert again.scene.train.names == scene.train.names
     assert again.scene.held_out.names == scene.held_out.names
     for view, other in zip(again.scene.train.cameras, scene.train.cameras):
@@ -222,25 +210,25 @@ def test_the_lifted_run_opens_again_also_where_it_moved(native, splat, of_run, t
     assert np.abs(again.render("0003").numpy().astype(int) - photograph).mean() < 3
     rows = again.export(tmp_path / "again.ply", found["red"])
     assert 0.9 * int(found["red"].mask.sum()) < len(rows) <= int(found["red"].mask.sum())  # all but the faintest
-    second = lift_run(again.config, timestamp="second", check_alignment=False, **OPTIONS)  # and can be lifted again
+    second = nl.lift_run(again.config, timestamp="second", check_alignment=False, **OPTIONS)  # and can be lifted again
     assert torch.equal(second.ask("red").selected, again.ask("red").selected)
 
     capture.rename(tmp_path / "elsewhere")
     with pytest.raises(FileNotFoundError, match=r"14 of the 14 .* --data"):
-        open_run(run.config)
-    assert open_run(run.config, data=tmp_path / "elsewhere").scene.train[0].image.shape == (120, 160, 3)
+        nl.open_run(run.config)
+    assert nl.open_run(run.config, data=tmp_path / "elsewhere").scene.train[0].image.shape == (120, 160, 3)
     moved = (tmp_path / "outputs").rename(tmp_path / "results") / run.config.relative_to(tmp_path / "outputs")
-    opened = open_run(moved, data=tmp_path / "elsewhere" / "images")
+    opened = nl.open_run(moved, data=tmp_path / "elsewhere" / "images")
     assert opened.scene.train.names == scene.train.names
     assert torch.equal(opened.ask("red").selected, found.selected[:, :1])
     with pytest.raises(FileNotFoundError, match=r"nowhere, given with --data"):
-        open_run(moved, data=tmp_path / "nowhere")
+        nl.open_run(moved, data=tmp_path / "nowhere")
 
 
 def test_every_degree_is_saved_and_drawn(splat, of_run, tmp_path: Path) -> None:
     for degree in range(4):
         rest = 0.2 * torch.randn(len(splat), (degree + 1) ** 2 - 1, 3, generator=generator(0))
-        scene = open_splat(write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest))), of_run)
+        scene = nl.open_splat(write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest))), of_run)
         again = open_saved_splat(saved_run(tmp_path / str(degree), scene))
         camera = scene.train.cameras[2]
         assert torch.equal(again.colors(camera), scene.colors(camera))
@@ -306,10 +294,10 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"transforms": "t.json"}, "--colmap"),
         (every, "0 points"),
     ):
-        with pytest.raises((InputError, FileNotFoundError), match=message):
-            open_splat(path, SplatOptions(**options))
+        with pytest.raises((nl.InputError, FileNotFoundError), match=message):
+            nl.open_splat(path, nl.SplatOptions(**options))
     with pytest.raises(TypeError, match="SplatOptions, got str and str"):
-        open_splat("x.ply", "capture")  # type: ignore[arg-type]
+        nl.open_splat("x.ply", "capture")  # type: ignore[arg-type]
 
 
 def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
@@ -317,9 +305,9 @@ def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_
     for count, hint in ((12, "--test-every 8"), (5, "--test-every or --eval-images")):
         moves = {"embeds.weight": torch.zeros(count, 9)}
         path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
-        with pytest.raises(InputError, match=f" {count} training views.*{hint}"):
-            open_splat(path, options)
-    assert len(open_splat(tmp_path / "ckpt_12_rank0.pt", replace(options, test_every=8)).train) == 12
+        with pytest.raises(nl.InputError, match=f" {count} training views.*{hint}"):
+            nl.open_splat(path, options)
+    assert len(nl.open_splat(tmp_path / "ckpt_12_rank0.pt", replace(options, test_every=8)).train) == 12
 
 
 def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames, given, tmp_path: Path) -> None:
@@ -329,7 +317,7 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
     (tmp_path / "images_2").mkdir()
     for frame in frames:  # of other format, as gsplat's trainer makes them
         Image.open(frame.file).resize((81, 60)).save(tmp_path / "images_2" / f"{frame.file.stem}.webp")
-    scene = open_splat(path, replace(base, images=tmp_path / "images_2", test_every=8, views="all"))
+    scene = nl.open_splat(path, replace(base, images=tmp_path / "images_2", test_every=8, views="all"))
     assert (len(scene.train), len(scene.held_out), scene.train.names[0]) == (14, 0, "images_2/0000.webp")
     camera, full = scene.train.cameras[0], native.train.cameras[0]
     assert (camera.width, camera.height) == (81, 60)
@@ -343,7 +331,7 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
         ({"eval_images": (str(tmp_path / "list.txt"),)}, [names[3], names[5]]),
         ({"eval_images": ("0.1",)}, shares),
     ):
-        scene = open_splat(path, replace(base, **more))
+        scene = nl.open_splat(path, replace(base, **more))
         assert scene.held_out.names == expected
         assert scene.train.names == [name for name in names if name not in expected]
 
@@ -361,8 +349,8 @@ def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
         entries.append({"file_path": f"images/{name}", "transform_matrix": pose, **camera})
     (tmp_path / "cap" / "transforms.json").write_text(json.dumps({"frames": entries}))
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    options = SplatOptions(transforms=tmp_path / "cap", images=tmp_path / "photos")
-    scene = open_splat(path, options)
+    options = nl.SplatOptions(transforms=tmp_path / "cap", images=tmp_path / "photos")
+    scene = nl.open_splat(path, options)
     assert (scene.train.names[0], scene.train.names[-1]) == ("photos/left/0000.png", "photos/right/0006.png")
     run = saved_run(tmp_path / "run", scene)
     facts = {"name", "rasterize_mode", "background", "photographs", "identity"}
@@ -371,12 +359,12 @@ def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
         again = open_saved_splat(run, data=(tmp_path / "photos").rename(tmp_path / "moved") if move else tmp_path)
         assert again.train.names == scene.train.names
         assert again.train[3].image.shape == (120, 160, 3)
-    with pytest.raises(InputError, match=r" 0000_s\.npy"):
-        lift_run(again, export=FeatureExport(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
+    with pytest.raises(nl.InputError, match=r" 0000_s\.npy"):
+        nl.lift_run(again, export=FeatureExport(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
     (tmp_path / "moved" / "left" / "0001.png").rename(tmp_path / "moved" / "0001.png")
     (tmp_path / "moved" / "right" / "0001.png").unlink()
-    with pytest.raises(InputError, match=r"moved/0001\.png for both"):
-        open_splat(path, replace(options, images=tmp_path / "moved"))
+    with pytest.raises(nl.InputError, match=r"moved/0001\.png for both"):
+        nl.open_splat(path, replace(options, images=tmp_path / "moved"))
 
 
 @needs_shared
@@ -388,10 +376,10 @@ def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
     pixels on and off; so COLMAP's project is held against the same poses made orthonormal.
     """
     config = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    scene = open_scene(config)
+    scene = nl.open_scene(config)
     path = write_ply(tmp_path / "s.ply", ply_columns(SplatParameters(**scene.parameters)))
     folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
-    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, eval_images=("0.1",)))
+    of_json = nl.open_splat(path, nl.SplatOptions(transforms=folder, world_transform=world, eval_images=("0.1",)))
     assert of_json.train.names == scene.train.names
     assert difference(scene, of_json, (0, -1)) < 1e-5
     rigid = []
@@ -399,8 +387,8 @@ def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
         rotation = Rotation.from_matrix(frame.pose[:, :3]).as_matrix()
         rigid.append(replace(frame, pose=np.column_stack([rotation, frame.pose[:, 3]])))
     write_transforms(tmp_path / "rigid.json", rigid, [])
-    expected = open_splat(path, SplatOptions(transforms=tmp_path / "rigid.json", world_transform=world))
+    expected = nl.open_splat(path, nl.SplatOptions(transforms=tmp_path / "rigid.json", world_transform=world))
     for binary in (True, False):
         project = write_colmap(tmp_path / f"p{binary}", rigid, binary=binary)
-        options = SplatOptions(colmap=project, images=folder / "images", world_transform=world)
-        assert difference(expected, open_splat(path, options), (0, -1)) < 1e-5
+        options = nl.SplatOptions(colmap=project, images=folder / "images", world_transform=world)
+        assert difference(expected, nl.open_splat(path, options), (0, -1)) < 1e-5

@@ -1,7 +1,5 @@
 """Formats of splats that other packages read."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Who is gone is noticed; who is slow is waited for."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

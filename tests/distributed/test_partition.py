@@ -1,7 +1,5 @@
 """What a team finds is what one process finds, bit for bit, however many there are."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import fields
 from types import SimpleNamespace

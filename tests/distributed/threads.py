@@ -1,7 +1,5 @@
 """A team of threads: what processes exchange, without any processes."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Small networks on disk, made once for all tests; a test that changes files copies them."""
 
-from __future__ import annotations
-
 import urllib.error
 import urllib.request
 from collections.abc import Callable

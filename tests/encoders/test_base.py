@@ -1,9 +1,12 @@
 """The values and the protocol that features come in."""
 
+import pytest
 import torch
 
-from normlift_ns.encoders.base import RegionFeatures, ViewFeatures
+from normlift_ns.encoders.base import PatchFeatures, RegionFeatures, ViewFeatures
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.plugins import PluginEncoder
 from normlift_ns.segmentation.regions import Grid
 from tests.encoders.tiny import refused
 
@@ -40,6 +43,40 @@ def test_regions_of_cells_must_have_features():
     ):
         given = torch.tensor(regions, dtype=torch.int32)
         refused(lambda given=given: ViewFeatures(labels, UNIT, given), *parts)
+
+
+class Blind:
+    """An encoder without features of odd regions and patches."""
+
+    identity, why_not_dense, calls = {"kind": "blind"}, None, 0
+
+    def encode(self, image, labels):
+        return self.patches(image, 1, int(labels.max()) + 1)
+
+    def encode_each(self, views):
+        return (self.encode(*view) for view in views)
+
+    def patches(self, image, rows, columns):
+        self.calls += 1
+        return torch.eye(rows * columns) * (torch.arange(rows * columns) % 2 == 0)
+
+    def text(self, prompts):
+        return torch.zeros(len(prompts), 4)
+
+
+@pytest.mark.parametrize("kind", ["regions", "patches"])
+def test_regions_without_a_feature_are_unlabeled(kind, tmp_path):
+    encoder, image = Blind(), torch.zeros(4, 4, 3, dtype=torch.uint8)
+    plugin = PluginEncoder.made("blind", lambda: encoder)
+    for source in (PatchFeatures(x, 4) if kind == "patches" else RegionFeatures(Grid(4), x) for x in (encoder, plugin)):
+        encoder.calls = 0
+        kept = cached(source, tmp_path / type(source.encoder).__name__)
+        for view in (source.view(image, "a.png"), kept.view(image, "a.png"), kept.view(image, "a.png")):
+            region = torch.cat([view.region_of_cell[0], torch.tensor([-1])])[view.labels.long()]
+            assert region[::2, ::2].tolist() == [[0, -1], [1, -1]]
+            assert torch.equal(view.features, torch.eye(4)[::2])
+        assert encoder.calls == 2
+    refused(lambda: plugin.text(["a"]), "'blind'", "length is not 1")
 
 
 def test_other_images_and_texts_are_refused():

@@ -1,7 +1,5 @@
 """What every encoder keeps to."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +31,7 @@ def options_of(name: str, folder: Path) -> SourceOptions:
     if name == "color":
         return SourceOptions(encoder="color")
     if name == "open_clip":
-        return SourceOptions(encoder_model=CLIP, encoder_pretrained=str(folder / "tiny.safetensors"))
+        return SourceOptions("open_clip", encoder_model=CLIP, encoder_pretrained=str(folder / "tiny.safetensors"))
     return SourceOptions(encoder=HUB[name], encoder_model=str(folder))
 
 

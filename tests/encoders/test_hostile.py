@@ -1,7 +1,5 @@
 """Files that are damaged, absurd or no files: only our own errors leave the loaders."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -196,7 +194,7 @@ def test_cache_entries_that_do_not_fit_are_made_again(tmp_path: Path) -> None:
     expected = source.view(IMAGE, NAME)
     short = torch.zeros(1, 1, 6, 8, dtype=torch.int16)
     labels = [short[..., :7], short[0], short[:0].int(), short - 2, short.float(), short.long()]
-    features = [torch.zeros(12, 3), torch.full((12, 3), torch.nan), torch.eye(3)[:2], torch.ones(12)]
+    features = [torch.full((12, 3), 0.1), torch.full((12, 3), torch.nan), torch.eye(3)[:2], torch.ones(12)]
     features += [torch.zeros(12, 0), torch.eye(3).expand(5, 3, 3).reshape(15, 3), torch.eye(12).half()]
     for kind, name, tensors in (("regions", "labels", labels), ("features", "features", features)):
         (path,) = (tmp_path / kind).iterdir()

@@ -1,7 +1,5 @@
 """SigLIP, SigLIP 2 and MetaCLIP 2: the same numbers as the library's own processor and model, in float64."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A run that SigLIP 2 lifted: asked through the commands' own code, again without its weights, and with others."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -13,11 +11,12 @@ import pytest
 import torch
 
 from normlift_ns.encoders.base import PatchFeatures
-from normlift_ns.encoders.build import make_source, resolve_regions, source_settings
+from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.text_encoder import default_rule, encoder_settings, text_encoder_for
+from normlift_ns.segmentation.registry import resolve_regions
 from tests.encoders.tiny import copied, refused
 
 

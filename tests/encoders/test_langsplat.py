@@ -1,7 +1,5 @@
 """LangSplat's files, put together by numpy, so that reading is tested without our writing; and our own."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

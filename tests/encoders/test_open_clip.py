@@ -176,7 +176,7 @@ def test_bad_weight_files_are_named_with_a_remedy(clip_weights, tmp_path):
 
 
 def test_absent_weights_give_one_message(empty_hub):
-    encoder = make_encoder(SourceOptions())
+    encoder = make_encoder(SourceOptions("open_clip"))
     assert encoder.identity["pretrained"] == "laion2b_s34b_b88k"
     parts = ("'laion2b_s34b_b88k'", "ViT-B-16", "laion/CLIP-ViT-B-16-laion2B-s34B-b88K", "Name or service not known")
     remedies = ("--encoder-pretrained FILE", "--encoder color")

@@ -1,7 +1,5 @@
 """Encoders by entry point: how they are found, what a broken one does, the recipe of CONTRIBUTING.md as a package."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -35,7 +33,7 @@ from tests.conftest import project
 from tests.encoders.tiny import refused
 
 ROOT = Path(__file__).parents[2]
-OURS = ["color", "metaclip2", "open_clip", "siglip", "siglip2"]
+OURS = ["color", "imagenet", "metaclip2", "open_clip", "siglip", "siglip2"]
 
 
 def install(folder: Path, package: str, points: str, code: str = "") -> None:
@@ -70,7 +68,8 @@ def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     assert ENCODERS.names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
-        assert (kind.rule, kind.threshold) == (("cosine" if name == "color" else "lerf"), 0.5)
+        expected = {"color": ("cosine", 0.7), "imagenet": ("cosine", "auto")}.get(name, ("lerf", 0.5))
+        assert (kind.rule, kind.threshold) == expected
         assert isinstance(kind, encoders.EncoderKind)  # where packages of others import it from
 
 
@@ -78,7 +77,7 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     install(tmp_path, "plug", points(other="plug:KIND", same="plug:KIND"))
     install(tmp_path, "two", points(same="two:KIND"))
     monkeypatch.syspath_prepend(tmp_path)
-    parts = ("'clip'", "--encoder", "color, metaclip2, open_clip, other, same, siglip, siglip2")
+    parts = ("'clip'", "--encoder", "color, imagenet, metaclip2, open_clip, other, same, siglip, siglip2")
     refused(lambda: encoder_kind("clip"), *parts)
     refused(lambda: check_source_options(SourceOptions(encoder="clip"), ()), *parts)
     assert find_encoder_kind("clip") is None and find_encoder_kind(3) is None
@@ -144,7 +143,7 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
     def options(**more: Any) -> SourceOptions:
         return SourceOptions(**{"encoder": "color", "regions": "halves", **more})
 
-    refused(options, "must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'halves'")
+    refused(options, "must be one of auto, sam, sam3, edges, patches, superpixel, grid, files; got 'halves'")
     with plugged(tmp_path / "good", "halves_plug", entry, MASKS.format(labels=halves)):
         check_source_options(options(level="2"), ())
         source = make_source(options(level="2"))
@@ -153,7 +152,9 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
         assert len(view.features) == 2 and view.labels.tolist() == [[0, 1]] * 4
         assert cached(source, tmp_path / "cache").view(image, "a.png").labels.equal(view.labels)
         refused(lambda: check_source_options(options(sam_model="a/b"), ()), "--sam-model a/b", '"halves"')
-        refused(lambda: options(regions="langsplat"), "auto, sam, sam3, patches, superpixel, grid, files, halves")
+        refused(
+            lambda: options(regions="langsplat"), "auto, sam, sam3, edges, patches, superpixel, grid, files, halves"
+        )
     for number, (labels, parts) in enumerate((
         ("torch.zeros(2, 2)", ["torch.float32 (2, 2)", "(4, 2)", "[H, W]"]),
         (f"{halves} * 2", ["0..2", "without gaps"]),

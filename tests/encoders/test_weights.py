@@ -1,7 +1,5 @@
 """Whether weights are on this machine, told without importing anything heavy."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Folders of SigLIP, SigLIP 2 and MetaCLIP 2, written by transformers; tests import this while they run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

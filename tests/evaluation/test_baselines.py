@@ -1,7 +1,5 @@
 """Ideas of other methods on a run's own features, against dense sums over pixels in float64."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import replace
@@ -15,17 +13,7 @@ from torch.nn.functional import normalize
 
 from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.evaluation.baselines import (
-    BASELINES,
-    TOP,
-    VISIBLE,
-    baseline_field,
-    dense_sums,
-    feature_maps,
-    lifted_batches,
-    timing_obstacle,
-    with_consensus,
-)
+from normlift_ns.evaluation import baselines
 from normlift_ns.evaluation.options import Evaluation
 from normlift_ns.evaluation.protocols import EvaluatedRun
 from normlift_ns.evaluation.studies import study_ablation, study_timing, voting_scalars
@@ -57,8 +45,8 @@ def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
     """Per view: the camera, A [N, P] in float64, and the feature of every pixel [P, D], 0 without a region."""
     found = []
     pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.int32).view(HEIGHT, WIDTH)
-    for block in lifted_batches(lifted, "cpu"):
-        for camera, features in zip(block.cameras, feature_maps(block, "cpu")):
+    for block in baselines.lifted_batches(lifted, "cpu"):
+        for camera, features in zip(block.cameras, baselines.feature_maps(block, "cpu")):
             weights = rasterize_evidence(lifted.scene.gaussians, [camera], [pixels]).rows
             found.append((camera, dense(weights, HEIGHT * WIDTH).double(), features.flatten(0, 1).double()))
     return found
@@ -83,7 +71,7 @@ def occam(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
 def drsplat(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     total = 0
     for _, weights, features in seen:
-        kept = weights * (weights >= weights.topk(TOP, dim=0).values[-1])
+        kept = weights * (weights >= weights.topk(baselines.TOP, dim=0).values[-1])
         total = total + kept @ features
     return normalize(total)
 
@@ -95,7 +83,9 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     for j in range(0, N, 4):  # the rest would take a second
         views = [(weights[j], features) for weights, features in labelled]
         most = max(float(weight.sum()) for weight, _ in views)
-        used = [(weight, features) for weight, features in views if weight.sum() >= VISIBLE * most and most > 0]
+        used = [
+            (weight, features) for weight, features in views if weight.sum() >= baselines.VISIBLE * most and most > 0
+        ]
         if len(used) == 0:
             continue
         weight, features = (torch.cat(part) for part in zip(*used))
@@ -109,9 +99,9 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
 def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
     monkeypatch.setattr("normlift_ns.evaluation.baselines._BLOCK", 60)
     seen, methods = observations(lifted), (sfs, occam, vala, drsplat)
-    assert {method.__name__ for method in methods} == set(BASELINES)
+    assert {method.__name__ for method in methods} == set(baselines.BASELINES)
     for method in methods:
-        field = baseline_field(method.__name__, lifted, "cpu")
+        field = baselines.baseline_field(method.__name__, lifted, "cpu")
         expected = method(seen, lifted.scene.gaussians.means)
         valid = field.valid(refined=False)
         if method is vala:
@@ -126,10 +116,10 @@ def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
 
 
 def test_the_views_are_those_of_the_lift(lifted):
-    cameras = [camera for block in lifted_batches(lifted, "cpu") for camera in block.cameras]
+    cameras = [camera for block in baselines.lifted_batches(lifted, "cpu") for camera in block.cameras]
     every = list(map(id, lifted.scene.train.cameras))
     assert [every.index(id(camera)) for camera in cameras] == [0, 1, 3, 4]
-    few = [camera for block in lifted_batches(lifted, "cpu", max_views=2) for camera in block.cameras]
+    few = [camera for block in baselines.lifted_batches(lifted, "cpu", max_views=2) for camera in block.cameras]
     assert [every.index(id(camera)) for camera in few] == [0, 4]
 
 
@@ -146,7 +136,7 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
         ({"features": {"kind": "other"}}, "other features"),
     ):
         with pytest.raises(InputError, match=message):
-            baseline_field("sfs", changed(lifted, **change), "cpu")
+            baselines.baseline_field("sfs", changed(lifted, **change), "cpu")
 
 
 @pytest.mark.parametrize("power", [0.0, 2.0])
@@ -163,11 +153,11 @@ def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}
     agreed = replace(lifted, field=replace(found, manifest=json.loads(json.dumps(manifest))))
-    assert with_consensus(lifted, False, "cpu") is lifted
-    assert with_consensus(agreed, True, "cpu") is agreed
-    plain = with_consensus(agreed, False, "cpu")
+    assert baselines.with_consensus(lifted, False, "cpu") is lifted
+    assert baselines.with_consensus(agreed, True, "cpu") is agreed
+    plain = baselines.with_consensus(agreed, False, "cpu")
     assert not plain.refined and plain.field.manifest["options"]["consensus"] is False
-    pairs = ((plain.field, lifted.field), (with_consensus(plain, True, "cpu").field, agreed.field))
+    pairs = ((plain.field, lifted.field), (baselines.with_consensus(plain, True, "cpu").field, agreed.field))
     for ours, theirs in pairs:
         assert torch.allclose(ours.directions(refined=False), theirs.directions(refined=False), atol=2e-3)
         for name in ("norm", "n_eff", "weight"):
@@ -193,7 +183,7 @@ def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
     agreed = ["consensus", "consensus_paper", "consensus_posterior"]
     assert [row["variant"] for row in rows] == [*names, *agreed]
     assert told == []
-    other = with_consensus(lifted, True, "cpu")
+    other = baselines.with_consensus(lifted, True, "cpu")
     again = study_ablation([other], evaluate, "cpu", told.append)
     assert [row["variant"] for row in again] == [row["variant"] for row in rows]
     for ours, theirs in zip(again, rows):
@@ -225,8 +215,10 @@ def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
         pytest.skip("gsplat's compiled part is missing")
     scene = lifted.scene.gaussians.to("cuda")
     job = RasterJob(scene, False, RasterSettings(), torch.float32)
-    for block in lifted_batches(lifted, "cuda"):
-        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), block.features[0].shape[1])
+    for block in baselines.lifted_batches(lifted, "cuda"):
+        found = baselines.dense_sums(
+            job, block.cameras, baselines.feature_maps(block, "cuda"), block.features[0].shape[1]
+        )
         counts = [regions.shape[1] for regions in block.regions]
         cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
         expected = cells_to_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
@@ -239,8 +231,8 @@ def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
 
 @needs_gpu
 def test_ideas_are_the_same_on_a_gpu(lifted):
-    for name in BASELINES:
-        here, there = (baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
+    for name in baselines.BASELINES:
+        here, there = (baselines.baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
         cosine = (here.directions(refined=False) * there.directions(refined=False)).sum(1)
         assert (cosine[here.valid(refined=False)] > 1 - 1e-3).float().mean() > 0.98
         assert (here.valid(refined=False) == there.valid(refined=False)).float().mean() > 0.99
@@ -251,7 +243,7 @@ def test_what_is_left_out_is_said(lifted):
     (row,) = study_timing([lifted], "cpu", told.append)
     assert "dense512_s" not in row
     assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
-    assert len(told) == 1 and timing_obstacle(lifted, "cpu") in told[0] and "--device cpu" in told[0]
+    assert len(told) == 1 and baselines.timing_obstacle(lifted, "cpu") in told[0] and "--device cpu" in told[0]
     cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
     older = changed(lifted, cost=cost)
     table = study_timing([lifted, older], "cpu")
@@ -280,6 +272,6 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
     g = generator(0)
     maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
     job = RasterJob(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
-    found = dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
+    found = baselines.dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
     expected = sum(w @ features.flatten(0, 1) for (_, w, _), features in zip(seen, maps))
     assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)

@@ -1,7 +1,5 @@
 """Where to look next: gains against a loop, regions and photographs of a wall of which the lift saw one side only."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import permutations
@@ -18,15 +16,6 @@ from normlift_ns.core.scene import camera_summary
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation import coverage
-from normlift_ns.evaluation.coverage import (
-    FAINT,
-    Coverage,
-    ReliabilityModel,
-    choose_views,
-    coverage_of,
-    gains,
-    lifted_names,
-)
 from normlift_ns.rasterization.settings import RasterSettings
 from tests.random_scenes import Photographs, generator, made_scene
 
@@ -86,10 +75,10 @@ def lifted(scene: Any, used: list[int], *, blank: tuple[int, ...] = ()) -> Seman
 
 
 @pytest.fixture(scope="module")
-def one_side() -> Coverage:
+def one_side() -> coverage.Coverage:
     """What is said of a lift that saw the near side."""
     scene = wall()
-    return coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)))
+    return coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)))
 
 
 def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
@@ -117,11 +106,11 @@ def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
 
 def test_photographs_of_the_other_side_come_first(monkeypatch):
     scene = wall()
-    photographs_ = coverage_of(scene, lifted(scene, [0, 1])).photographs
+    photographs_ = coverage.coverage_of(scene, lifted(scene, [0, 1])).photographs
     assert {photograph.name for photograph in photographs_[:2]} <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
     assert photographs_[0].gain > 3 * photographs_[-1].gain
     monkeypatch.setattr(coverage, "MAX_IMAGES", 2)  # of more, some are looked at
-    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
+    found = coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert {photograph.name for photograph in found.photographs} == {"4.png", "h.png"}
     assert any("5" in remark and "2" in remark for remark in found.remarks)
 
@@ -131,12 +120,12 @@ def test_scale_of_the_pictures_does_not_matter(one_side):
     scene = wall()
     whole = lifted(scene, [0, 1, 2, 3], blank=(5,))
     larger = replace(whole, scalars=replace(whole.scalars, weight=16 * whole.scalars.weight))
-    one, other = one_side.photographs, coverage_of(scene, larger).photographs
+    one, other = one_side.photographs, coverage.coverage_of(scene, larger).photographs
     assert [photograph.name for photograph in one] == [photograph.name for photograph in other]
     assert [photograph.gain for photograph in one] == pytest.approx([photograph.gain for photograph in other])
 
 
-def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[ReliabilityModel, SparseRows, Tensor]:
+def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[coverage.ReliabilityModel, SparseRows, Tensor]:
     g = generator(seed)
     dense = torch.rand(n, views, generator=g, dtype=torch.float64) * (torch.rand(n, views, generator=g) < 0.6)
     before = torch.rand(n, 3, generator=g, dtype=torch.float64) * (torch.rand(n, 3, generator=g) < 0.5)
@@ -145,13 +134,13 @@ def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[ReliabilityModel
     row, column = dense.nonzero(as_tuple=True)
     sparse = SparseRows.from_coo(row, column, dense[row, column], n)
     return (
-        ReliabilityModel(norm, before.sum(1), (before**2).sum(1), surface, 0.7),
+        coverage.ReliabilityModel(norm, before.sum(1), (before**2).sum(1), surface, 0.7),
         sparse,
         torch.cat([before, dense], 1),
     )
 
 
-def looped(known: ReliabilityModel, columns: Tensor, view: int, chosen: list[int]) -> float:
+def looped(known: coverage.ReliabilityModel, columns: Tensor, view: int, chosen: list[int]) -> float:
     """The gain by the formula, one Gaussian after the other."""
     total = 0.0
     for j in range(len(known.norm)):
@@ -159,7 +148,7 @@ def looped(known: ReliabilityModel, columns: Tensor, view: int, chosen: list[int
         for views in (chosen, [*chosen, view]):
             w = [float(known.weight[j])] + [float(columns[j, 3 + v]) for v in views]
             squares = float(known.squared[j]) + sum(x**2 for x in w[1:])
-            noise = (FAINT * float(known.surface[j])) ** 2
+            noise = (coverage.FAINT * float(known.surface[j])) ** 2
             n = sum(w) ** 2 / (squares + noise) if squares + noise > 0 else 0.0
             reliabilities.append(float(known.norm[j]) * n / (n + known.beta))
         total += float(known.surface[j]) * max(0.0, reliabilities[1] - reliabilities[0])
@@ -172,8 +161,8 @@ def test_gains_are_those_of_a_loop(monkeypatch):
     for seed in range(5):
         known, views, columns = random_case(seed)
         expected = [looped(known, columns, v, []) for v in range(5)]
-        assert gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
-        chosen = choose_views(known, views, 5, 3)
+        assert coverage.gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
+        chosen = coverage.choose_views(known, views, 5, 3)
         before: list[int] = []
         for view, found in chosen:
             rest = {v: looped(known, columns, v, before) for v in range(5) if v not in before}
@@ -185,15 +174,15 @@ def test_gains_are_those_of_a_loop(monkeypatch):
 
 
 def test_similar_views_gain_little_after_each_other_and_faint_ones_nothing():
-    def case(norms: int, columns: list[list[float]]) -> tuple[ReliabilityModel, SparseRows]:
+    def case(norms: int, columns: list[list[float]]) -> tuple[coverage.ReliabilityModel, SparseRows]:
         ones, zeros = torch.ones(norms, dtype=torch.float64), torch.zeros(norms, dtype=torch.float64)
         row, column, weight = (torch.tensor(part) for part in zip(*columns))
         sparse = SparseRows.from_coo(row.long(), column.long(), weight.double(), norms)
-        return ReliabilityModel(ones, zeros, zeros, ones, beta=1.0), sparse
+        return coverage.ReliabilityModel(ones, zeros, zeros, ones, beta=1.0), sparse
 
     known, views = case(2, [[0, 0, 1.0], [0, 1, 1.0], [1, 2, 0.9]])
-    assert [view for view, _ in choose_views(known, views, 3, 3)] == [0, 2, 1]
-    clear, faint = gains(*case(1, [[0, 0, 1.0], [0, 1, 0.001]]), 2).tolist()
+    assert [view for view, _ in coverage.choose_views(known, views, 3, 3)] == [0, 2, 1]
+    clear, faint = coverage.gains(*case(1, [[0, 0, 1.0], [0, 1, 0.001]]), 2).tolist()
     assert clear == pytest.approx(0.5, abs=0.01)
     assert faint < 1e-3
 
@@ -209,14 +198,14 @@ def test_weights_are_shares_of_the_picture():
 
 def test_everything_reliable_is_said():
     scene = wall(held_out=NONE)
-    found = coverage_of(scene, lifted(scene, list(range(8))))
+    found = coverage.coverage_of(scene, lifted(scene, list(range(8))))
     assert (found.regions, found.photographs, found.left_out, len(found.remarks)) == ([], [], {}, 2)
 
 
 def test_one_camera():
     scene = wall(train=Photographs(["0.png"], [looking((-3.0, -0.9, 0.2))]), held_out=NONE)
-    found = coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
-    n_eff = 1 / (1 + FAINT**2)
+    found = coverage.coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
+    n_eff = 1 / (1 + coverage.FAINT**2)
     assert found.regions[0].reliability == pytest.approx(n_eff / (n_eff + 1))
     assert found.regions[0].lifted_reliability == pytest.approx(0.5)  # one view that agrees with itself
     assert any("single camera" in remark for remark in found.remarks)
@@ -225,12 +214,12 @@ def test_one_camera():
 def test_records_of_what_was_lifted():
     scene = wall()
     old = {"statistics": {"views": 3, "left_out": 0}, "options": {"max_views": 3}}
-    assert lifted_names(scene, old) == ({"0.png", "4.png", "7.png"}, set())
+    assert coverage.lifted_names(scene, old) == ({"0.png", "4.png", "7.png"}, set())
     for facts in ({}, {"statistics": {"views": 6, "left_out": 2}}, {"statistics": {"views": 4, "left_out": 0}}):
         with pytest.raises(InputError, match="does not record"):
-            lifted_names(scene, facts)
+            coverage.lifted_names(scene, facts)
     with pytest.raises(InputError, match="no longer has"):
-        lifted_names(scene, {"views_lifted": ["gone.png"]})
+        coverage.lifted_names(scene, {"views_lifted": ["gone.png"]})
     for facts in (
         {"views_lifted": "0.png"},
         {"views_lifted": [3]},
@@ -242,7 +231,7 @@ def test_records_of_what_was_lifted():
         {"statistics": {"views": 8, "left_out": 0}, "options": []},
     ):
         with pytest.raises(InputError, match="damaged"):
-            lifted_names(scene, facts)
+            coverage.lifted_names(scene, facts)
 
 
 def test_cameras_that_see_nothing_and_wrong_bounds_are_refused(unchecked):
@@ -250,11 +239,11 @@ def test_cameras_that_see_nothing_and_wrong_bounds_are_refused(unchecked):
     found = lifted(scene, [0, 1])
     for wrong in (-0.1, 1.1, float("nan"), True):
         with pytest.raises(InputError, match="min_reliability"):
-            coverage_of(scene, found, min_reliability=wrong)
+            coverage.coverage_of(scene, found, min_reliability=wrong)
     away = [looking((-3.0, 0.0, 0.0), (-9.0, 0.0, 0.0)) for _ in range(8)]
     blind = wall(train=Photographs(scene.train.names, away), held_out=NONE)
     with pytest.raises(InputError, match="no image shows a Gaussian"):
-        coverage_of(blind, found)
+        coverage.coverage_of(blind, found)
 
 
 def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
@@ -262,7 +251,7 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     aslant = looking((1.2, 2.6, 0.2))
     scene = wall(held_out=Photographs(["h.png"], [aslant]))
     scene.train.cameras[4:] = [looking((0.9, 2.8 + 0.1 * i, 0.2)) for i in range(4)]
-    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
+    found = coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert 1 <= len(found.poses) <= 5
     pose = found.poses[0]
     drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
@@ -354,7 +343,7 @@ def test_a_camera_that_looks_straight_down():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_a_gpu_says_the_same(one_side):
     scene = wall()
-    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)), device="cuda")
+    found = coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)), device="cuda")
     assert [photograph.name for photograph in found.photographs] == [x.name for x in one_side.photographs]
     gained = [photograph.gain for photograph in one_side.photographs]
     assert [photograph.gain for photograph in found.photographs] == pytest.approx(gained, rel=1e-3)

@@ -1,7 +1,5 @@
 """Labels and names that are damaged, absurd or no files: only our own errors leave the loaders."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

@@ -4,8 +4,6 @@ sfs_expectations.json holds what that code (metrics.py, the same in its four lat
 `shapes`: how many pixels it selects, and a digest of them; null where it fails.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

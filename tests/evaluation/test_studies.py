@@ -1,7 +1,5 @@
 """Studies: what R knows, on Gaussians made by hand, against SciPy and plain loops; which votes are tried; figures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -11,21 +9,12 @@ from scipy import stats
 
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.metrics import NO_CLASS
-from normlift_ns.evaluation.studies import (
-    BETA,
-    POOLED_SCENE,
-    SWEEPS,
-    SceneSignals,
-    recorded_vote,
-    signal_rows,
-    signal_statistics,
-    sweeps,
-)
+from normlift_ns.evaluation import studies
 from normlift_ns.options import RefineConfig
 from tests.random_scenes import generator
 
 
-def scene(seed: int, n: int = 400) -> SceneSignals:
+def scene(seed: int, n: int = 400) -> studies.SceneSignals:
     """A third has no evidence, a fifth no truth; the vote mends some."""
     g = generator(seed)
     r = torch.rand(n, generator=g) * (torch.arange(n) % 3 > 0)
@@ -36,12 +25,12 @@ def scene(seed: int, n: int = 400) -> SceneSignals:
     refined = torch.where(torch.rand(n, generator=g) < 0.8, truth, unrefined)
     counted = torch.where(torch.rand(n, generator=g) < 0.2, NO_CLASS, truth)
     opacity = (r + 0.3 * torch.rand(n, generator=g)).clamp(0, 1)
-    return SceneSignals(scalars, opacity, counted, {"unrefined": unrefined, "refined": refined})
+    return studies.SceneSignals(scalars, opacity, counted, {"unrefined": unrefined, "refined": refined})
 
 
 def test_groups_name_refined_and_unrefined_answers():
     one = scene(0)
-    found, zero = signal_statistics(one), one.scalars.reliability == 0
+    found, zero = studies.signal_statistics(one), one.scalars.reliability == 0
     counted = one.truth != NO_CLASS
     for name, group in (("zero", zero), ("seen", ~zero), ("all", zero | ~zero)):
         chosen = (group & counted).nonzero().squeeze(1).tolist()
@@ -55,7 +44,7 @@ def test_groups_name_refined_and_unrefined_answers():
 
 def test_correlations_are_of_all_gaussians_with_their_p_values():
     one = scene(1, n=30_000)  # of which 20,000 have R > 0
-    found, seen = signal_statistics(one), one.scalars.reliability > 0
+    found, seen = studies.signal_statistics(one), one.scalars.reliability > 0
     r, o = (x[seen].double().numpy() for x in (one.scalars.reliability, one.opacity))
     for name, expected in (("spearman", stats.spearmanr(r, o)), ("kendall", stats.kendalltau(r, o))):
         assert found[f"opacity.{name}"] == pytest.approx(expected.statistic, abs=1e-12)
@@ -65,32 +54,34 @@ def test_correlations_are_of_all_gaussians_with_their_p_values():
 
 def test_scenes_are_pooled_gaussian_by_gaussian():
     scenes = [scene(2, n=300), scene(3, n=900)]
-    rows = signal_rows(["a", "b"], scenes)
-    assert [row["scene"] for row in rows] == ["a", "b", POOLED_SCENE]
+    rows = studies.signal_rows(["a", "b"], scenes)
+    assert [row["scene"] for row in rows] == ["a", "b", studies.POOLED_SCENE]
     of_a, of_b, pooled = rows
     assert pooled["zero.share"] == pytest.approx((300 * of_a["zero.share"] + 900 * of_b["zero.share"]) / 1200)
     r = torch.cat([s.scalars.reliability for s in scenes])
     o = torch.cat([s.opacity for s in scenes])
     assert pooled["opacity.kendall"] == pytest.approx(stats.kendalltau(r[r > 0].double(), o[r > 0].double()).statistic)
     assert pooled["opacity.kendall"] not in (of_a["opacity.kendall"], of_b["opacity.kendall"])
-    assert [row["scene"] for row in signal_rows(["a"], scenes[:1])] == ["a"]
+    assert [row["scene"] for row in studies.signal_rows(["a"], scenes[:1])] == ["a"]
 
 
 def test_without_a_truth_there_are_no_accuracies():
     one = scene(4)
-    found = signal_statistics(SceneSignals(one.scalars, one.opacity))
+    found = studies.signal_statistics(studies.SceneSignals(one.scalars, one.opacity))
     assert not any("accuracy" in key or "bin" in key for key in found)
     assert math.isfinite(found["opacity.kendall_p"])
-    assert not any("accuracy" in key for key in signal_statistics(one, SceneSignals(one.scalars, one.opacity)))
+    assert not any(
+        "accuracy" in key for key in studies.signal_statistics(one, studies.SceneSignals(one.scalars, one.opacity))
+    )
 
 
 def test_sweeps_contain_and_mark_the_default_and_the_run():
     config = replace(RefineConfig(), k=17, tau=0.123)
-    own = recorded_vote({"options": {"reliability_beta": 3.5, "vote": vars(config)}})
-    labels = [each[0].label for each in sweeps([own])]
-    for parameter, values in SWEEPS.items():
+    own = studies.recorded_vote({"options": {"reliability_beta": 3.5, "vote": vars(config)}})
+    labels = [each[0].label for each in studies.sweeps([own])]
+    for parameter, values in studies.SWEEPS.items():
         some = [label for label in labels if label["parameter"] == parameter]
-        numbers = {"beta": BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
+        numbers = {"beta": studies.BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
         used = {"beta": 3.5, "k": 17, "tau": 0.123}.get(parameter, numbers[parameter])
         assert [label["value"] for label in some] == sorted({*values, numbers[parameter], used})
         assert [label["value"] for label in some if label["default"]] == [numbers[parameter]]
@@ -98,8 +89,10 @@ def test_sweeps_contain_and_mark_the_default_and_the_run():
 
 
 def test_runs_lifted_differently_are_swept_over_the_same_values():
-    owns = [recorded_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)]
-    every = list(sweeps(owns))
+    owns = [
+        studies.recorded_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)
+    ]
+    every = list(studies.sweeps(owns))
     of_sigma = [each for each in every if each[0].label["parameter"] == "sigma_d"]
     assert {0.77, 1.33} <= {each[0].label["value"] for each in of_sigma}
     assert all(each[0].config.sigma_d == each[1].config.sigma_d == each[0].label["value"] for each in of_sigma)

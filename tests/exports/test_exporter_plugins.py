@@ -1,7 +1,5 @@
 """An exporter of another package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -10,8 +10,6 @@ neighbours. So numbers are compared one by one on the kind of machine that golde
 means, counts and a sample of the sources.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -27,6 +25,8 @@ import numpy as np
 import torch
 from plyfile import PlyData
 from safetensors.numpy import load_file
+
+from normlift_ns.encoders.color import _names, embed_colors
 
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
@@ -45,7 +45,7 @@ VOTE = (
     0,
 )
 """Of version 0.1, which knew no consensus."""
-SINCE = {"stands_out", "nearest", "suggested_threshold", "histogram"}
+SINCE = {"verdict", "nearest", "suggested_threshold", "histogram"}
 """What an answer tells since."""
 NUMBERS = {"class_id", "instance_id"}
 """What exports tell since, in place of `label`, which is `class_id` - 1."""
@@ -59,12 +59,20 @@ def run_commands(scene: str, config: Path, folder: Path) -> None:
     found.
     """
     lift = ("--encoder", "color", "--max-views", 8, "--lift-downscale", 2, "--consensus", False, *VOTE)
-    place = ("--queries", *TEXTS[scene], "--timestamp", "golden", "--output-dir", folder)
-    _command("ns-normlift", "--load-config", config, *lift, *place)
+    _command("ns-normlift", "--load-config", config, *lift, "--timestamp", "golden", "--output-dir", folder)
     (lifted,) = folder.glob("*/normlift/golden/config.yml")
+    ask = ("--load-config", lifted, "--text-embeddings", single_colors(folder / "texts.npz"), "--threshold", 0.5)
+    _command("ns-normlift-query", *ask, "--text", *TEXTS[scene], "--save-query", True)
     files = ("--output-json", folder / "answers.json", "--output-npz", folder / "answers.npz")
-    _command("ns-normlift-query", "--load-config", lifted, "--text", *TEXTS[scene], "brown", *files)
+    _command("ns-normlift-query", *ask, "--text", *TEXTS[scene], "brown", *files)
     _command("ns-normlift-export", "--load-config", lifted, "--output-dir", folder / "export", "--select", "selection")
+
+
+def single_colors(path: Path) -> Path:
+    """Write the vectors of color names as version 0.1 had them: each name was one color, without other shades."""
+    vectors = embed_colors(np.stack(list(_names().values()))).astype(np.float32)
+    np.savez(path, **dict(zip(_names(), vectors)))
+    return path
 
 
 def _command(name: str, *flags: object) -> None:

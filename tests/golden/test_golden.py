@@ -1,7 +1,5 @@
 """Fields and answers are those of version 0.1, number by number."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Damage and files in the wrong place are noticed before any number is used, and nothing is read outside of arrays."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Claims: one winner whoever races, and work of the dead is taken over, by the watcher's own clock."""
 
-from __future__ import annotations
-
 import random
 import time
 from pathlib import Path

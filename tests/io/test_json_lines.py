@@ -1,7 +1,5 @@
 """Lines of JSON by several processes: what is whole is read, whatever a killed one has left."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 

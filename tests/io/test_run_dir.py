@@ -1,7 +1,5 @@
 """The files of a lifted run belong together, and no output takes the place of one."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path
@@ -11,16 +9,8 @@ import torch
 
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
+from normlift_ns.io import run_dir
 from normlift_ns.io.atomic import refuse_existing, refuse_run_files
-from normlift_ns.io.run_dir import (
-    MANIFEST_FILE,
-    add_digest_comment,
-    check_file_digests,
-    check_run,
-    read_manifest,
-    refuse_existing_run,
-    run_file_digests,
-)
 from tests.hostile import no_files
 from tests.io.test_digests import as_version_0_1, example, flipped
 
@@ -30,14 +20,14 @@ CONFIG = "method_name: normlift\ntimestamp: größe\n"
 def write_run(run: Path, seed: int = 0) -> Path:
     """What surrounds a field; its loaders are tested elsewhere."""
     run.mkdir(parents=True)
-    (run / "config.yml").write_text(add_digest_comment(CONFIG), "utf8")
+    (run / "config.yml").write_text(run_dir.add_digest_comment(CONFIG), "utf8")
     (run / "dataparser_transforms.json").write_text(json.dumps({"scale": 1.0, "seed": seed}))
     (run / "nerfstudio_models").mkdir()
     (run / "nerfstudio_models" / "step-000000007.ckpt").write_bytes(bytes(range(seed, seed + 99)))
     write_text_embeddings(run / "normlift" / "texts.npz", {"fox": torch.arange(1.0 + seed, 5.0 + seed)})
     beside = [*run.glob("*.json"), *run.glob("*/*.ckpt"), *run.glob("*/*.npz"), run / "absent.json", run.parent / "x"]
     (run.parent / "x").write_text("elsewhere")
-    example("float16").save(run / "normlift", beside=run_file_digests(run / "normlift", beside))
+    example("float16").save(run / "normlift", beside=run_dir.run_file_digests(run / "normlift", beside))
     return run
 
 
@@ -46,7 +36,7 @@ BESIDE = ["dataparser_transforms.json", "nerfstudio_models/step-000000007.ckpt",
 
 def test_the_manifest_knows_the_files_of_the_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    digests = read_manifest(run / "normlift")[1]
+    digests = run_dir.read_manifest(run / "normlift")[1]
     assert digests is not None
     assert set(digests) == {
         "field.safetensors",
@@ -56,9 +46,9 @@ def test_the_manifest_knows_the_files_of_the_run(tmp_path: Path) -> None:
     }
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_run(run)
-        check_run(run.rename(tmp_path / "moved"))
-        check_run(tmp_path / "no run")
+        run_dir.check_run(run)
+        run_dir.check_run(run.rename(tmp_path / "moved"))
+        run_dir.check_run(tmp_path / "no run")
 
 
 def test_files_of_another_run_and_flipped_bits_are_refused(tmp_path: Path) -> None:
@@ -68,9 +58,9 @@ def test_files_of_another_run_and_flipped_bits_are_refused(tmp_path: Path) -> No
         for wrong in (foreign, whole[:-1], b"", *(flipped(whole, bit) for bit in range(0, 190, 13))):
             path.write_bytes(wrong)
             with pytest.raises(InputError, match=rf"{path} is damaged.* expected xxh3_128:.*copy"):
-                check_run(run)
+                run_dir.check_run(run)
         path.unlink()
-        check_run(run)  # who needs it says so
+        run_dir.check_run(run)  # who needs it says so
 
 
 def test_an_edited_config_is_warned_of_until_its_first_line_goes(tmp_path: Path) -> None:
@@ -81,41 +71,41 @@ def test_an_edited_config_is_warned_of_until_its_first_line_goes(tmp_path: Path)
         config.write_bytes(flipped(whole, bit))
         if config.read_bytes().startswith(b"# Lines below: "):
             with pytest.warns(UserWarning, match=r"config\.yml .*delete its first line"):
-                check_run(run)
+                run_dir.check_run(run)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for fine in (CONFIG.replace("normlift", "other").encode(), whole.replace(b"\n", b"\r\n"), b"", b"\xff"):
             config.write_bytes(fine)
-            check_run(run)
+            run_dir.check_run(run)
         config.unlink()
-        check_run(run)
+        run_dir.check_run(run)
 
 
 def test_runs_without_digests_are_not_checked(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     as_version_0_1(run / "normlift")
     (run / BESIDE[0]).write_text("{}")
-    check_run(run)
+    run_dir.check_run(run)
 
 
 def test_a_manifest_leads_nowhere_else(tmp_path: Path) -> None:
     for i, name in enumerate(["/etc/passwd", "../../x", "../a/b", "..", ".", "", "a/b", "a\0", "\udcff", "../.x"]):
         example("float16").save(tmp_path / str(i), beside={name: "xxh3_128:0"})
         with pytest.raises(InputError, match=r"manifest\.json is damaged"):
-            check_file_digests(tmp_path / str(i))
+            run_dir.check_file_digests(tmp_path / str(i))
 
 
 def test_what_is_no_file_is_refused_or_absent(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    paths = [run / BESIDE[0], run / "config.yml", run / "normlift" / MANIFEST_FILE]
+    paths = [run / BESIDE[0], run / "config.yml", run / "normlift" / run_dir.MANIFEST_FILE]
     for kinds in zip(*map(no_files, paths)):
         if kinds[0] in ("nothing", "a link to nothing", "a link to itself"):
-            check_run(run)
+            run_dir.check_run(run)
             with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
-                read_manifest(run / "normlift")
+                run_dir.read_manifest(run / "normlift")
         else:
             with pytest.raises(InputError, match=r"manifest\.json"):
-                check_run(run)
+                run_dir.check_run(run)
 
 
 def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
@@ -136,10 +126,10 @@ def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
 
 def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    refuse_existing_run(run, overwrite=True)
-    refuse_existing_run(tmp_path / "new", overwrite=False)
+    run_dir.refuse_existing_run(run, overwrite=True)
+    run_dir.refuse_existing_run(tmp_path / "new", overwrite=False)
     with pytest.raises(FileExistsError, match="--timestamp"):
-        refuse_existing_run(run, overwrite=False)
+        run_dir.refuse_existing_run(run, overwrite=False)
     (tmp_path / "photos").mkdir()
     with pytest.raises(FileExistsError, match=r"photos .*config\.yml"):
-        refuse_existing_run(tmp_path / "photos", overwrite=True)
+        run_dir.refuse_existing_run(tmp_path / "photos", overwrite=True)

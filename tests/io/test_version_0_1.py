@@ -4,8 +4,6 @@ version_0_1/ was written by version 0.1: a small demo room in scene/, a run of n
 and one of ns-train normlift (trained), and what ns-normlift-query answered.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -15,10 +13,10 @@ import pytest
 import normlift_ns as nl
 from normlift_ns.cli import evaluate, export, lift, query
 from tests.cli.conftest import run_entry
-from tests.golden.summary import differences, without_news
+from tests.golden.summary import differences, single_colors, without_news
 from tests.nerfstudio_plugin.stock_run import relocate_config
 
-QUERIES = {"lifted": ("--text", "red", "sky blue", "--threshold", 0.4), "trained": ("--text", "red")}
+QUERIES = {"lifted": ("red", "sky blue", "--threshold", 0.4), "trained": ("red", "--threshold", 0.5)}
 STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
 
 
@@ -32,7 +30,8 @@ def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 @pytest.mark.usefixtures("nerfstudio")
 def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, answers = config.parent.name, tmp_path / "answers.json"
-    flags = ("--load-config", config, *QUERIES[name], "--output-json", answers)
+    texts = single_colors(tmp_path / "texts.npz")
+    flags = ("--load-config", config, "--text-embeddings", texts, "--output-json", answers, "--text", *QUERIES[name])
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     before = json.loads((tmp_path / "old" / f"answers_{name}.json").read_text())
     assert differences(without_news(json.loads(answers.read_text())), before, 1e-5) == []
@@ -46,19 +45,8 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert run_entry(monkeypatch, evaluate.entrypoint, *scored) == 0
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "normlift"
 
-    again = (
-        "--load-config",
-        config,
-        "--encoder",
-        "colour",
-        "--region-count",
-        16,
-        "--vote-k",
-        6,
-        "--timestamp",
-        "again",
-    )
-    assert run_entry(monkeypatch, lift.entrypoint, *again) == 0
+    again = ("--encoder", "colour", "--region-count", 16, "--vote-k", 6, "--timestamp", "again")
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *again) == 0
     lifted = nl.open_run(config.parents[1] / "again" / "config.yml")
     assert lifted.ask("red").texts == ("red",)
 

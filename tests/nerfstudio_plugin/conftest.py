@@ -1,7 +1,5 @@
 """Runs that the plugin's tests share."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

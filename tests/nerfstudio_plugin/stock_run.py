@@ -11,8 +11,6 @@ What splatfacto cannot do without a GPU, internet or system libraries is replace
 * torch.compile: eager, as compiling takes longer than the training.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Only what is tested here may stand in a config.yml, and only values that splatfacto can be trained with."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The plugin on real captures, which are not part of the project."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

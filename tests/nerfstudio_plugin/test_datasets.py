@@ -1,7 +1,5 @@
 """Data sets of trained runs: nerfstudio neither asks, nor runs a shell, nor reads what it would read wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

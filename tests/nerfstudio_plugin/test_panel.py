@@ -3,8 +3,6 @@
 What the actions do to a state is tested in tests/session; here, that each widget does its action and shows the result.
 """
 
-from __future__ import annotations
-
 import html
 import io
 import re
@@ -215,7 +213,7 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert (panel.answer.question.rule, panel.answer.question.negatives) == ("lerf", ("right",))
 
     ask(panel, "left")
-    counts = []
+    counts, usual = [], widgets.threshold.value
     for threshold in (-0.2, 0.8, 0.99):
         panel.act(Action("Threshold"), threshold)
         counts.append(int(chosen(pipeline).sum()))
@@ -223,12 +221,12 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
         assert f"**{counts[-1]}** of 60" in said(panel)
     assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
     panel.act(Action("Undo"))  # the drag of a slider is one step
-    assert widgets.threshold.value == 0.5
+    assert widgets.threshold.value == usual > 0.5
     panel.act(Action("Redo"))
     assert widgets.threshold.value == 0.99
-    panel.act(Action("Threshold"), 0.7)
+    panel.act(Action("Threshold"), 0.6)
     ask(panel, "right")
-    assert panel.answer.question.threshold == 0.7  # stays for the same rule
+    assert panel.answer.question.threshold == 0.6  # stays for the same rule
     least = float(model.field.scalars.reliability.median())
     panel.act(Action("Minimum reliability"), least)
     assert (model.field.scalars.reliability[chosen(pipeline)] >= least).all()
@@ -394,7 +392,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
     assert listed(panel) == []
-    assert "up: probably not in this scene" in html.unescape(panel._widgets.histograms.content)
+    assert "up: probably not here" in html.unescape(panel._widgets.histograms.content)
     press_row(groups[0], "hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
@@ -537,11 +535,15 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
-    assert torch.equal(clicked, (similar > 0.9) & field.valid())
+    median, top = np.quantile(similar[field.valid()], (0.5, 0.999))
+    assert panel.state.query.threshold == pytest.approx(median + 0.8 * (top - median), abs=1e-4)
+    asked = field.query(panel.state.query.embeddings)[:, 0]
+    assert torch.equal(clicked, (asked > panel.state.query.threshold) & field.valid())
+    threshold = panel.answer.question.threshold
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
-    assert panel.answer.question.threshold == 0.5  # not that of the click
+    assert panel.answer.question.threshold != threshold  # of the click
     pipeline.model.attach(field, load_query(pipeline.model.config.semantics))  # as after a restart
     assert panel._session.clicks == {}
     ask(panel, "left")

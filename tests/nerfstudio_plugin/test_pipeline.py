@@ -1,7 +1,5 @@
 """`ns-train normlift` by nerfstudio's own Trainer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs are read and written without nerfstudio: what comes out is nerfstudio's, bit for bit."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import tempfile

@@ -1,7 +1,5 @@
 """The arithmetic of a plan: against sums by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """What a plan tells of real captures against what their lifts take, in seconds of the CPU: other work on the machine
 changes those little. One thread, because threads that wait for each other count as busy."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

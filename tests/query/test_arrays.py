@@ -1,7 +1,5 @@
 """Questions without torch: the same answers as with it, from files alone."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -26,6 +24,7 @@ from prompt_toolkit.output import DummyOutput
 from normlift_ns import InputError, SemanticField, open_run
 from normlift_ns.cli import query
 from normlift_ns.cli.query import answer_lines, run_repl
+from normlift_ns.core.null_level import with_null_level
 from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.io.field import read_field
 from normlift_ns.options import RelevancyRule
@@ -48,6 +47,7 @@ from tests.random_scenes import unit_rows
 def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     lifted, means, source = example(seed)
     field = SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)
+    field = with_null_level(field, unit_rows(5, D, seed + 8).float())
     vectors, negatives = (100 * unit_rows(count, D, seed + 7).float().numpy() for count in (3, 2))
     question = Query(
         ("a", "b", "c"), vectors, ("d", "e"), negatives, rule, 0.1, min_reliability=min_reliability, refined=refined
@@ -129,7 +129,7 @@ def test_lines_become_lines_of_json(lifted, monkeypatch, capsys):
             red, wooden, blue = map(json.loads, shown.out.splitlines())
             assert red["text"] == "red" and 0.005 < red["fraction"] < 0.1 and red["rule"] == "cosine"
             assert "color name" in wooden["error"]
-            assert blue["threshold"] == 0.5
+            assert blue["threshold"] == 0.7
             assert "1 of 3" in shown.err
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red") == 0
     assert f"{red['fraction']:.2%}" in said(capsys)

@@ -1,7 +1,5 @@
 """The encoder that answers is the one that made the field."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace
@@ -86,11 +84,11 @@ def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.
     assert set(settings) == set(ENCODER_KEYS)
     assert settings["encoder_pretrained"] == str(tmp_path / "w.pt")
     assert settings["text_vectors"] == str(tmp_path / "t.npz")
-    assert encoder_settings(SourceOptions())["encoder_pretrained"] == "laion2b_s34b_b88k"  # a tag is no path
+    assert encoder_settings(SourceOptions("open_clip"))["encoder_pretrained"] == "laion2b_s34b_b88k"  # a tag is no path
 
 
 def test_a_relative_path_of_version_0_1_finds_the_same_file_or_none(tmp_path, monkeypatch) -> None:
-    settings = {**encoder_settings(SourceOptions()), "encoder_pretrained": "w.pt"}
+    settings = {**encoder_settings(SourceOptions("open_clip")), "encoder_pretrained": "w.pt"}
     content = f"blake2b:{blake2b(b'right', digest_size=16).hexdigest()}"
     field = field_with(settings, {"encoder": {"kind": "open_clip", "pretrained": content}})
     for name, text in (("a", b"right"), ("b", b"wrong")):
@@ -108,7 +106,9 @@ def test_a_relative_path_of_version_0_1_finds_the_same_file_or_none(tmp_path, mo
 
 def test_a_file_that_is_called_like_the_tag_is_not_taken_for_it(tmp_path, monkeypatch) -> None:
     tag = SourceOptions().encoder_pretrained
-    field = field_with(encoder_settings(SourceOptions()), {"encoder": {"kind": "open_clip", "pretrained": tag}})
+    field = field_with(
+        encoder_settings(SourceOptions("open_clip")), {"encoder": {"kind": "open_clip", "pretrained": tag}}
+    )
     text_encoder_for(field)
     monkeypatch.chdir(tmp_path)
     Path(tag).write_bytes(b"weights")
@@ -137,4 +137,4 @@ def test_features_of_version_0_1_may_say_nothing_of_the_encoder(tmp_path: Path) 
         assert isinstance(
             text_encoder_for(field_with(precomputed_settings(str(tmp_path / "t.npz")), features)), TextEmbeddingFile
         )
-        text_encoder_for(field_with(encoder_settings(SourceOptions()), features))
+        text_encoder_for(field_with(encoder_settings(SourceOptions("open_clip")), features))

@@ -1,7 +1,5 @@
 """The rasterizer once more, as loops over Python floats: written from the formulas, sharing no code."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

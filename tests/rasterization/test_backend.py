@@ -1,7 +1,5 @@
 """Which backend suits a job, whatever is installed."""
 
-from __future__ import annotations
-
 import importlib.util
 import threading
 from importlib import metadata

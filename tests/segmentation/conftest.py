@@ -1,5 +1,14 @@
 """The small networks of the encoders' tests."""
 
-from tests.encoders.conftest import empty_hub, library_weights, sam_weights, transformers, unsure
+from tests.encoders.conftest import (
+    clip,
+    clip_weights,
+    empty_hub,
+    library_weights,
+    open_clip,
+    sam_weights,
+    transformers,
+    unsure,
+)
 
-__all__ = ["empty_hub", "library_weights", "sam_weights", "transformers", "unsure"]
+__all__ = ["clip", "clip_weights", "empty_hub", "library_weights", "open_clip", "sam_weights", "transformers", "unsure"]

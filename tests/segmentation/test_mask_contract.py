@@ -18,6 +18,7 @@ from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.segmentation.sam import SAM_LEVELS, SamMasks, load_sam_network
 from normlift_ns.segmentation.sam3 import Sam3Masks, Sam3Network
 from tests.encoders.tiny import Largest, copied, refused
+from tests.segmentation.test_edges import tiny_regions
 from tests.segmentation.test_sam2 import LOOSE, photograph
 
 EVERY = replace(LOOSE, box_iou=0.99, suppression=Suppression(iou=1.0, score=-9.0, outer=0.0, inner=2.0))
@@ -38,10 +39,12 @@ def folders(sam_weights, library_weights, tmp_path_factory) -> dict[str, Path]:
 def make(kind: str, folder: Path) -> Any:
     if kind in NETWORKS:
         return Sam3Masks(("mug", "red mug"), str(folder)) if kind == "sam3" else SamMasks(str(folder), rules=EVERY)
+    if kind == "edges":
+        return tiny_regions()
     return {"files": LabelFiles(folder), "superpixel": Superpixels(20), "grid": Grid(20)}[kind]
 
 
-KINDS = (*NETWORKS, "files", "superpixel", "grid")
+KINDS = (*NETWORKS, "edges", "files", "superpixel", "grid")
 
 
 @pytest.mark.parametrize("kind", KINDS)

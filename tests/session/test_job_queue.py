@@ -1,7 +1,5 @@
 """Work waits its turn, and nobody waits for it."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -71,7 +71,7 @@ def test_a_click_is_asked_by_its_direction_and_beside_texts_by_the_rule_cosine_a
     (prompt,) = encode_prompts("like click 1", read, known)
     assert prompt.is_click
     _, question = build_query(field, [prompt], read)
-    assert (question.rule, question.threshold, question.negatives) == ("cosine", 0.9, ())
+    assert question.rule == "cosine" and question.suggest_threshold and not (question.gated or question.negatives)
     again = {row.text: row.vector for row in prompts_of_query(question)}
     (prompt,) = encode_prompts(join_prompts(question.texts), read, again)
     np.testing.assert_array_equal(prompt.vector, click)

@@ -1,7 +1,5 @@
 """Where a camera goes to look at something, among walls whose places are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

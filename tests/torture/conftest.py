@@ -1,7 +1,5 @@
 """The server of commands, and the table of what was tried, which docs/reliability.md shows."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -4,8 +4,6 @@ Noticed: refused with our message, computed again (caches) or warned of (config.
 Harmless: the same answers, parameters and stored vectors, bit for bit. Anything else is a wrong answer without a word.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import warnings

@@ -4,8 +4,6 @@ It reads lists of jobs from its input, one line of JSON each, runs the jobs of a
 one line: exit code (or minus the signal) and number of accesses of every job.
 """
 
-from __future__ import annotations
-
 import json
 import mmap
 import os

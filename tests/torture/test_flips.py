@@ -1,7 +1,5 @@
 """Flipped bits in all that is written for runs and their caches: noticed, or harmless."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

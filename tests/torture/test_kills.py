@@ -1,7 +1,5 @@
 """Processes that are killed while they write: nothing is lost or left over, and the command can be run again."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Eight processes, or two, at once on one capture: no run is lost, and no files of two of them are mixed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Small scenes for the tests of viewers."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable

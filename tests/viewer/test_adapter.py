@@ -1,7 +1,5 @@
 """What is known of the viser that is installed still holds, and its server gives away nothing but its page."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import urllib.request

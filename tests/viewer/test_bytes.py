@@ -1,7 +1,5 @@
 """What goes over the line of a real server: an answer costs 32 bytes per drawn Gaussian, turning the camera nothing."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import pytest

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import html
 import re
 from types import SimpleNamespace
@@ -70,7 +68,7 @@ def shown(texts: tuple[str, ...], relevancy: torch.Tensor) -> Answer:
         scalars=SimpleNamespace(reliability=torch.tensor([0.9, 0.5, 0.2]), n_eff=torch.ones(3), weight=torch.ones(3))
     )
     question = Query(texts, torch.eye(len(texts), 2))
-    return Answer(question, field, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5)
+    return Answer(question, field, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5, (1.0, 1.0))
 
 
 def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> None:

@@ -1,7 +1,5 @@
 """A person before a page that is not there: every widget does what it says, and pages are apart."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import threading

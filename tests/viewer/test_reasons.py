@@ -1,7 +1,5 @@
 """Why something is selected, as the panels tell it."""
 
-from __future__ import annotations
-
 import html
 from typing import Any
 

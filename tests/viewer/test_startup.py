@@ -1,7 +1,5 @@
 """Pages that come before the run is read wait, and those that leave meanwhile are not let in."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 from normlift_ns.viewer import adapter as door_module

@@ -1,7 +1,5 @@
 """Pictures from the server show what the page's camera sees, in the colours of the state, and follow both."""
 
-from __future__ import annotations
-
 import io
 import threading
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What goes over the line between viser and its page, for both lines of viser."""
 
-from __future__ import annotations
-
 import struct
 from importlib.metadata import version
 from typing import Any

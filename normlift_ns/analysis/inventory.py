@@ -1,0 +1,260 @@
+"""The objects of a scene without prompts: parts whose Gaussians share regions in the images that show them.
+
+Two neighboring Gaussians that both have a region in an image either share it, which counts 1, or count the similarity
+of the two regions, max(0, 1 - (1 - cos) / (3 s)), where s = 1 - median ||f_j|| is the usual disagreement of the views.
+The affinity of two parts is the mean of these counts over all images and all pairs of neighbors across their border::
+
+    a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
+
+where m is the median number of images per pair. A border is a line on a surface, so parts that touch at a few pairs
+only do not join. From every Gaussian on its own, each part joins the part with the largest affinity if that is the
+larger one, while any affinity is at least 0.95, then 0.9, and so on down to 0.5. This is the ultrametric contour map of
+image segmentation (Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of
+regions in place of edge strengths. Borders that segmentation draws at random differ from image to image and vanish;
+those of objects stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.analysis.objects import Catalogue, Instances
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from normlift_ns.options import OBJECT_MIN_GAUSSIANS
+
+MAX_OBJECTS = 20
+"""Largest number of objects in an inventory."""
+MIN_SHARE = 0.001
+"""Smallest share of an object in the evidence of all images."""
+_NEIGHBORS = 8
+_MIN_VISIBLE = 0.25
+"""An image shows a Gaussian if its weight there is at least this times its largest weight in any image."""
+_MIN_REGION = 0.25
+"""A Gaussian has the region with its largest weight in an image if that is at least this share; every one of several
+levels has its own share."""
+_SPREADS = 3.0
+"""Disagreement of two regions, in units of the usual one, at which they count 0."""
+_LEVELS = tuple(level / 20 for level in range(19, 9, -1))
+"""Affinities at which parts join, from 0.95 to 0.5."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inventory:
+    """Objects of a scene, those with the most evidence first: large ones, and ones that many images show."""
+
+    instance_id: Int32[Tensor, " n"]
+    """Object of every Gaussian, 1 for the first; 0: none."""
+    catalog: Catalogue
+    """Box, mean R, number of images and best images of every object. The text is its name: the best word of the
+    vocabulary if the verdict on that is "found", else "object 3"."""
+
+    def __len__(self) -> int:
+        return len(self.catalog.objects)
+
+    def mask(self, number: int) -> Bool[Tensor, " n"]:
+        """Return the Gaussians of an object.
+
+        Raises:
+            ValueError: there is no object of this number.
+        """
+        if not 1 <= number <= len(self):
+            raise InputError(f"object {number} is not in the inventory, which has objects 1 to {len(self)}")
+        return self.instance_id == number
+
+
+class ViewRegions(NamedTuple):
+    """Gaussians that one image shows, each with its region, a column of the evidence."""
+
+    gaussian: Int64[Tensor, " m"]
+    region: Int64[Tensor, " m"]
+
+
+class _Borders(NamedTuple):
+    """Pairs of parts that touch, with the sum and the number of the counts across their border."""
+
+    first: Int64[np.ndarray, " e"]
+    second: Int64[np.ndarray, " e"]
+    total: Float64[np.ndarray, " e"]
+    observed: Float64[np.ndarray, " e"]
+
+    def joined(self, part: Int64[np.ndarray, " n"]) -> _Borders:
+        """Return the borders between new parts, where part i becomes `part[i]`."""
+        first, second = part[self.first], part[self.second]
+        keep = first != second
+        low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
+        key, index = np.unique(low * len(part) + high, return_inverse=True)
+        sums = (np.bincount(index, x[keep], len(key)) for x in (self.total, self.observed))
+        return _Borders(key // len(part), key % len(part), *sums)
+
+
+def find_inventory(
+    evidence: Evidence,
+    features: Float[Tensor, "s d"],
+    means: Float[Tensor, "n 3"],
+    spread: float,
+) -> Int32[Tensor, " n"]:
+    """Number the objects of a scene, 1 for the one with the most evidence; 0: none.
+
+    There are at most 20. An object has at least 20 Gaussians, and at least a thousandth of the evidence of all images.
+
+    Args:
+        features: one unit row per column (region) of the evidence.
+        spread: 1 - median ||f_j||, the usual disagreement of the views about a Gaussian.
+    """
+    evidence = evidence.to("cpu")
+    part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))
+    weight = (evidence.rows.row_sums() + evidence.unlabeled.row_sums()).numpy()
+    size, total = np.bincount(part), np.bincount(part, weight)
+    order = np.argsort(-total, kind="stable")
+    large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_SHARE * weight.sum()) & (total[order] > 0)
+    listed = order[large][:MAX_OBJECTS]
+    number = np.zeros(len(size), np.int32)
+    number[listed] = np.arange(1, len(listed) + 1)
+    return torch.from_numpy(number[part]).to(means.device)
+
+
+def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
+    """Yield the Gaussians that each image shows, with their regions."""
+    rows, groups, view = evidence.rows, evidence.view_group_offsets, evidence.region_view.long()
+    weight, column, gaussian = rows.weight.double(), rows.column.long(), rows.row_index()
+    total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
+    largest = torch.zeros(evidence.num_gaussians, dtype=torch.float64)
+    largest.scatter_reduce_(0, total.row_index(), total.weight, "amax")
+    group = torch.repeat_interleave(torch.arange(len(groups) - 1), groups.diff())
+    best = torch.zeros(len(groups) - 1, dtype=torch.float64).scatter_reduce_(0, group, weight, "amax")
+    entry = (weight == best[group]).nonzero().squeeze(1)
+    entry = entry[torch.cat([torch.ones(min(1, len(entry)), dtype=torch.bool), group[entry].diff() > 0])]  # the first
+    gaussian, column, weight = gaussian[entry], column[entry], weight[entry]
+    key = total.row_index() * evidence.num_views + total.column.long()
+    here = total.weight[torch.searchsorted(key, gaussian * evidence.num_views + view[column])]
+    shown = (here >= _MIN_VISIBLE * largest[gaussian]) & (weight >= _MIN_REGION * here)
+    gaussian, column = gaussian[shown], column[shown]
+    order = view[column].argsort(stable=True)
+    counts = torch.bincount(view[column], minlength=evidence.num_views).tolist()
+    for part in order.split(counts):
+        yield ViewRegions(gaussian[part], column[part])
+
+
+def _neighbor_borders(
+    views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
+) -> _Borders:
+    """Return the borders between single Gaussians: every Gaussian and its nearest neighbors."""
+    neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
+    here = torch.arange(len(means))[:, None].expand_as(neighbors)
+    low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
+    key = (low * len(means) + high)[neighbors >= 0].unique()
+    first, second = key // max(len(means), 1), key % max(len(means), 1)
+    total, count = (torch.zeros(len(key), dtype=torch.float64) for _ in range(2))
+    label = torch.full((len(means),), -1)
+    for shown in views:
+        label[shown.gaussian] = shown.region
+        pair = ((label[first] >= 0) & (label[second] >= 0)).nonzero().squeeze(1)
+        one, other = label[first[pair]], label[second[pair]]
+        total[pair] += _similarity(one, other, features, spread)
+        count[pair] += 1
+        label[shown.gaussian] = -1
+    known = count > 0
+    return _Borders(*(x[known].numpy() for x in (first, second, total, count)))
+
+
+def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
+    """Return the counts of pairs of regions of one image: 1 for the same region."""
+    count = torch.ones(len(one), dtype=torch.float64)
+    differs = (one != other).nonzero().squeeze(1)
+    key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)
+    cosine = (features[key // len(features)].double() * features[key % len(features)].double()).sum(dim=1)
+    count[differs] = (1 - (1 - cosine) / (_SPREADS * max(spread, 1e-6))).clamp(0, 1)[index]
+    return count
+
+
+def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
+    """Join Gaussians to parts; return the part of each, numbered from 0 without gaps."""
+    part, size = np.arange(num_gaussians), np.ones(num_gaussians)
+    images = float(np.median(borders.observed)) if len(borders.observed) > 0 else 0.0
+    for level in _LEVELS:
+        while True:
+            least = images * np.sqrt(np.minimum(size[borders.first], size[borders.second]))
+            affinity = borders.total / np.maximum(borders.observed, least)
+            target = _targets(borders, affinity, size, np.flatnonzero(affinity >= level))
+            if np.array_equal(target, np.arange(len(size))):
+                break
+            while not np.array_equal(target, target[target]):
+                target = target[target]
+            _, number = np.unique(target, return_inverse=True)
+            part, size, borders = number[part], np.bincount(number, size), borders.joined(number)
+    return part
+
+
+def _targets(
+    borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
+) -> Int64[np.ndarray, " n"]:
+    """Return the part that each part joins: the one with the largest affinity of the chosen borders, if that is larger.
+
+    Ties go to the larger part, then to the one with the smaller index. Equally large parts count as larger if their
+    index is smaller.
+    """
+    source = np.concatenate([borders.first[chosen], borders.second[chosen]])
+    target = np.concatenate([borders.second[chosen], borders.first[chosen]])
+    order = np.lexsort((target, -size[target], -np.tile(affinity[chosen], 2), source))
+    source, target = source[order], target[order]
+    best = np.ones(len(source), bool)
+    best[1:] = source[1:] != source[:-1]
+    source, target = source[best], target[best]
+    larger = (size[target] > size[source]) | ((size[target] == size[source]) & (target < source))
+    result = np.arange(len(size))
+    result[source[larger]] = target[larger]
+    return result
+
+
+def as_instances(instance_id: Int32[Tensor, " n"], names: tuple[str, ...]) -> Instances:
+    """Return the objects as instances, each of its own class, for the catalog and exports."""
+    return Instances(names, instance_id, instance_id, tuple(range(1, len(names) + 1)))
+
+
+def mean_directions(
+    evidence: Evidence, features: Float[Tensor, "s d"], instance_id: Int32[Tensor, " n"]
+) -> Float64[Tensor, "m d"]:
+    """Return the unit mean feature of every object, weighted by evidence."""
+    count, rows = int(instance_id.max()) if len(instance_id) > 0 else 0, evidence.rows
+    ids = instance_id.to(rows.weight.device).long()[rows.row_index()]
+    key = ids * evidence.num_regions + rows.column.long()
+    weight = torch.zeros((count + 1) * evidence.num_regions, dtype=torch.float64, device=key.device)
+    weight.index_add_(0, key, rows.weight.double())
+    return torch.nn.functional.normalize(weight.view(count + 1, -1)[1:] @ features.to(weight), dim=1)
+
+
+def best_words(
+    directions: Float64[Tensor, "m d"], scene: Float[Tensor, "k d"], vectors: Float[Tensor, "w d"], *, by_chance: float
+) -> list[int | None]:
+    """Return the best word of every object; None where many words are as likely to be the best by chance.
+
+    Some words are near to everything. So the cosines of each word are standardized over the scene, and then those of
+    each object over the words. The best word must stay the best, and must exceed the value that `by_chance` of all
+    pairs of an object and a word would exceed if they were normally distributed.
+
+    Args:
+        directions: of the objects, from `mean_directions`.
+        scene: directions of a sample of the Gaussians of the scene.
+        vectors: one unit row per word.
+        by_chance: number of pairs that may exceed the limit; inf: no limit, and the best word need not stay the best.
+    """
+    cosine = directions @ vectors.to(directions).T
+    best = cosine.argmax(dim=1)
+    if by_chance == float("inf") or len(best) == 0:
+        return best.tolist()
+    usual = scene.to(directions) @ vectors.to(directions).T
+    score = (cosine - usual.mean(dim=0)) / usual.std(dim=0).clamp(min=1e-9)
+    score = (score - score.mean(dim=1, keepdim=True)) / score.std(dim=1, keepdim=True).clamp(min=1e-9)
+    limit = float(torch.special.ndtri(torch.tensor(1 - by_chance / (MAX_OBJECTS * len(vectors)), dtype=torch.float64)))
+    clear = (score.argmax(dim=1) == best) & (score.amax(dim=1) > limit)
+    return [word if stands_out else None for word, stands_out in zip(best.tolist(), clear.tolist())]

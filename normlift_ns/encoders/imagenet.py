@@ -1,0 +1,92 @@
+"""Words for the 1,000 classes of ImageNet: names, synonyms, hypernyms and the last words of names.
+
+`imagenet_words.json` has the names of every class and the hypernyms above them, from WordNet 3.0;
+research/imagenet_words.py makes it. A name, such as "red fox", means its class, or several classes with that name. A
+hypernym, such as "dog" or "furniture", means all classes below it. The last word of names, such as "panda", means the
+classes with these names, unless it is a name or a hypernym itself: "dog" is not a hot dog.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from normlift_ns.errors import InputError, truncate_text
+
+_ENDINGS = (("ches", "ch"), ("shes", "sh"), ("ses", "s"), ("xes", "x"), ("zes", "z"), ("ies", "y"), ("men", "man"),
+            ("s", ""))  # fmt: skip
+"""Endings of plurals and of their singulars, as in WordNet."""
+_AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|that|which)\b.*")
+"""End of a phrase, after the noun that it is about."""
+
+
+def find_classes(prompt: str) -> list[int]:
+    """Return the classes that a prompt names, in ascending order.
+
+    The longest known words at the end of the prompt count, so that articles and adjectives are ignored, and so is what
+    follows a preposition.
+
+    >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
+    ([277], [277, 278, 279, 280], [968])
+
+    Raises:
+        InputError: If it names none.
+    """
+    text = _normalized(prompt)
+    head = _AFTER_HEAD.sub("", text).split()
+    for phrase in (text, *(" ".join(head[start:]) for start in range(len(head)))):
+        for word in _singulars(phrase):
+            if word in _vocabulary():
+                return list(_vocabulary()[word])
+    near = [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
+    suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
+    raise InputError(
+        f"text {truncate_text(prompt)!r} names none of the 1,000 classes of ImageNet, nor a group of them; close words "
+        f"are {suggestions}: use one of them, or lift with --encoder open_clip for other words"
+    )
+
+
+def _normalized(text: str) -> str:
+    """Return the words in lower case, without hyphens and other signs between them."""
+    return " ".join(re.findall(r"[^\W_]+(?:['.][^\W_]+)*", text.lower()))
+
+
+def _singulars(phrase: str) -> Iterator[str]:
+    """Yield a phrase and its possible singulars."""
+    yield phrase
+    before, _, last = phrase.rpartition(" ")
+    stems = [last.removesuffix(ending) + singular for ending, singular in _ENDINGS if last.endswith(ending)]
+    for stem in [_table()["plurals"].get(last, last), *stems]:
+        yield f"{before} {stem}".strip()
+
+
+@cache
+def _table() -> dict[str, Any]:
+    return json.loads(Path(__file__).with_name("imagenet_words.json").read_text(encoding="utf8"))
+
+
+@cache
+def _vocabulary() -> dict[str, tuple[int, ...]]:
+    """Return the classes of every word, normalized."""
+    known: dict[str, set[int]] = {}
+    heads: dict[str, set[int]] = {}
+    for number, names in enumerate(_table()["classes"].values()):
+        for name in map(_normalized, names.split(", ")):
+            known.setdefault(name, set()).add(number)
+            heads.setdefault(name.split()[-1], set()).add(number)
+    for names, groups in _table()["hypernyms"].items():
+        for name in map(_normalized, names.split(", ")):
+            for group in groups.split():
+                first, _, last = group.partition("-")
+                known.setdefault(name, set()).update(range(int(first), int(last or first) + 1))
+    return {word: tuple(sorted(found)) for word, found in (heads | known).items()}
+
+
+def class_names() -> list[str]:
+    """Return the first name of each of the 1,000 classes."""
+    return [names.split(", ")[0] for names in _table()["classes"].values()]

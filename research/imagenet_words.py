@@ -1,0 +1,96 @@
+"""Words for the 1,000 classes of ImageNet, from WordNet 3.0: python -m research.imagenet_words /usr/share/wordnet
+
+Writes normlift_ns/encoders/imagenet_words.json. The folder is that of Debian's package wordnet-base: index.noun,
+data.noun and noun.exc of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids. The ids of the
+classes, in the order of the network's outputs, are those of the table itself, so no other source is needed.
+
+A class has the lemmas of its synset as names. A hypernym is a synset above one or more classes, and at most half of
+them: "artifact" and "object" tell nothing apart. A lemma of several hypernyms belongs to the one whose sense WordNet
+lists first, so that "cat" means the domestic cat rather than the lion or the whip. It also belongs to later senses that
+occur in WordNet's annotated texts and have the same parent, as both kinds of furniture that "table" means.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from itertools import groupby
+from pathlib import Path
+
+import normlift_ns
+
+TABLE = Path(normlift_ns.__file__).parent / "encoders" / "imagenet_words.json"
+SOURCE = "Made from WordNet 3.0 by research/imagenet_words.py; the license of WordNet:"
+
+
+def read_synsets(folder: Path) -> tuple[dict[str, list[str]], dict[str, list[str]], str]:
+    """Return the lemmas and the hypernyms of every noun synset by its offset, and the license at the top."""
+    lemmas, above, license_lines = {}, {}, []
+    for line in (folder / "data.noun").read_text("utf8").splitlines():
+        if line.startswith("  "):
+            license_lines.append(line.split(maxsplit=1)[1] if len(line.split()) > 1 else "\n")
+            continue
+        offset, _, _, count, *words = line.partition(" | ")[0].split()
+        size = 2 * int(count, 16)
+        lemmas[offset] = [word.replace("_", " ") for word in words[:size:2]]
+        pointers = words[size + 1 :]
+        above[offset] = [there for kind, there in zip(pointers[::4], pointers[1::4]) if kind in ("@", "@i")]
+    return lemmas, above, " ".join(line.strip() or "\n" for line in license_lines)
+
+
+def read_senses(folder: Path) -> dict[str, tuple[list[str], int]]:
+    """Return, for every noun in lower case, the offsets of its synsets, the most frequent sense first, and the number
+    of senses that occur in WordNet's annotated texts."""
+    senses = {}
+    for line in (folder / "index.noun").read_text("utf8").splitlines():
+        if not line.startswith(" "):
+            word, _, count, *rest = line.split()
+            senses[word.replace("_", " ")] = rest[-int(count) :], int(rest[-int(count) - 1])
+    return senses
+
+
+def ranges(numbers: list[int]) -> str:
+    """Return ascending numbers as text.
+
+    >>> ranges([1, 4, 5, 6, 9])
+    '1 4-6 9'
+    """
+    runs = [[number for _, number in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    return " ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+def table(folder: Path, ids: list[str]) -> dict[str, object]:
+    """Return the whole table for the synset ids of the classes."""
+    lemmas, above, terms = read_synsets(folder)
+    senses = read_senses(folder)
+    below: dict[str, set[int]] = {}
+    for number, name in enumerate(ids):
+        waiting = list(above[name[1:]])
+        while len(waiting) > 0:
+            offset = waiting.pop()
+            below.setdefault(offset, set()).add(number)
+            waiting += above[offset]
+    below = {offset: found for offset, found in below.items() if len(found) <= len(ids) // 2}
+
+    def owners(word: str) -> list[str]:
+        offsets, attested = senses[word.lower()]
+        first = next(offset for offset in offsets if offset in below)
+        return [first, *(x for x in offsets[:attested] if x in below and x != first and above[x] == above[first])]
+
+    kept: dict[str, set[int]] = {}
+    for offset in sorted(below):
+        words = ", ".join(word for word in lemmas[offset] if offset in owners(word))
+        kept[words] = kept.get(words, set()) | below[offset]
+    classes = {name: ", ".join(lemmas[name[1:]]) for name in ids}
+    hypernyms = {words: ranges(sorted(found)) for words, found in kept.items() if words != ""}
+    known = {word.lower() for words in [*classes.values(), *hypernyms] for word in words.split(", ")}
+    known |= {word.split()[-1] for word in known}
+    pairs = (line.split()[:2] for line in (folder / "noun.exc").read_text("utf8").splitlines())
+    plurals = {plural: word for plural, word in pairs if word in known and plural not in known}
+    return {"source": SOURCE, "license": terms, "classes": classes, "hypernyms": hypernyms, "plurals": plurals}
+
+
+if __name__ == "__main__":
+    found = table(Path(sys.argv[1]), list(json.loads(TABLE.read_text("utf8"))["classes"]))
+    TABLE.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", "utf8")
+    sys.stdout.write(f"Written: {TABLE}, {TABLE.stat().st_size:,} bytes\n")
