@@ -535,7 +535,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
-    median, top = np.quantile(similar[field.valid()], (0.5, 0.999))
+    median, top = np.quantile(similar[field.valid()].cpu(), (0.5, 0.999))
     assert panel.state.query.threshold == pytest.approx(median + 0.8 * (top - median), abs=1e-4)
     asked = field.query(panel.state.query.embeddings)[:, 0]
     assert torch.equal(clicked, (asked > panel.state.query.threshold) & field.valid())
