@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.relevancy import TOP_QUANTILE
+from normlift_ns.core.relevancy import top_values
 
 NULL_SHARE = 0.03
 """Share of the null vocabulary that may be nearer to a Gaussian than a text that is found there."""
@@ -35,9 +34,7 @@ def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> Sema
     tops: list[float] = []
     for block in vectors.split(_BLOCK):
         cosine = field.query(block, refined=False).float()
-        tops += (
-            np.quantile(cosine[source][valid].cpu().numpy(), TOP_QUANTILE, axis=0).tolist() if bool(valid.any()) else []
-        )
+        tops += top_values(cosine[source[valid]]) if bool(valid.any()) else []
         best = cosine if best is None else torch.cat([best, cosine], 1)
         best = best.topk(min(count, best.shape[1]), 1).values
     assert best is not None

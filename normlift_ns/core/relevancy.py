@@ -59,31 +59,25 @@ def _namespace(array: Any) -> Any:
     return torch
 
 
+# A softmax over two values is a sigmoid of their difference. It falls as the negative rises, so the minimum is at the
+# largest negative. At the threshold, prompt and negative are equally similar.
+_LERF = RuleSettings(
+    lambda positive, negative, temperature: _sigmoid(temperature * _margin(positive, negative)),
+    0.5,
+    True,
+    no_direction=0.0,
+    display_min=0.0,
+    presence_limit=_PRESENT,
+)
+
 RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
-    # As lerf, with the null level of the Gaussian as the only negative: at the threshold, the prompt is as near as the
-    # nearest unrelated words are.
-    "contrast": RuleSettings(
-        lambda positive, level, temperature: _sigmoid(temperature * _margin(positive, level)),
-        0.5,
-        False,
-        no_direction=0.0,
-        display_min=0.0,
-        presence_limit=_PRESENT,
-    ),
+    # The null level of the Gaussian is the only negative.
+    "contrast": _LERF._replace(needs_negatives=False),
     # The threshold suits the color encoder, and queries without further information: see `query.question.make_query`.
     "cosine": RuleSettings(
         lambda positive, _, __: positive, 0.5, False, no_direction=0.0, display_min=0.0, presence_limit=None
     ),
-    # A softmax over two values is a sigmoid of their difference. It falls as the negative rises, so the minimum is at
-    # the largest negative. At the threshold, prompt and negative are equally similar.
-    "lerf": RuleSettings(
-        lambda positive, negative, temperature: _sigmoid(temperature * _margin(positive, negative)),
-        0.5,
-        True,
-        no_direction=0.0,
-        display_min=0.0,
-        presence_limit=_PRESENT,
-    ),
+    "lerf": _LERF,
     # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
     "margin": RuleSettings(
         lambda positive, negative, _: _margin(positive, negative),
@@ -143,3 +137,19 @@ def gaussian_relevancy(
     """
     values = relevancy(positive, negative, rule=rule)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)
+
+
+def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
+    """Return the value of each column that one row in a thousand exceeds, interpolated; N >= 1.
+
+    On a GPU only these numbers are copied to the CPU.
+
+    >>> top_values(np.arange(2001.0)[:, None])
+    [1998.0]
+    """
+    if isinstance(values, np.ndarray):
+        return np.quantile(values, TOP_QUANTILE, axis=0).tolist()
+    place = TOP_QUANTILE * (len(values) - 1)
+    largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile takes 16 million values
+    low, high = largest[-1].double(), largest[max(len(largest) - 2, 0)].double()
+    return (low + (high - low) * (place - math.floor(place))).tolist()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy
+from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy, top_values
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.options import RelevancyRule
 from normlift_ns.query.presence import Verdict, judge
@@ -297,21 +297,18 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     negative = field.null_levels(refined=question.refined) if question.rule == "contrast" else cosine[:, count:]
     relevancy = gaussian_relevancy(cosine[:, :count], negative, valid, question.rule)
     means = means if isinstance(means, np.ndarray) else means.detach()
-    verdicts = _judge_all(field, question.rule, as_numpy(cosine[:, :count][valid]), as_numpy(relevancy[valid]))
+    verdicts = _judge_all(field, question.rule, cosine[:, :count][valid], relevancy[valid])
     selected = relevancy[:0] > 0
     unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, verdicts)
     return apply_threshold(unselected, question)
 
 
-def _judge_all(
-    field: HasManifest, rule: RelevancyRule, cosine: Float[np.ndarray, "m q"], relevancy: Float[np.ndarray, "m q"]
-) -> tuple[Verdict | None, ...]:
-    """Return the verdict on every prompt from the Gaussians that have a direction."""
+def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: Any) -> tuple[Verdict | None, ...]:
+    """Return the verdict on every prompt, from cosines and relevancies [M, Q] of the Gaussians with a direction."""
     if len(cosine) == 0:
         return (None,) * cosine.shape[1]
-    tops = (np.quantile(values, TOP_QUANTILE, axis=0) for values in (cosine, relevancy))
-    name, manifest = encoder_name(field), field.manifest
-    return tuple(judge(manifest, name, rule, top_cosine=float(c), top=float(r)) for c, r in zip(*tops))
+    name, manifest, tops = encoder_name(field), field.manifest, zip(top_values(cosine), top_values(relevancy))
+    return tuple(judge(manifest, name, rule, top_cosine=best, top=top) for best, top in tops)
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
