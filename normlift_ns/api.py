@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
@@ -69,6 +70,7 @@ from normlift_ns.segmentation.registry import describe_choice, resolve_source
 
 
 @renamed(check="check_alignment")
+@check_arguments
 def lift_run(
     config_or_scene: str | Path | Scene,
     *,

@@ -28,6 +28,16 @@ class InputError(ValueError):
     """
 
 
+class ArgumentError(InputError, TypeError):
+    """InputError for an argument of the wrong kind, which Python's own functions report as a TypeError."""
+
+
+class MissingImageError(InputError, KeyError, IndexError):
+    """InputError for a training image that does not exist."""
+
+    __str__ = Exception.__str__  # KeyError would quote the message
+
+
 class OutputError(Exception):
     """Failed write to standard output. Not an OSError, which loaders would attribute to the file that they read."""
 

@@ -29,6 +29,7 @@ from normlift_ns.analysis.objects import (
     make_catalogue,
     similarity_to_capture,
 )
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
@@ -67,6 +68,7 @@ _MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
 represented by about 5,000 Gaussians."""
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class LiftedRun:
     """A trained scene with its semantics, on disk and in memory.
@@ -107,6 +109,7 @@ class LiftedRun:
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
     @renamed(rule="relevancy")
+    @check_arguments
     def ask(
         self,
         *texts: str,
@@ -168,6 +171,7 @@ class LiftedRun:
         return save_query(self.folder / FIELD_FOLDER, question)
 
     @renamed(reach="object_max_gap", min_size="object_min_gaussians")
+    @check_arguments
     def export(
         self,
         path: str | Path,
@@ -223,6 +227,7 @@ class LiftedRun:
             overwrite=overwrite,
         )
 
+    @check_arguments
     def masks(
         self,
         folder: str | Path,
@@ -254,6 +259,7 @@ class LiftedRun:
         settings, folder = RasterSettings.recorded(self.field.manifest), check_path("folder", folder)
         return write_masks(self.scene, self._mask(part), folder, invert=rest, settings=settings, overwrite=overwrite)
 
+    @check_arguments
     def transfer(
         self,
         cloud: str | Path,
@@ -333,6 +339,7 @@ class LiftedRun:
         return self.votes.explain(self._mask(part), refined=answer is None or answer.question.refined)
 
     @renamed(metres_per_unit="meters_per_unit")
+    @check_arguments
     def catalogue(
         self, part: Answer | Finding | Bool[Tensor, " n"], *, meters_per_unit: float | None = None
     ) -> Catalogue:
@@ -366,6 +373,7 @@ class LiftedRun:
             self.scene, self.field, instances, transform, meters_per_unit=meters_per_unit, device=self.device
         )
 
+    @check_arguments
     def inventory(self, vocabulary: Sequence[str] | None = None, *, meters_per_unit: float | None = None) -> Inventory:
         """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
 
@@ -441,6 +449,7 @@ class LiftedRun:
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
         return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 
+    @check_arguments
     def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
         """Find Gaussians that likely belong to no surface, see `analysis.objects`.
 
@@ -476,6 +485,7 @@ class LiftedRun:
             )
         return mask
 
+    @check_arguments
     def camera(self, view: str | Path | int) -> Camera:
         """Return the camera of a training image.
 
@@ -501,6 +511,7 @@ class LiftedRun:
             raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
         return cameras[matches[0]]
 
+    @check_arguments
     def render(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
         """Render the scene from a camera.
 
@@ -531,6 +542,7 @@ def _answer_of(part: Any) -> Answer | None:
 
 
 @renamed(text_vectors="text_embeddings", text_template="prompt_template")
+@check_arguments
 def open_run(
     load_config: str | Path,
     *,

@@ -33,6 +33,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Scalars, check_tensors, check_unit_rows
@@ -67,6 +68,7 @@ class Overlaps(NamedTuple):
     """B, in 0..1."""
 
 
+@check_arguments
 class Consensus(NamedTuple):
     """Feature table that the views agree on, with statistics of the consensus.
 
@@ -88,6 +90,7 @@ class Consensus(NamedTuple):
     """Number of Gaussians sampled."""
 
 
+@check_arguments
 def consensus(
     evidence: Evidence,
     features: Float[Tensor, "s d"],

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
@@ -36,6 +37,7 @@ class Entries(NamedTuple):
     """Number of regions of each view."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Evidence(TensorRecord):
     """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
@@ -106,6 +108,7 @@ class Evidence(TensorRecord):
         return self.rows.weight.numel()
 
     @staticmethod
+    @check_arguments
     def from_entries(
         parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
@@ -135,6 +138,7 @@ class Evidence(TensorRecord):
         view = self.region_view[self.rows.column[groups[:-1]].long()]
         return SparseRows(torch.searchsorted(groups, self.rows.offsets), view, segment_sum(self.rows.weight, groups))
 
+    @check_arguments
     def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
         """Return the columns of the given views, in their order.
 
@@ -165,11 +169,13 @@ class Evidence(TensorRecord):
         region_view = new_view[self.region_view[columns].long()]
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
 
+    @check_arguments
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some Gaussians, in the given order."""
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 
+    @check_arguments
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """Return the evidence of coarser regions without rasterizing again.
 
@@ -212,6 +218,7 @@ class Evidence(TensorRecord):
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled)
 
     @staticmethod
+    @check_arguments
     def merge(*parts: Evidence) -> Evidence:
         """Append the views and columns of all parts in argument order; concatenate feature tables in the same order.
 
@@ -231,6 +238,7 @@ class Evidence(TensorRecord):
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
+    @check_arguments
     def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
         """Write a safetensors file atomically, replacing an earlier one, and return its digest.
 
@@ -249,6 +257,7 @@ class Evidence(TensorRecord):
         return save_arrays(Path(path), tensors, metadata, key=key, overwrite=True)
 
     @staticmethod
+    @check_arguments
     def load(path: str | Path, *, key: str = "") -> Evidence:
         """Read a file that `save` wrote.
 

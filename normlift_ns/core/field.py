@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
@@ -36,6 +37,7 @@ from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, wr
 from normlift_ns.options import RelevancyRule, Storage
 
 
+@check_arguments
 @dataclass(frozen=True)
 class SemanticField(TensorRecord):
     """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three storage forms.
@@ -72,6 +74,7 @@ class SemanticField(TensorRecord):
         return int(self.manifest["dimension"])
 
     @staticmethod
+    @check_arguments
     def build(
         lifted: Lifted,
         means: Float[Tensor, "n 3"],
@@ -134,11 +137,13 @@ class SemanticField(TensorRecord):
         scalars = scalars.map(lambda x: x.float() if x.dtype == torch.float64 else x)
         return SemanticField(scalars, source.int(), store, manifest, means.detach().float())
 
+    @check_arguments
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
         mask = self.scalars.norm > 0
         return mask[self.source.long()] if refined else mask
 
+    @check_arguments
     def query(
         self, text_vectors: Float[Tensor, "q d"] | Float[np.ndarray, "q d"], *, refined: bool = True
     ) -> Float[Tensor, "n q"]:
@@ -161,12 +166,14 @@ class SemanticField(TensorRecord):
         cosine = self.store.products(vectors / length, self.scalars)
         return cosine[self.source.long()] if refined else cosine
 
+    @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
         """Return the null level of every Gaussian as one column; no column if the field has no null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
 
+    @check_arguments
     def relevancy(
         self,
         text_vectors: Float[Tensor, "q d"],
@@ -189,12 +196,14 @@ class SemanticField(TensorRecord):
         negative = self.null_levels(refined=refined) if rule == "contrast" else cosine[:, count:]
         return gaussian_relevancy(cosine[:, :count], negative, self.valid(refined=refined), rule)
 
+    @check_arguments
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
         rows = self.source.long()[rows] if refined else rows
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
 
+    @check_arguments
     def save(
         self, folder: str | Path, *, overwrite: bool = False, beside: Mapping[str, str] = MappingProxyType({})
     ) -> None:
@@ -232,6 +241,7 @@ class SemanticField(TensorRecord):
         write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod
+    @check_arguments
     def load(
         folder: str | Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
     ) -> SemanticField:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
 
@@ -27,6 +28,7 @@ QUATERNION_RANGE = (1e-18, 1e18)
 or silently the identity."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
@@ -106,6 +108,7 @@ def facing_pose(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float
     return pose
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
@@ -161,6 +164,7 @@ class Camera:
         """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
         return self.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
 
+    @check_arguments
     def downscaled(self, factor: float) -> Camera:
         """Return the camera with its size multiplied by at most 1.
 
@@ -174,6 +178,7 @@ class Camera:
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)
 
+    @check_arguments
     def project(
         self, points: Float[Tensor, "n 3"]
     ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:

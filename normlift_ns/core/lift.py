@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
@@ -34,6 +35,7 @@ _LENGTH_TOLERANCE = 1e-2
 """Accepted deviation of the length of a unit row from 1, which half precision and files need."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Scalars(TensorRecord):
     """Scalars of every Gaussian.
@@ -77,6 +79,7 @@ class Scalars(TensorRecord):
         return Scalars(**{f.name: function(getattr(self, f.name)) for f in fields(Scalars)})
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Lifted:
     """Result of a lift: the scalars of every Gaussian, and the evidence and features that its direction follows from.
@@ -129,6 +132,7 @@ class Lifted:
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
 
 
+@check_arguments
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:

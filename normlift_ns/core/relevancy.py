@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule
 
@@ -90,6 +91,7 @@ RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
 }
 
 
+@check_arguments
 def relevancy(
     positive: Float[ArrayT, "*n q"],
     negative: Float[ArrayT, "*n b"] | None = None,

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Int64, UInt8
 from torch import Tensor
 from typing_extensions import Unpack
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import has_triton, retry_in_halves
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -101,6 +102,7 @@ class RasterOptions(TypedDict, total=False):
     """
 
 
+@check_arguments
 def rasterize_evidence(
     scene: GaussianScene,
     cameras: Iterable[Camera],
@@ -194,6 +196,7 @@ def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpac
     return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
 
+@check_arguments
 def render(
     scene: GaussianScene,
     camera: Camera,
@@ -325,6 +328,7 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
     return max(high, UNLABELED) + 1 if count is None else count
 
 
+@check_arguments
 class Contributors(NamedTuple):
     """Gaussians that contribute to P pixels: entries offsets[p] to offsets[p + 1] belong to pixel p, nearest first.
 
@@ -341,6 +345,7 @@ class Contributors(NamedTuple):
     """Weights A_pj in 0..1; those of a pixel add up to its alpha."""
 
 
+@check_arguments
 def contributors(
     scene: GaussianScene,
     camera: Camera,

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS
 
 
+@check_arguments
 @dataclass(frozen=True)
 class RasterSettings:
     """Constants of gsplat's kernels, as splatfacto calls them; the defaults are those of gsplat 1.4.0.
@@ -55,6 +57,7 @@ class RasterSettings:
     """A pixel stops before the first Gaussian that would leave this or less transmittance."""
 
     @staticmethod
+    @check_arguments
     def of_gsplat(version: str) -> RasterSettings:
         """Return the constants of gsplat 1.4, 1.5 or 1.6; the last is not released yet and may change.
 
@@ -76,6 +79,7 @@ class RasterSettings:
         return rectangle if minor == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)
 
     @staticmethod
+    @check_arguments
     def recorded(manifest: Mapping[str, Any]) -> RasterSettings:
         """Return the constants of the `gsplat_rules` in a manifest; without this entry, those of gsplat 1.4.
 
