@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import operator
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, MissingImageError
 from normlift_ns.io.atomic import refuse_run_files
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -50,7 +49,6 @@ from normlift_ns.options import (
     OBJECT_MAX_GAP,
     OBJECT_MIN_GAUSSIANS,
     RelevancyRule,
-    check_bool,
     check_number,
     check_path,
     check_prompt_list,
@@ -109,7 +107,6 @@ class LiftedRun:
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
     @renamed(rule="relevancy")
-    @check_arguments
     def ask(
         self,
         *texts: str,
@@ -204,11 +201,8 @@ class LiftedRun:
                 reserved for a file of a run.
         """
         path = check_path("path", path)
-        check_bool("overwrite", overwrite)
         if path.name == "":
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
-        if answer is not None and not isinstance(answer, Answer):
-            raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
         refuse_run_files(*exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
@@ -492,12 +486,14 @@ class LiftedRun:
         Args:
             view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            KeyError, IndexError: there is no such image.
-            ValueError: several images have this name; include the folder.
+            ValueError: there is no such image (it is also a KeyError and an IndexError), or several images have this
+                name; include the folder.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
-            return cameras[operator.index(view)]
+            if not -len(names) <= view < len(names):
+                raise _no_image(str(view), names)
+            return cameras[view]
         name = Path(view).as_posix()
         matches = [i for i, image in enumerate(names) if image == name] or [
             i
@@ -508,7 +504,7 @@ class LiftedRun:
             options = ", ".join(names[i] for i in matches)
             raise InputError(f"{len(matches)} training images are called {name!r}: {options}; include the folder")
         if len(matches) == 0:
-            raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
+            raise _no_image(repr(name), names)
         return cameras[matches[0]]
 
     @check_arguments
@@ -526,14 +522,18 @@ class LiftedRun:
         image = render_image(self.scene, camera, settings=settings)
         if found is None:
             return image
-        if not isinstance(found, Answer | Finding):
-            raise TypeError(f"render draws an answer, or its finding for one prompt; got {type(found).__name__}")
         shown, answer = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
         display = make_display(self.field, answer, shown=shown)
         mode = self.scene.rasterize_mode
         values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=mode, settings=settings)
         overlay = render_outputs(display, image.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
+    return MissingImageError(
+        f"view must be a training image: there is no {name}; there are {len(names)}, {names[0]} to {names[-1]}"
+    )
 
 
 def _answer_of(part: Any) -> Answer | None:

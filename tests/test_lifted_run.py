@@ -162,7 +162,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
         ({"features": []}, "^0 .* 12"),
         ({"features": {}}, "empty"),
-        ({"features": [labels.numpy()] * 12}, "got ndarray"),
+        ({"features": [labels.numpy()] * 12}, "must be a tuple of 2"),
         ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
         ({"texts": {"a": np.zeros(2)}}, r"text 'a' must be \[D\], finite and not zero"),
         ({"texts": {"a": [1.0, float("nan")]}}, "text 'a' must be"),

@@ -6,7 +6,9 @@ say Tensor, a NumPy array and nested lists of numbers are accepted too and conve
 
 from __future__ import annotations
 
+import builtins
 import inspect
+import math
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -46,9 +48,11 @@ def check_arguments(target: _T) -> _T:
 
     @cache
     def checks() -> tuple[list[tuple[str, _Check]], tuple[str, _Check] | None, dict[str, _Check]]:
-        hints = get_type_hints(owner)
+        hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
         named = {p.name: _check_of(hints.get(p.name, Any)) for p in parameters}
-        ordered = [(p.name, named[p.name]) for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        ordered = [
+            (p.name, named[p.name]) for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+        ]
         more = next(((p.name, named[p.name]) for p in parameters if p.kind == p.VAR_POSITIONAL), None)
         for p in parameters:
             if p.kind == p.VAR_KEYWORD and p.name in hints:  # Unpack[a TypedDict]
@@ -72,6 +76,15 @@ def check_arguments(target: _T) -> _T:
     return target
 
 
+class _Names(dict[str, Any]):
+    """Names that annotations may use; those imported for type checkers only stand for anything."""
+
+    def __missing__(self, name: str) -> Any:
+        if hasattr(builtins, name):
+            raise KeyError(name)
+        return Any
+
+
 def _error(name: str, expected: str, value: object) -> ArgumentError:
     shown = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "dtype") and hasattr(value, "shape") else None
     return ArgumentError(f"{name} must be {expected}, got {shown or short_repr(value)}")
@@ -81,7 +94,7 @@ def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
     return value
 
 
-def _check_of(hint: Any) -> _Check:
+def _check_of(hint: Any) -> _Check:  # noqa: PLR0911 (a table of kinds)
     """Return the check of an annotation; annotations without a rule here accept anything."""
     origin, parts = get_origin(hint), get_args(hint)
     if hasattr(hint, "dim_str"):
@@ -89,7 +102,9 @@ def _check_of(hint: Any) -> _Check:
     if origin in (Union, types.UnionType):
         return _union_check(parts)
     if origin is Literal:
-        return _instance_check(lambda x: any(type(x) is type(p) and x == p for p in parts), f"one of {list(parts)}")
+        return _instance_check(
+            lambda x: any(type(x) is type(p) and x == p for p in parts), f"one of {', '.join(map(str, parts))}"
+        )
     if origin is tuple:
         return _items_check(tuple, parts)
     if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
@@ -128,9 +143,9 @@ def _number_check(kind: type) -> _Check:
     accepted, expected = (Integral, "a whole number") if kind is int else (Real, "a number")
 
     def check(name: str, value: Any, _: _Sizes) -> Any:
-        if type(value) is kind and value == value:
+        if type(value) is kind and (kind is int or not math.isnan(value)):
             return value
-        if isinstance(value, bool) or not isinstance(value, accepted) or value != value:
+        if isinstance(value, bool) or not isinstance(value, accepted) or math.isnan(value):
             raise _error(name, expected, value)
         try:
             return kind(value)
@@ -147,14 +162,17 @@ def _union_check(parts: Sequence[Any]) -> _Check:
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
         if value is None and optional:
             return None
-        messages = []
+        errors: list[InputError] = []
         for one in checks:
             try:
                 return one(name, value, sizes)
             except InputError as error:
-                messages.append(str(error))
-        expected = " or ".join(text.removeprefix(f"{name} must be ").rpartition(", got ")[0] for text in messages)
-        raise _error(name, expected, value) if len(messages) > 1 else ArgumentError(messages[0])
+                errors.append(error)
+        start = f"{name} must be "
+        for error in errors:  # of an item
+            if len(errors) == 1 or not str(error).startswith(start):
+                raise error
+        raise _error(name, " or ".join(str(e).removeprefix(start).rpartition(", got ")[0] for e in errors), value)
 
     return check
 

@@ -142,11 +142,11 @@ def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) ->
 
 
 def _check_numbers(power: float, sample: int, least: float) -> None:
-    if not isinstance(power, int | float) or not 0 <= power < float("inf"):
+    if not 0 <= power < float("inf"):
         raise InputError(f"power must be a number >= 0, got {power!r}")
-    if not isinstance(sample, int) or sample < 1:
+    if sample < 1:
         raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
-    if not isinstance(least, int | float) or not 0 <= least <= 1:
+    if not 0 <= least <= 1:
         raise InputError(f"least must be a number in 0..1, got {least!r}")
 
 

@@ -154,7 +154,7 @@ class SemanticField(TensorRecord):
         Raises:
             ValueError: if a vector has another dimension, is zero or is not finite.
         """
-        if text_vectors.ndim != 2 or text_vectors.shape[1] != self.dimension:
+        if text_vectors.shape[1] != self.dimension:
             raise InputError(
                 f"text vectors must be [Q, {self.dimension}] like the field's features, got "
                 f"{tuple(text_vectors.shape)}; use the encoder that made them"

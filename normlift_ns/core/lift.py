@@ -13,6 +13,7 @@ Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -162,10 +163,8 @@ def lift(
     >>> lifted.directions(), lifted.scalars.norm, lifted.scalars.reliability  # of 2 views: 0.6 * 2 / (2 + 1)
     (tensor([[1., 0.]]), tensor([0.6000]), tensor([0.4000]))
     """
-    if unlabeled not in ("ignore", "dilute"):
-        raise InputError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
-    if not beta >= 0:
-        raise InputError(f"beta must be >= 0, got {beta}")
+    if not 0 <= beta < math.inf:
+        raise InputError(f"beta must be >= 0 and finite, got {beta}")
     for name, rows in (("regions", evidence.rows), ("unlabeled pixels", evidence.unlabeled)):
         if not bool(((rows.weight >= 0) & (rows.weight <= _MAX_WEIGHT)).all()):
             low, high = (float(x) for x in rows.weight.aminmax())

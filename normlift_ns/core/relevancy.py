@@ -117,8 +117,12 @@ def relevancy(
     >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """
-    if rule not in RELEVANCY_RULES:
-        raise InputError(f"rule must be one of {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if not 0 < temperature < math.inf:
+        raise InputError(f"temperature must be positive and finite, got {temperature}")
+    if negative is not None and type(negative) is not type(positive):  # lists, or NumPy beside torch
+        negative = (
+            np.asarray(negative) if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor(negative)
+        )
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
         raise InputError('rule "contrast" compares with the null level, which the field does not have; choose "cosine"')
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):

@@ -54,7 +54,6 @@ class QueryField(HasManifest, Protocol):
         ...
 
 
-@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Answer:
     """Result of a query with Q prompts. `answer["fox"]` is the result for one prompt; see `Finding`.

@@ -157,7 +157,7 @@ def rasterize_evidence(
         warnings.warn(
             f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, "
             "and are not drawn",
-            stacklevel=2,
+            stacklevel=3,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
     parts: list[Entries] = []
@@ -233,7 +233,7 @@ def render(
     >>> image.tolist(), alpha.tolist()
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
-    if values.ndim != 2 or len(values) != len(scene):
+    if len(values) != len(scene):
         raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job)
@@ -405,8 +405,6 @@ def contributors(
 
 
 def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or pixels.dtype.is_floating_point or pixels.dtype == torch.bool:
-        raise InputError(f"pixels must be integers [P, 2], (column, row), got {pixels.dtype} {tuple(pixels.shape)}")
     size = pixels.new_tensor([camera.width, camera.height])
     outside = ((pixels < 0) | (pixels >= size)).any(dim=1).nonzero()
     if len(outside) > 0:

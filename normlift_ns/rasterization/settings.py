@@ -56,6 +56,15 @@ class RasterSettings:
     min_transmittance: float = 1e-4
     """A pixel stops before the first Gaussian that would leave this or less transmittance."""
 
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("near_plane", 0.0, self.far_plane), ("eps2d", 0.0, 1e6), ("frustum_margin", 0.0, 1e6),
+            ("min_discriminant", 0.0, 1e6), ("min_compensation", 0.0, 1.0), ("radius_sigmas", 0.0, 1e6),
+            ("tile_size", 1, 2**15), ("max_alpha", 0.0, 1.0), ("min_alpha", 0.0, 1.0), ("min_transmittance", 0.0, 1.0),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must be in {low:g}..{high:g}, got {getattr(self, name)}")
+
     @staticmethod
     @check_arguments
     def of_gsplat(version: str) -> RasterSettings:

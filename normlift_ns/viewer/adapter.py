@@ -321,7 +321,10 @@ class ViserServer:
     ) -> None:
         import viser  # noqa: PLC0415 (--help should not wait for it)
 
-        with guarded(accepted_names(host, allowed_hosts)), contextlib.redirect_stdout(io.StringIO()):  # hides viser's table of addresses
+        with (
+            guarded(accepted_names(host, allowed_hosts)),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # hides viser's table of addresses
             self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         handle_in_order(self._server)
         self.host, self.port = host, self._server.get_port()
