@@ -88,7 +88,7 @@ TABLE: list[Row] = [
     (nl.open_splat, {"path": ("path", "/nowhere"), "options": ("SplatOptions", nl.SplatOptions(colmap=Path("/nowhere")))}),
     (nl.open_run, {"load_config": ("path", "/nowhere"), "data": ("path|None", None), "device": ("word", "cpu"),
                    "text_embeddings": ("path|None", None), "prompt_template": ("text|None", None)}),
-    (nl.coverage, {"run": ("LiftedRun", None), "min_reliability": ("number", 0.5)}),
+    (nl.coverage, {"run": ("LiftedRun", None)}),
     (nl.lift_run, {"config_or_scene": ("path", "/nowhere"), "lift": ("LiftOptions|None", None), "texts": ("none|None", None),
                    "queries": ("texts", ()), "load_step": ("whole|None", None), "overwrite": ("bool", False),
                    "output_dir": ("path|None", None), "device": ("word", "cpu"), "report": ("function", print)}),
@@ -121,14 +121,14 @@ def is_kind(kind: str, value: Any) -> bool:
         return callable(value)
     return {
         "whole": isinstance(value, int) and not isinstance(value, bool),
-        "number": isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value),
+        "number": isinstance(value, int | float) and not isinstance(value, bool) and not (isinstance(value, float) and math.isnan(value)),
         "bool": isinstance(value, bool),
         "text": isinstance(value, str),
         "path": isinstance(value, str | Path),
         "dictionary": isinstance(value, Mapping),
         "texts": isinstance(value, list | tuple) and all(isinstance(item, str) for item in value),
         "wholes": isinstance(value, list | tuple),
-        "Cameras": value == [] or value == (),
+        "Cameras": isinstance(value, list | tuple) and len(value) == 0,
         "maps": isinstance(value, list | tuple),
         "option": not isinstance(value, Nothing) and not callable(value),
     }.get(word, False)
@@ -181,7 +181,7 @@ def test_wrong_kinds_are_refused_by_name_in_10_000_calls(data):
 def test_arrays_of_every_library_give_the_same(unchecked):
     expected = nl.relevancy(UNIT, rule="cosine")
     assert torch.equal(nl.relevancy(UNIT.tolist()), expected)
-    assert np.array_equal(nl.relevancy(UNIT.numpy(), FEATURES, rule="lerf").shape, (N, 4))
+    assert np.array_equal(nl.relevancy(UNIT.numpy(), UNIT[:, :2], rule="lerf").shape, (N, 4))
     assert nl.nearest_neighbors(MEANS.tolist(), np.int64(2)).index.tolist() == NEAR.index.tolist()
     assert nl.nearest_neighbors(MEANS.numpy()[::-1], 2).index.shape == (N, 2)
     camera = nl.Camera(K.tolist(), POSE.numpy(), np.int32(16), 16)

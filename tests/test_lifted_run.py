@@ -166,7 +166,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
         ({"texts": {"a": np.zeros(2)}}, r"text 'a' must be \[D\], finite and not zero"),
         ({"texts": {"a": [1.0, float("nan")]}}, "text 'a' must be"),
-        ({"texts": {"a": np.ones((1, 2))}}, "text 'a' must be"),
+        ({"texts": {"a": np.ones((1, 2))}}, r"texts\['a'\] must be"),
         ({"texts": {" ": [1, 2]}}, "not a valid text"),
         ({"texts": {"fox.npy": [1, 2]}}, "not a valid text"),
         ({"texts": {5: [1, 2]}}, "dictionary"),
@@ -193,7 +193,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
     with pytest.raises(FileExistsError, match="--timestamp"):
         nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
-    with pytest.raises(TypeError, match=r"config\.yml .* got int"):
+    with pytest.raises(TypeError, match="config_or_scene must be .* got 3"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
         nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")

@@ -12,6 +12,7 @@ import math
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, wraps
 from itertools import chain, repeat
 from numbers import Integral, Real
@@ -24,7 +25,7 @@ from normlift_ns.errors import ArgumentError, InputError
 from normlift_ns.options import check_path, short_repr
 
 _T = TypeVar("_T")
-_Sizes = dict[str, int]
+_Sizes = dict[str, Any]
 """Lengths of the named axes of the arguments so far."""
 _Check = Callable[[str, Any, _Sizes], Any]
 """Function of name, value and sizes; it returns the converted value."""
@@ -145,12 +146,10 @@ def _number_check(kind: type) -> _Check:
     def check(name: str, value: Any, _: _Sizes) -> Any:
         if type(value) is kind and (kind is int or not math.isnan(value)):
             return value
-        if isinstance(value, bool) or not isinstance(value, accepted) or math.isnan(value):
-            raise _error(name, expected, value)
-        try:
-            return kind(value)
-        except OverflowError:
-            raise _error(name, expected, value) from None
+        with suppress(OverflowError):  # an integer with hundreds of digits
+            if isinstance(value, accepted) and not isinstance(value, bool) and not math.isnan(value):
+                return kind(value)
+        raise _error(name, expected, value)
 
     return check
 
@@ -222,7 +221,8 @@ def _array_check(hint: Any) -> _Check:
             len(shape) < len(fixed) if wide else len(shape) != len(fixed)
         ):
             raise _error(name, expected, value)
-        for axis, length in zip(fixed, shape[len(shape) - len(fixed) :]):
+        ends = len(shape) - len(fixed)
+        for axis, length in zip(axes, (shape[:ends], *shape[ends:]) if wide else shape):
             if length != (int(axis) if axis.isdigit() else sizes.setdefault(axis, length)):
                 known = "" if axis.isdigit() else f" with {axis} = {sizes[axis]}"
                 raise _error(name, expected + known, value)

@@ -99,6 +99,7 @@ class Lifted:
     features: Float[Tensor, "s d"]
     """The feature table, normalized, in the precision of the lift."""
 
+    @check_arguments
     def directions(
         self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
     ) -> Float[Tensor, "m d"]:

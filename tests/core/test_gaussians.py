@@ -3,6 +3,7 @@ import torch
 from jaxtyping import TypeCheckError
 
 from normlift_ns import Camera, GaussianScene
+from normlift_ns.core.gaussians import facing_pose
 
 N = 4
 GOOD = {
