@@ -40,6 +40,7 @@ from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
+from normlift_ns.io.memory import refuse_small_memory
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
     TEXT_EMBEDDINGS_FILE,
@@ -202,6 +203,8 @@ class PreparedLift:
 def run_lift(request: LiftRequest) -> LiftedRun:
     """Lift features onto a trained scene, write the lifted run, and return it."""
     prepared, stages = prepare_lift(request), StageTimer(request.report)
+    cameras = prepared.scene.train.cameras
+    refuse_small_memory(len(prepared.scene.gaussians), max((c.width * c.height for c in cameras), default=0))
     check_target(prepared)
     announce(prepared)
     check_alignment(prepared, stages)

@@ -121,7 +121,9 @@ def is_kind(kind: str, value: Any) -> bool:
         return callable(value)
     return {
         "whole": isinstance(value, int) and not isinstance(value, bool),
-        "number": isinstance(value, int | float) and not isinstance(value, bool) and not (isinstance(value, float) and math.isnan(value)),
+        "number": isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and not (isinstance(value, float) and math.isnan(value)),
         "bool": isinstance(value, bool),
         "text": isinstance(value, str),
         "path": isinstance(value, str | Path),

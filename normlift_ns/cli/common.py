@@ -144,8 +144,8 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
     with nullcontext() if terminal.log_file is None else _open_log(terminal.log_file) as log:
         if log is not None:
             log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} {command}\n")
-        sys.stdout = None if stdout is None else cast(Any, _OutputStream(stdout, log, _output_errors))
-        sys.stderr = None if stderr is None else cast(Any, _OutputStream(stderr, log, nullcontext))
+        sys.stdout = cast(Any, _OutputStream(stdout, log, _output_errors))
+        sys.stderr = cast(Any, _OutputStream(stderr, log, nullcontext))
         output_settings.append(terminal)
         try:
             yield
@@ -231,6 +231,8 @@ def run_command(command: type[CommandProtocol]) -> None:
     The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
     and 143 for SIGTERM, after partial files are removed.
     """
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # closed by the caller
+    sys.stderr = sys.stderr or open(os.devnull, "w")
     streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
     for stream in streams:
         if hasattr(stream, "reconfigure"):
@@ -429,6 +431,7 @@ def _sigterm_raises() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
     def report(ignored: Any) -> None:
         number = _SIGNALS.get(ignored.exc_type)
         if number is None:
