@@ -231,8 +231,8 @@ def run_command(command: type[CommandProtocol]) -> None:
     The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
     and 143 for SIGTERM, after partial files are removed.
     """
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # closed by the caller
-    sys.stderr = sys.stderr or open(os.devnull, "w")
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (closed by the caller)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
     for stream in streams:
         if hasattr(stream, "reconfigure"):

@@ -184,7 +184,7 @@ def _items_check(origin: type, parts: Sequence[Any]) -> _Check:
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
         listed = isinstance(value, list | tuple)
         accepted = listed or (every and isinstance(value, origin) and not isinstance(value, str | bytes | Mapping))
-        if not accepted or (not every and len(value) != len(parts)):
+        if not accepted or getattr(value, "ndim", 1) == 0 or (not every and len(value) != len(parts)):
             raise _error(name, expected, value)
         rows = zip(repeat(checks[0]) if every else checks, value)
         items = (one(f"{name}[{i}]", item, sizes if not every else {}) for i, (one, item) in enumerate(rows))
