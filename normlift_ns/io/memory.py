@@ -65,9 +65,10 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
     Raises:
         MemoryError: The lift does not fit; the message has the estimate.
     """
-    needed = (0 if loaded else _LIFT_BYTES) + gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
+    needed = gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
     for name, free in free_memory().items():
-        bytes_needed = needed + (_library_bytes() if name == "ulimit -v" and not loaded else 0)
+        start = 0 if loaded else _library_bytes() if name == "ulimit -v" else _LIFT_BYTES
+        bytes_needed = start + needed
         if free < bytes_needed:
             raise MemoryError(
                 f"The lift needs at least {bytes_needed / 2**30:.2f} GiB of memory, but {name} leaves "
@@ -76,6 +77,8 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
 
 
 def _library_bytes() -> int:
+    """Return the size of the libraries of torch and CUDA, which are mapped as a whole."""
     spec = find_spec("torch")
-    folders = [] if spec is None else [Path(place) / "lib" for place in spec.submodule_search_locations or ()]
-    return sum(file.stat().st_size for folder in folders for file in folder.glob("*.so*") if file.is_file())
+    places = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    files = [file for place in places for file in (*place.glob("lib/*.so*"), *place.parent.glob("nvidia/*/lib/*.so*"))]
+    return sum(file.stat().st_size for file in files if file.is_file())

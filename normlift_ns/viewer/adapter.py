@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import functools
 import http
 import inspect
 import io
@@ -18,6 +19,7 @@ from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, UInt32
+from msgspec import MsgspecError
 
 from normlift_ns.viewer.host_check import accepted_names, refuse_request
 
@@ -155,7 +157,8 @@ def guarded(names: frozenset[str]) -> Iterator[None]:
                 return http.HTTPStatus.NOT_FOUND, {}, b"404"
             return status, told, with_script(content)
 
-        return serve(handler, host, port, process_request=request, **{**options, "compression": None})
+        options["compression"] = None
+        return serve(_without_tracebacks(handler), host, port, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
@@ -174,7 +177,7 @@ def _guarded_one(names: frozenset[str]) -> Iterator[None]:
     serve: Any = module.serve
     missing = (http.HTTPStatus.NOT_FOUND, "Not Found", Headers({"Content-Length": "3"}), b"404")
 
-    def guarded_serve(*handlers: Any, process_request: Any = None, **options: Any) -> Any:
+    def guarded_serve(handler: Any, *address: Any, process_request: Any = None, **options: Any) -> Any:
         def request(connection: Any, asked: Any) -> Any:
             refused = refuse_request(asked.headers.get_all("Host"), asked.headers.get_all("Origin"), names)
             if refused is not None:
@@ -199,13 +202,24 @@ def _guarded_one(names: frozenset[str]) -> Iterator[None]:
             headers = Headers({"Content-Type": "text/html", "Content-Length": str(len(content))})
             return Response(found.status_code, found.reason_phrase, headers, content)
 
-        return serve(*handlers, process_request=request, **options)
+        return serve(_without_tracebacks(handler), *address, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
         yield
     finally:
         module.serve = serve
+
+
+def _without_tracebacks(handler: Any) -> Any:
+    """Let a malformed message end its connection without a traceback; callbacks run elsewhere."""
+
+    @functools.wraps(handler)
+    async def handle(*connection: Any) -> None:
+        with contextlib.suppress(AssertionError, AttributeError, LookupError, TypeError, ValueError, MsgspecError):
+            await handler(*connection)
+
+    return handle
 
 
 # Adapter for viser in its two versions: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
@@ -616,12 +630,12 @@ def _ignore_invalid_values(connection: Any) -> None:
         invalid = contextlib.suppress(ArithmeticError, AssertionError, TypeError, ValueError)
 
         def handle(number: int, message: Any) -> None:
-            if all(map(_finite, message.updates.values())):
+            if isinstance(message.updates, dict) and all(map(_finite, message.updates.values())):
                 with invalid:
                     handler(number, message)
 
         async def handle_async(number: int, message: Any) -> None:  # 1.x
-            if all(map(_finite, message.updates.values())):
+            if isinstance(message.updates, dict) and all(map(_finite, message.updates.values())):
                 with invalid:
                     await handler(number, message)
 
