@@ -439,10 +439,10 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
                 temporary, descriptor = _temporary_folder(folder)
             yield temporary
         finally:
-            with deferred_signals():
-                if temporary is not None:
-                    complete_journal(temporary)
-                    shutil.rmtree(temporary, ignore_errors=True)
+            try:
+                _discard(temporary)
+            finally:
+                _discard(temporary)  # again, because a signal may come just before they wait
                 release_lock(descriptor)
     except (OSError, RuntimeError, SafetensorError) as error:  # the latter two from torch and safetensors, disk full
         reason = str(error)
@@ -454,6 +454,13 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
             reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
+
+
+def _discard(temporary: Path | None) -> None:
+    if temporary is not None and temporary.exists():
+        with deferred_signals():
+            complete_journal(temporary)
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _temporary_folder(folder: Path) -> tuple[Path, int | None]:

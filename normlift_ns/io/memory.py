@@ -42,8 +42,8 @@ def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
     with suppress(OSError, ValueError):
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     for line in lines:
-        _, controllers, group = line.split(":", 2)
-        if controllers == "":
+        controllers, colon, group = line.partition(":")[2].partition(":")
+        if controllers == "" and colon:
             base, names = root / "sys/fs/cgroup", ("memory.max", "memory.current")
         elif "memory" in controllers.split(","):
             base, names = root / "sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes")
