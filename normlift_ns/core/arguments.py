@@ -1,6 +1,6 @@
 """Checks of the arguments of public functions, against their annotations.
 
-`check_arguments` decorates every public function and record. Its annotations are the kinds that it accepts. Where they
+`check_arguments` decorates every public function and record. Its annotations are the kinds that it accepts. If they
 say Tensor, a NumPy array and nested lists of numbers are accepted too and converted. This module does not need torch.
 """
 
@@ -95,25 +95,29 @@ def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
     return value
 
 
-def _check_of(hint: Any) -> _Check:  # noqa: PLR0911 (a table of kinds)
+def _check_of(hint: Any) -> _Check:
     """Return the check of an annotation; annotations without a rule here accept anything."""
-    origin, parts = get_origin(hint), get_args(hint)
     if hasattr(hint, "dim_str"):
         return _array_check(hint)
+    return _plain_check(hint) if get_origin(hint) is None else _generic_check(get_origin(hint), get_args(hint))
+
+
+def _generic_check(origin: Any, parts: Sequence[Any]) -> _Check:
     if origin in (Union, types.UnionType):
         return _union_check(parts)
     if origin is Literal:
-        return _instance_check(
-            lambda x: any(type(x) is type(p) and x == p for p in parts), f"one of {', '.join(map(str, parts))}"
-        )
-    if origin is tuple:
-        return _items_check(tuple, parts)
-    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
-        return _mapping_check(_check_of(parts[1]))
-    if origin is not None and isinstance(origin, type) and issubclass(origin, Iterable):
-        return _items_check(origin, (*parts[:1], ...))
+        words = ", ".join(map(str, parts))
+        return _instance_check(lambda x: any(type(x) is type(p) and x == p for p in parts), f"one of {words}")
     if origin is Callable:
         return _instance_check(callable, "a function")
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return _mapping_check(_check_of(parts[1]))
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        return _items_check(origin, parts if origin is tuple else (*parts[:1], ...))
+    return _anything
+
+
+def _plain_check(hint: Any) -> _Check:
     if hint in (int, float):
         return _number_check(hint)
     if hint is Path:
