@@ -197,6 +197,10 @@ def test_arrays_of_every_library_give_the_same(unchecked):
     one = nl.rasterize_evidence(SCENE, [camera], [labels], backend="torch")
     two = nl.rasterize_evidence(SCENE, iter([CAMERA]), (x for x in [labels.tolist()]), backend="torch")
     assert torch.equal(one.rows.weight, two.rows.weight)
+    with pytest.raises(nl.InputError, match="reliability must"):
+        nl.unsupported(NEAR, np.float32(1) * np.ones(()))
+    with pytest.raises(nl.InputError, match="reliability has 1 rows"):
+        nl.unsupported(NEAR, [1.0])
     assert torch.equal(FIELD.query(FEATURES.tolist()), FIELD.query(FEATURES.numpy()))
 
 

@@ -86,7 +86,7 @@ class _Names(dict[str, Any]):
         return Any
 
 
-def _error(name: str, expected: str, value: object) -> ArgumentError:
+def _error(name: str, expected: str, value: Any) -> ArgumentError:
     shown = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "dtype") and hasattr(value, "shape") else None
     return ArgumentError(f"{name} must be {expected}, got {shown or short_repr(value)}")
 
@@ -152,7 +152,7 @@ def _number_check(kind: type) -> _Check:
             return value
         with suppress(OverflowError):  # an integer with hundreds of digits
             if isinstance(value, accepted) and not isinstance(value, bool) and not math.isnan(value):
-                return kind(value)
+                return cast(Any, kind)(value)
         raise _error(name, expected, value)
 
     return check
@@ -192,7 +192,13 @@ def _items_check(origin: type, parts: Sequence[Any]) -> _Check:
             raise _error(name, expected, value)
         rows = zip(repeat(checks[0]) if every else checks, value)
         items = (one(f"{name}[{i}]", item, sizes if not every else {}) for i, (one, item) in enumerate(rows))
-        return type(value)(items) if type(value) in (list, tuple) else items if origin is not Sequence else value
+        return (
+            cast(Any, type(value))(items)
+            if type(value) in (list, tuple)
+            else items
+            if origin is not Sequence
+            else value
+        )
 
     return check
 
@@ -254,6 +260,6 @@ def _as_tensor(name: str, value: Any, expected: str) -> Any:
     import torch  # noqa: PLC0415 (a command-line query does not need it)
 
     try:
-        return torch.as_tensor(np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value)
+        return torch.as_tensor(np.asarray(value, order="C") if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise _error(name, expected, value) from None

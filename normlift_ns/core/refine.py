@@ -324,6 +324,10 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
+    if neighbors.index.numel() > 0 and int(neighbors.index.max()) >= len(reliability):
+        raise InputError(
+            f"reliability has {len(reliability)} rows, but neighbors name row {int(neighbors.index.max())}"
+        )
     return (reliability[: len(neighbors.index)] <= 0) & ~_any_reliable(neighbors, reliability)
 
 
