@@ -33,7 +33,7 @@ class View(NamedTuple):
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
-    mask: Bool[Tensor, "h w"] | None
+    mask: Bool[Tensor, "mask_h mask_w"] | None  # readers compare the size, and name the file
     """True at pixels that count; None: all pixels count."""
     name: str
     """Path of the image file relative to the dataset, with forward slashes."""
