@@ -1,7 +1,5 @@
 """Commands, as the tests give them."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import time
@@ -9,16 +7,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 from unittest.mock import MagicMock
 
 import pytest
 
 from normlift_ns.cli.common import run_command
+from normlift_ns.demo.room import DemoRoom
 from tests.conftest import make_lifted, make_trained
-
-if TYPE_CHECKING:
-    from normlift_ns.demo.room import DemoRoom
 
 SMALL = ("--encoder", "color", "--vote-k", "12")
 """Flags that lift the small demo room in a moment."""

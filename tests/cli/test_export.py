@@ -94,16 +94,25 @@ def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
     assert cloud.point.reliability.numpy().max() < 1
 
 
-def test_selection_and_rest_make_up_the_scene(scene_ply, lifted, tmp_path, monkeypatch, capsys) -> None:
-    rows = {}
-    for part in ("selection", "rest"):
-        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--select", part, "--text", "red")
-        assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-filename", f"{part}.ply") == 0
+def test_selection_and_rest_make_up_the_scene_and_clean_lacks_floaters(
+    scene_ply, lifted, tmp_path, monkeypatch, capsys
+) -> None:
+    rows, whole = {}, np.load(scene_ply.with_name("splat_rows.npy"))
+    for part in ("selection", "rest", "clean"):
+        text = () if part == "clean" else ("--text", "red")
+        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", *text)
+        assert run_entry(monkeypatch, export.entrypoint, *flags, "--select", part) == 0
         rows[part] = np.load(tmp_path / f"{part}_rows.npy")
         assert PlyData.read(tmp_path / f"{part}.ply")["vertex"].count == len(rows[part])
-    assert np.array_equal(np.union1d(*rows.values()), np.load(scene_ply.with_name("splat_rows.npy")))
-    assert len(np.intersect1d(*rows.values())) == 0
-    assert "Objects" in capsys.readouterr().out
+    assert np.array_equal(np.union1d(rows["selection"], rows["rest"]), whole)
+    assert len(np.intersect1d(rows["selection"], rows["rest"])) == 0
+    mask = open_run(lifted).floaters().mask
+    assert np.array_equal(np.setdiff1d(whole, rows["clean"]), np.flatnonzero(mask.numpy()))
+    shown = said(capsys)
+    assert 0 < int(mask.sum()) < 0.05 * len(mask) and f"{int(mask.sum()):,} likely floaters are left out" in shown
+    limit = ("--select", "clean", "--floater-threshold", "100", "--overwrite")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, *limit) == 0
+    assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), whole)
 
 
 def test_objects_of_the_room(lifted: Path, tmp_path: Path, monkeypatch) -> None:

@@ -5,9 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +18,6 @@ from normlift_ns.cli import query
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.query.question import load_query
-from tests.browser.server import STOCK, Server
 from tests.cli.conftest import run_entry
 from tests.data.scene_files import ply_columns, write_ply
 
@@ -66,24 +62,6 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     rendered = np.asarray(Image.open(tmp_path / "out" / "test" / "rgb" / "0006.png").convert("RGB")).astype(float)
     photo = np.asarray(Image.open(stranger.parents[4] / "room" / "images" / "0006.png").convert("RGB"))
     assert np.abs(rendered - photo).mean() < 3
-
-
-@pytest.mark.slow
-def test_ns_viewer_answers(stranger, tmp_path):
-    assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
-
-
-def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
-    """The page that ns-viewer serves, if it still runs two seconds later."""
-    viewer = Server(STOCK, config, log, cwd=cwd)
-    try:
-        viewer.start(CUDA_VISIBLE_DEVICES="")
-        page = urllib.request.urlopen(viewer.address, timeout=60).read()
-        time.sleep(2)
-        assert viewer.alive(), viewer.said()
-        return page
-    finally:
-        viewer.stop()
 
 
 @pytest.fixture(autouse=True)

@@ -4,10 +4,9 @@ import shutil
 from pathlib import Path, PureWindowsPath
 
 import pytest
-import yaml
 
 from normlift_ns.data.nerfstudio.config import locate_run, read_trainer_config
-from tests.nerfstudio_plugin.conftest import opened, read
+from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 
 HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"
@@ -20,11 +19,9 @@ def refused(path: Path, text: str, problem: str) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_a_stock_config_is_read_as_nerfstudio_reads_it(stock: StockRun, tmp_path: Path) -> None:
-    text = stock.config.read_text()
-    assert read(stock.config) == yaml.load(text, Loader=yaml.Loader)
+def test_a_config_of_another_operating_system_is_read(stock: StockRun, tmp_path: Path) -> None:
     path = tmp_path / "config.yml"
-    path.write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))  # of another operating system
+    path.write_text(stock.config.read_text().replace("pathlib.PosixPath", "pathlib.WindowsPath"))
     output_dir = read_trainer_config(path).output_dir
     assert output_dir == Path("outputs") and not isinstance(output_dir, PureWindowsPath)
 
@@ -51,11 +48,9 @@ def test_runs_of_nerfstudios_main_branch_are_read(stock: StockRun, tmp_path: Pat
 
 def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
     for text, problem in (
-        ("method_name: [", "YAML"),
         ("\x00\x01", "YAML"),
         ("", "no method_name"),
         ("method_name: splatfacto", "no method_name"),  # not an object of nerfstudio's
-        (HEADER, "TrainerConfig has no machine"),
     ):
         refused(tmp_path / "config.yml", text, problem)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):

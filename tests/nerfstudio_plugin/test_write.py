@@ -1,4 +1,3 @@
-import errno
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,6 @@ from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.query.question import Query, load_query
 from tests.nerfstudio_plugin.conftest import field_of, opened, read, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
-from tests.processes import killed_at
 
 CHECKPOINT = "step-000000002.ckpt"
 
@@ -100,20 +98,17 @@ def test_an_existing_directory_is_kept_unless_told(copied: Path, field: Semantic
 
 
 def test_a_failure_leaves_nothing_and_keeps_what_was_there(copied: Path, field: SemanticField, monkeypatch) -> None:
+    def fail(*args: object) -> None:
+        raise KeyboardInterrupt
+
     source = opened(copied)
     run_dir = write(source, field, timestamp="now")
-    for failure in (OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()):
-
-        def fail(*args, failure=failure) -> None:
-            raise failure
-
-        with monkeypatch.context() as patch:
-            patch.setattr(torch, "save", fail)
-            for how in ({"timestamp": "other"}, {"timestamp": "now", "overwrite": True}):
-                with pytest.raises(type(failure)):
-                    write(source, field, **how)
-        assert os.listdir(run_dir.parent) == ["now"]
-        field_of(opened(run_dir / "config.yml"))
+    monkeypatch.setattr(torch, "save", fail)
+    for how in ({"timestamp": "other"}, {"timestamp": "now", "overwrite": True}):
+        with pytest.raises(KeyboardInterrupt):
+            write(source, field, **how)
+    assert os.listdir(run_dir.parent) == ["now"]
+    field_of(opened(run_dir / "config.yml"))
 
 
 def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field: SemanticField) -> None:
@@ -158,34 +153,6 @@ def test_of_lifts_at_once_all_are_numbered_or_all_but_one_refused(copied: Path, 
     for name in names:
         assert read(default.with_name(name) / "config.yml").timestamp == name
         assert len(field_of(opened(default.with_name(name) / "config.yml"))) == len(field)
-
-
-@pytest.mark.slow
-def test_a_lift_killed_while_it_replaces_a_run_loses_nothing(copied: Path, field: SemanticField, monkeypatch) -> None:
-    """At every 15th access to the disk, and at each one around the moment when the new run takes its place."""
-    from normlift_ns import open_run  # noqa: PLC0415
-
-    source = opened(copied)
-    run_dir = write(source, field, question=asking("old"), timestamp="now")
-    (run_dir.parent / ".cache" / "features").mkdir(parents=True)
-    monkeypatch.setattr(atomic, "_rename", lambda *_: False)  # where a system cannot exchange two folders
-
-    def lift() -> None:
-        write(source, field, question=asking("new"), timestamp="now", overwrite=True)
-
-    step, seen, gone, swapped = 1, [], 0, 0
-    while killed_at(step, lift, run_dir.parent):
-        gone += not run_dir.exists()
-        stored = open_run(run_dir / "config.yml").ask_stored()  # completes what was under way
-        assert stored is not None
-        seen.append(stored.texts[0])
-        if seen[-1] == "new" and swapped == 0:
-            step, swapped = step - 14, step  # back to the last one that left the old run
-        else:
-            step += 15 if swapped == 0 else 1 if step < swapped else 5
-    assert set(seen) == {"old", "new"} and gone > 0
-    lift()
-    assert sorted(os.listdir(run_dir.parent)) == [".cache", "now"]
 
 
 def test_what_a_killed_lift_left_is_cleaned_and_a_running_one_is_not(copied: Path, field: SemanticField) -> None:

@@ -231,6 +231,7 @@ def test_everything_by_buttons(crowd):
     for line, message in (("zebra", "zebra"), (" ; ", "Ask")):
         page.ask(line)
         page.says(message)
+        page.selects(BLOCK)  # the answer before
 
 
 def test_histograms_floaters_and_reasons_belong_to_what_is_selected(crowd, run):
