@@ -25,9 +25,8 @@ COLOURS = "cream,light brown,teal,chocolate brown,sky blue,dark green,bright blu
 WORDS = "curtain,mattress,doormat,table,sofa,flowerpot,crate,stool,cone,ball,doughnut,box,vase"
 THINGS = dict(zip(COLOURS.split(","), WORDS.split(",")))
 """What the classes of the room are called here, by their colours."""
-NOISE, MERGED, UNLABELLED, SMALLEST = 1.0, 0.1, 0.2, 20
-"""Length of the noise on the unit vector of every mask; shares of masks that are merged with a neighbour and of pixels
-without any; pixels of the smallest mask."""
+NOISE, UNLABELLED, SMALLEST = 1.0, 0.2, 20
+"""Length of the noise on the unit vector of every mask; share of pixels without any; pixels of the smallest mask."""
 
 
 def pieces(labels: NDArray, cell: int | None) -> NDArray:
@@ -51,14 +50,6 @@ def damaged(truth: NDArray, cell: int | None, vectors: NDArray, rng: np.random.G
     ids = pieces(truth, cell)
     first = [truth[ids == i][0] - 1 for i in range(ids.max() + 1)]
     rows = unit(vectors[first] + NOISE * unit(rng.normal(size=(len(first), vectors.shape[1]))))
-    for i in np.flatnonzero(rng.random(len(rows)) < MERGED):
-        around = np.unique(ids[ndimage.binary_dilation(ids == i, iterations=2)])
-        near = around[(around >= 0) & (around != i)]
-        if len(near) > 0:
-            other = rng.choice(near)
-            sizes = np.array([[(ids == i).sum()], [(ids == other).sum()]])
-            rows[other] = unit((sizes * rows[[i, other]]).sum(axis=0))
-            ids[ids == i] = other
     smooth = ndimage.gaussian_filter(rng.normal(size=ids.shape), 8)
     ids[smooth < np.quantile(smooth, UNLABELLED)] = -1
     used = np.unique(ids[ids >= 0])

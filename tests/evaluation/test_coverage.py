@@ -106,9 +106,8 @@ def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
 
 def test_photographs_of_the_other_side_come_first(monkeypatch):
     scene = wall()
-    photographs_ = coverage.coverage_of(scene, lifted(scene, [0, 1])).photographs
-    assert {photograph.name for photograph in photographs_[:2]} <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
-    assert photographs_[0].gain > 3 * photographs_[-1].gain
+    first, *_, last = coverage.coverage_of(scene, lifted(scene, [0, 1])).photographs
+    assert first.name in {"4.png", "5.png", "6.png", "7.png", "h.png"} and first.gain > 3 * last.gain
     monkeypatch.setattr(coverage, "MAX_IMAGES", 2)  # of more, some are looked at
     found = coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert {photograph.name for photograph in found.photographs} == {"4.png", "h.png"}
@@ -133,11 +132,8 @@ def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[coverage.Reliabi
     norm = torch.rand(n, generator=g, dtype=torch.float64)
     row, column = dense.nonzero(as_tuple=True)
     sparse = SparseRows.from_coo(row, column, dense[row, column], n)
-    return (
-        coverage.ReliabilityModel(norm, before.sum(1), (before**2).sum(1), surface, 0.7),
-        sparse,
-        torch.cat([before, dense], 1),
-    )
+    known = coverage.ReliabilityModel(norm, before.sum(1), (before**2).sum(1), surface, 0.7)
+    return known, sparse, torch.cat([before, dense], 1)
 
 
 def looped(known: coverage.ReliabilityModel, columns: Tensor, view: int, chosen: list[int]) -> float:
