@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -36,13 +35,6 @@ def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> in
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
-
-
-def wait_for(done: Callable[[], bool], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @dataclass

