@@ -1,4 +1,4 @@
-"""The commands have the options of their dataclasses, each with a text; and they start."""
+"""The commands have the options of the reference page, each with a text; and they start."""
 
 import os
 import re
