@@ -83,7 +83,6 @@ def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def little_room() -> DemoRoom:
-    """The room of `little`."""
     from tests.plain_room import plain_room  # noqa: PLC0415
 
     return plain_room(3000)

@@ -329,7 +329,6 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsys):
-    """As a user types it: a table at the end, and the exit code of the one that failed."""
     monkeypatch.chdir(tmp_path)
     Path("list.txt").write_text(f"{trained}\ngone/config.yml\n")
     flags = ("list.txt", "--results", "results", "--", *SMALL, "--output-dir", "lifted", "--queries", "red")

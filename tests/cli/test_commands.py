@@ -281,7 +281,6 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
 
 
 def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
-    """What shows before the splat is read is in test_early.py."""
     columns, splat = ply_columns(random_splat(5)), ply_columns(SplatParameters(**open_scene(little).parameters))
     write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
     write_gsplat(ply.parent / "other.pt", random_splat(50))

@@ -126,6 +126,7 @@ EXPORT = [
     ("--select selection", "--select selection", "--text"),
     ("--transfer file", "--transfer", "--text"),
     ("--select nothing", "--select", "'nothing'"),
+    ("--exporters note", "unknown exporter 'note'"),
     ("--object-max-gap nan", "--object-max-gap", "got nan"),
     ("--output-dir file", "file, named with --output-dir"),
     ("--output-filename /", "--output-filename"),

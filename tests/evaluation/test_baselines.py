@@ -139,7 +139,6 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
 
 @pytest.mark.parametrize("power", [0.0, 2.0])
 def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
-    """As `lift_scene` lifts them, numbers that vote included."""
     options = replace(PLAIN, consensus=True, consensus_power=power, consensus_sample=9)
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}

@@ -94,7 +94,6 @@ def capture(request: pytest.FixtureRequest) -> Path:
 
 
 def opened(config: Path, **how: Any) -> Any:
-    """The scene of a run."""
     from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415
 
     return open_scene(config, **how)
@@ -136,5 +135,4 @@ def write(
 
 
 def field_of(scene: NerfstudioScene) -> SemanticField:
-    """The field of a lifted run."""
     return load_field(scene.location.run_dir, scene.gaussians.means, checkpoint=scene.checkpoint_path)

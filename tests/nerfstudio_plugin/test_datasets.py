@@ -218,8 +218,6 @@ def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
 
 
 def test_damage_of_json_is_a_message(copied: Path) -> None:
-    """In the data set, and in what the training wrote."""
-
     def load() -> None:
         scene = opened(copied)
         assert len(scene.train.cameras) == len(scene.train)

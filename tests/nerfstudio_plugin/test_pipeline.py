@@ -187,7 +187,6 @@ def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun], metho
 
 
 def test_a_stock_checkpoint_is_trained_on_and_lifted(train: Callable[..., StockRun], stock: StockRun) -> None:
-    """`ns-train normlift --load-checkpoint …`, with a full checkpoint, optimizers included."""
     (checkpoint,) = (stock.config.parent / "nerfstudio_models").iterdir()
     run = opened(train("further", checkpoint=checkpoint).config)
     assert run.checkpoint.step == 4  # the stock run ended with step 2

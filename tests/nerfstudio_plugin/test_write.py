@@ -1,6 +1,5 @@
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,10 +82,12 @@ def test_paths_become_absolute_elsewhere(copied: Path, field: SemanticField, tmp
             source = opened(copied, data=data)
 
 
-def test_an_existing_directory_is_replaced_if_told(copied: Path, field: SemanticField) -> None:
+def test_an_existing_directory_is_replaced_only_if_told(copied: Path, field: SemanticField) -> None:
     source = opened(copied)
     run_dir = write(source, field, timestamp="now")
     (run_dir / "note.txt").touch()
+    with pytest.raises(FileExistsError, match=rf"{run_dir} exists; .*--timestamp .*--output-dir.*--overwrite"):
+        write(source, field, timestamp="now")
     assert write(source, field, timestamp="now", overwrite=True) == run_dir
     assert not (run_dir / "note.txt").exists() and os.listdir(run_dir.parent) == ["now"]
     lifted = opened(run_dir / "config.yml")  # a run may also replace the one that it was made from
@@ -123,33 +124,6 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field:
         field_of(opened(run_dir / "config.yml"))
     with pytest.raises(FileNotFoundError, match=r"without semantics \(no normlift/"):
         field_of(opened(stock.config))
-
-
-def test_of_lifts_at_once_all_are_numbered_or_all_but_one_refused(copied: Path, field: SemanticField) -> None:
-    source = opened(copied)
-    default, chosen = (run_directory(source.runs_dir, source.name, name) for name in ("2024-05-01_120000", "now"))
-
-    def lift(_: int) -> str:
-        return write_run(source, field, default, exact_name=False).name
-
-    def lift_there(seed: int) -> Exception | Path:
-        try:
-            return write_run(source, field, chosen, question=asking(str(seed)))
-        except FileExistsError as error:
-            return error
-
-    with ThreadPoolExecutor(2) as pool:
-        names = [*pool.map(lift, range(2)), lift(2)]
-        found = list(pool.map(lift_there, range(2)))
-    (refused,) = (error for error in found if isinstance(error, FileExistsError))
-    assert all(part in str(refused) for part in (f"{chosen} exists", "--timestamp", "--output-dir", "--overwrite"))
-    kept = load_query(chosen / "normlift")
-    assert kept is not None and kept.texts == (str(found.index(chosen)),)
-    assert sorted(names) == [f"2024-05-01_120000{end}" for end in ("", "_2", "_3")]
-    assert sorted([*names, "now"]) == sorted(os.listdir(default.parent))
-    for name in names:
-        assert read(default.with_name(name) / "config.yml").timestamp == name
-        assert len(field_of(opened(default.with_name(name) / "config.yml"))) == len(field)
 
 
 def test_what_a_killed_lift_left_is_cleaned_and_a_running_one_is_not(copied: Path, field: SemanticField) -> None:

@@ -23,7 +23,6 @@ from normlift_ns.viewer.widgets import escape_mdx
 
 
 def pictured() -> tuple[torch.Tensor, torch.Tensor]:
-    """A picture, in colours and grey."""
     rgb = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
     return rgb, rgb.mean(dim=2, keepdim=True).expand_as(rgb)
 
