@@ -23,6 +23,10 @@ pipeline: !!python/object:a.B
 """
 
 
+MY_EXPORTS = ("a.ply", "b_rows.npy", "c_names.json", "d_objects.json")
+MY_SCORES = ("e.json", "f_sweeps.svg", "g_signals.svg", "h_coverage_camera_path.json", "i_coverage_pose_5.png")
+
+
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     """A trained and lifted run, as far as one can see without opening it, and things that are no files."""
@@ -37,6 +41,9 @@ def config(tmp_path: Path) -> Path:
     (tmp_path / "dangling").symlink_to("nothing")
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "outputs" / "room" / "normlift" / "old").mkdir(parents=True)
+    (tmp_path / "mine").mkdir()
+    for name in (*MY_EXPORTS, *MY_SCORES):
+        (tmp_path / "mine" / name).touch()
     return folder / "config.yml"
 
 
@@ -127,13 +134,16 @@ EXPORT = [
     ("--transfer file", "--transfer", "--text"),
     ("--select nothing", "--select", "'nothing'"),
     ("--exporters note", "unknown exporter 'note'"),
+    *((f"--output-dir mine --output-filename {x[0]}.ply", f"{x} exists", "--output-dir") for x in MY_EXPORTS),
     ("--object-max-gap nan", "--object-max-gap", "got nan"),
     ("--output-dir file", "file, named with --output-dir"),
     ("--output-filename /", "--output-filename"),
     ("--text a --transfer none.ply", "none.ply, given with --transfer"),
     ("--text a --select clean --masks-dir m", "--masks-dir"),
 ]
+STUDIES = "--protocol masks --labels room --study sweeps signals coverage --output-path mine"
 EVAL = [
+    *((f"{STUDIES}/{x[0]}.json", f"{x} exists", "--output-path", "--overwrite True") for x in MY_SCORES),
     ("--protocol masks --labels none", "none, given with --labels"),
     ("--protocol lerf --labels none", "none, given with --labels"),
     ("--protocol scannet --labels none", "none, given with --labels"),

@@ -43,12 +43,7 @@ def stock(made_once: Callable[..., Path], _imported: None) -> StockRun:
         rest = trainer.pipeline.model.features_rest.data
         rest.copy_(0.2 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(0)))
 
-    def make(folder: Path) -> None:
-        write_dataset(folder / "scene")
-        train_splatfacto(folder, Path("scene"), prepare=prepare, steps=3)
-
-    folder = made_once("stock", make)
-    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+    return trained_once(made_once, "stock", write_dataset, prepare=prepare, steps=3)
 
 
 @pytest.fixture
@@ -91,6 +86,17 @@ def capture(request: pytest.FixtureRequest) -> Path:
     if not config.exists():
         pytest.skip(f"needs the real captures, which are not part of the project: no {config}")
     return config
+
+
+def trained_once(made_once: Callable[..., Path], name: str, write: Callable[[Path], Any], **how: Any) -> StockRun:
+    """A run of a dataset, by its name in `made_once`; `how` are keywords of `train_splatfacto`."""
+
+    def make(folder: Path) -> None:
+        write(folder / "scene")
+        train_splatfacto(folder, Path("scene"), **how)
+
+    folder = made_once(name, make)
+    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
 
 
 def opened(config: Path, **how: Any) -> Any:

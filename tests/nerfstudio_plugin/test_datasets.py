@@ -16,8 +16,8 @@ from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.errors import InputError
 from tests.data.scene_files import write_colmap
 from tests.hostile import fuzz, hostile_json
-from tests.nerfstudio_plugin.conftest import opened
-from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, train_splatfacto, write_dataset
+from tests.nerfstudio_plugin.conftest import opened, trained_once
+from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, write_dataset
 
 
 def write_project(folder: Path) -> Path:
@@ -39,12 +39,7 @@ def project(made_once: Callable[..., Path], _imported: None) -> StockRun:
     def configure(config: Any) -> None:
         config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
 
-    def make(folder: Path) -> None:
-        write_project(folder / "scene")
-        train_splatfacto(folder, Path("scene"), configure=configure)
-
-    folder = made_once("colmap-run", make)
-    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+    return trained_once(made_once, "colmap-run", write_project, configure=configure)
 
 
 @pytest.fixture
