@@ -59,9 +59,9 @@ def unit(rows: NDArray) -> NDArray:
     return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
-def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, seed: int) -> None:
+def write_features(capture: Path, folder: Path, vectors: NDArray, views: int) -> None:
     """What LangSplat's preprocessing would leave of the training images."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     folder.mkdir()
     for path in sorted((capture / "instance").iterdir())[:views]:
         truth = np.asarray(Image.open(path)).astype(np.int64)
@@ -75,9 +75,8 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("draws", "least"), [(1, 0.9), pytest.param(3, 0.92, marks=pytest.mark.extra)])
-def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
-    """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
+def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatch):
+    """mIoU over the Gaussians of 13 classes."""
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
     from tests.plain_room import plain_room  # noqa: PLC0415
 
@@ -89,16 +88,15 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
     np.savez(tmp_path / "texts.npz", **dict(zip(THINGS.values(), vectors)))
     texts = TextEmbeddingFile(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])
 
-    def lifted(seed: int, level: str) -> tuple[Path, list[float]]:
+    features = tmp_path / "features"
+    write_features(tmp_path / "room", features, vectors, views=24)
+
+    def lifted(level: str) -> tuple[Path, list[float]]:
         """The run, and mIoU before and after refinement."""
-        features = tmp_path / f"features_{seed}"
-        if not features.exists():
-            write_features(tmp_path / "room", features, vectors, views=24, seed=seed)
-        name = f"{level}_{seed}"
         importing = ("--features", "langsplat", "--features-dir", features, "--text-embeddings", tmp_path / "texts.npz")
-        flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
+        flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", level)
         assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-        config = trained.parents[2] / "normlift" / name / "config.yml"
+        config = trained.parents[2] / "normlift" / level / "config.yml"
         field = open_run(config).field
         scores = []
         for refined in (False, True):
@@ -106,16 +104,13 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
             scores.append(class_scores(confusion(room.labels, found, len(room.names))).miou)
         return config, scores
 
-    scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}
+    before, after = lifted("l")[1]
     monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)  # another level has its evidence
-    config, summed = lifted(0, "sum")
+    config, summed = lifted("sum")
     asking = ("--text", "sofa", "--negatives", "box", "table", "--output-json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
     (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
-    before, after = np.mean(list(scores.values()), axis=0)
-    assert after >= least
-    assert all(refined > raw for raw, refined in scores.values())
-    assert after > before + 0.02
+    assert after >= 0.9 and after > before + 0.02
     assert summed[1] >= 0.9
     truth = room.labels == room.names.index("sky blue")
     assert sofa["fraction"] == pytest.approx(float(truth.float().mean()), rel=0.2)

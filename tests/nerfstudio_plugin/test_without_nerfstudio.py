@@ -23,7 +23,7 @@ from normlift_ns.api import _lifted_config
 from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
-from normlift_ns.data.nerfstudio.dataparsers import normalize_poses, parse_dataset
+from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
 from normlift_ns.data.nerfstudio.load import TrainedViews
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
@@ -138,18 +138,6 @@ def poses(rng: np.random.Generator, count: int) -> list[list[list[float]]]:
     found[:, :3, :3] = Rotation.from_euler("zyx", rng.normal([0, 0, 1.4], [1.5, 0.4, 0.4], (count, 3))).as_matrix()
     found[:, :3, 3] = rng.normal(0, 3, (count, 3))
     return found.tolist()
-
-
-def test_worlds_are_nerfstudios(nerfstudio: Any) -> None:
-    from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses  # noqa: PLC0415
-
-    rng, methods = np.random.default_rng(0), (("pca", "up", "vertical", "none"), ("poses", "focus", "none"))
-    for orientation, center, count in itertools.product(*methods, (3, 4, 9)):
-        rows = poses(rng, count)
-        parser = config_classes.NerfstudioDataParserConfig(center_method=center, auto_scale_poses=False)
-        found, transform, scale = normalize_poses(rows, parser, orientation)
-        expected = auto_orient_and_center_poses(torch.tensor(rows), orientation, center)
-        assert torch.equal(found, expected[0][:, :3]) and torch.equal(transform, expected[1]) and scale == 1
 
 
 def write_images(rng: np.random.Generator, files: list[Path], size: tuple[int, int], mode: str) -> None:

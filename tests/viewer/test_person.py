@@ -247,8 +247,6 @@ def test_histograms_floaters_and_reasons_belong_to_what_is_selected(crowd, run):
     page.until(lambda: page.gui["Threshold"].value == 0.9)
     page.press("History", "Clear")
     page.until(lambda: page.drawings("svg") == 0)
-    page.press("Suggested")
-    page.says("no threshold")
 
     page.asks("blue", BLOCK)
     page.press("Why?")
@@ -274,9 +272,6 @@ def test_histograms_floaters_and_reasons_belong_to_what_is_selected(crowd, run):
     page.press("Select likely floaters")
     page.says("no likely floaters")
     page.until(lambda: not page.gui["Ask"].disabled)
-    page.asks("green", 0)
-    page.press("Why?")
-    page.says("nothing is selected")
     del vars(run)["floaters"]
     assert torch.equal(run.floaters, find_floaters(run.scene.gaussians, run.space.field.scalars).mask)
 
