@@ -96,7 +96,6 @@ def little(little_room: DemoRoom, made_once: Any) -> Path:
 
 @pytest.fixture(scope="session")
 def little_lifted(little: Path, made_once: Any) -> Path:
-    """config.yml of a lifted run of it."""
     return make_lifted(made_once, little, "t", "--region-count", "300")
 
 

@@ -28,7 +28,6 @@ def capture(little_lifted: Path) -> Path:
 
 @pytest.fixture
 def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The document that a protocol writes."""
 
     def score(protocol: str, labels: Path, *flags: object) -> dict:
         given = ("--protocol", protocol, "--load-config", little_lifted, "--labels", labels, "--overwrite", True)

@@ -84,7 +84,6 @@ def children(pid: int) -> list[int]:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("rank", [1, pytest.param(0, marks=pytest.mark.extra)])
 def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained, alone, tmp_path):
-    """While they keep what they have seen."""
     command, output = words(trained, tmp_path / "killed", 2), tmp_path / "killed"
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     until(lambda: len(children(process.pid)) == 2)

@@ -18,7 +18,7 @@ from normlift_ns.cli import query
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.query.question import load_query
-from tests.cli.conftest import run_entry
+from tests.cli.conftest import run_entry, said
 from tests.data.scene_files import ply_columns, write_ply
 
 BIN = Path(sys.executable).parent
@@ -93,7 +93,7 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
 
 
-def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queries_are_stored_and_replaced_beside_their_checkpoint(lifted, tmp_path, monkeypatch, capsys) -> None:
     copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
     shutil.copytree(lifted.parent, copy.parent)
     flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save-query", "True")
@@ -107,3 +107,7 @@ def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypat
     assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
     assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 0
     assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
+    (checkpoint,) = (copy.parent / "nerfstudio_models").iterdir()
+    checkpoint.write_bytes(checkpoint.read_bytes() + b"of another run")
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 1
+    assert checkpoint.name in said(capsys)

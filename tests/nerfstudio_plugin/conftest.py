@@ -81,7 +81,6 @@ def registered(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(params=["fox", "tabletop"])
 def capture(request: pytest.FixtureRequest) -> Path:
-    """config.yml of a real run."""
     config = SHARED / "captures" / "outputs" / request.param / "splatfacto" / "run" / "config.yml"
     if not config.exists():
         pytest.skip(f"needs the real captures, which are not part of the project: no {config}")

@@ -76,7 +76,6 @@ def test_missing_small_images_are_refused_without_a_question(moved: Path, tmp_pa
 
 
 def test_what_nerfstudio_reads_first_is_checked_first(moved: Path, tmp_path: Path) -> None:
-    """It prefers the text files of COLMAP."""
     model = tmp_path / "moved" / "scene" / "sparse" / "0"
     (model / "cameras.txt").write_text("1 PINHOLE wide")
     with pytest.raises(InputError, match=r"cameras\.txt is damaged"):

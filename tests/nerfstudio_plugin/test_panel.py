@@ -585,7 +585,6 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
 
 
 def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
-    """As in a training: the viewer starts before there is anything to ask."""
     panel, field = pipeline.model.normlift, pipeline.model.field
     panel.close()
     assert panel._widgets.ask.disabled

@@ -81,7 +81,6 @@ class Gui:
         return "\n".join(w.content for w in self.made if w.visible and not w.removed)
 
     def rows(self) -> list[Any]:
-        """The buttons of the found objects."""
         return [w for w in self.made if w.options == ("go to", "only", "hide", "export") and w.visible]
 
 
