@@ -488,8 +488,9 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     browser._scene_pointer_cb(event)
     assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
     clicked, threshold = chosen(pipeline), panel.answer.question.threshold
-    similar = field.directions() @ field.directions(met[None])[0]
-    assert torch.equal(clicked, (similar > threshold) & field.valid()) and clicked.any()
+    asked = field.query(panel.state.query.embeddings)[:, 0]
+    assert torch.equal(clicked, (asked > threshold) & field.valid()) and clicked.any()
+    assert asked[met] == pytest.approx(1, abs=1e-3)
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
