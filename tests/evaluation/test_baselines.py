@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from normlift_ns.evaluation.studies import study_ablation, study_timing, voting_
 from normlift_ns.evidence_collection import cells_to_regions
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.rasterization.backend import RasterJob
-from tests.random_scenes import Photographs, dense, made_scene, orbit, random_scene
+from tests.random_scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
 OPTIONS = SourceOptions(encoder="color", regions="grid", region_count=12)
@@ -238,3 +239,29 @@ def test_what_is_left_out_is_said(lifted):
     table = study_timing([lifted, older], "cpu")
     assert [row["scene"] for row in table] == ["made", "made", "mean"]
     assert table[2]["store_s"] == lifted.field.manifest["cost"]["store_s"]  # the other does not say
+
+
+def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
+    """The loop over views and channels, with gsplat's compiled functions replaced by dense products."""
+    seen = observations(lifted)[:2]
+    weights = iter([weights for _, weights, _ in seen])
+
+    def project_views(job: RasterJob, cameras: list[Camera]) -> SimpleNamespace:
+        return SimpleNamespace(means2d=None, conics=None, opacities=None, offsets=None, indices=next(weights))
+
+    def backward(*given: Any) -> tuple[Any, ...]:
+        gradient = given[13]
+        assert gradient.shape == (1, HEIGHT, WIDTH, 32)
+        return None, None, None, (given[10] @ gradient.flatten(0, 2))[None]
+
+    monkeypatch.setattr("normlift_ns.evaluation.baselines.project_views", project_views)
+    monkeypatch.setattr(
+        "normlift_ns.evaluation.baselines.compiled_rasterizer",
+        lambda: (lambda *drawing: (None, torch.zeros(1, HEIGHT, WIDTH, 1), None), backward),
+    )
+    g = generator(0)
+    maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
+    job = RasterJob(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
+    found = baselines.dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
+    expected = sum(w @ features.flatten(0, 1) for (_, w, _), features in zip(seen, maps))
+    assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)
