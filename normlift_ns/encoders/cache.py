@@ -24,6 +24,7 @@ from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatur
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import load_arrays, save_arrays
+from normlift_ns.io.guard import read_file
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 REMEDY = "restore it by lifting again with: ns-normlift (the same options)"
@@ -85,7 +86,7 @@ class CachedRegions(_Cached):
 
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
         """Return the cache path of the label maps of an image, whether the file exists or not."""
-        files = [file.read_bytes() for file in self.files(name)]
+        files = [read_file(file, max_bytes=2**31) for file in self.files(name)]
         return cache_path(self.folder, self.identity, name.encode(), *_key_parts(image), *files)
 
 
