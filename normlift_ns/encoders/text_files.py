@@ -245,7 +245,7 @@ def write_text_embeddings(file: Path, vectors: Mapping[str, Any]) -> None:
         FileExistsError, OSError: As `atomic_file`.
     """
     units = {text: unit_rows(vector) for text, vector in vectors.items()}
-    with atomic_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
+    with atomic_file(file, own=True) as draft, zipfile.ZipFile(draft, "w") as archive:
         for text, unit in units.items():  # numpy.savez does not accept a text named "file"
             with archive.open(f"{text}.npy", "w") as entry:
                 np.lib.format.write_array(entry, unit, allow_pickle=False)

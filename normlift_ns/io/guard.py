@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import re
@@ -186,11 +187,12 @@ def file_kind(path: Path) -> str:
         if head.lstrip()[:1] in (b"{", b"["):
             file.seek(0)
             return ".json" if _is_json(file) else "text that is not JSON"
-    words = head.decode("utf8", "replace").replace(",", " ").split()
-    if len(words) == 0:
-        return ""
-    is_text = words[0].isprintable() and "\ufffd" not in words[0]
-    return f"text beginning with {words[0][:40]!r}" if is_text else f"data beginning with {head[:4].hex()}"
+    decoder = codecs.getincrementaldecoder("utf8")("replace")  # the head may end within a character
+    text = decoder.decode(head, final=len(head) < _HEAD_BYTES)
+    if any(not (c.isprintable() or c.isspace()) or c == "\ufffd" for c in text):
+        return f"data beginning with {head[:4].hex()}"
+    first, comma, _ = text.partition("\n")[0].partition(",")
+    return f"a table with the column {first[:40]!r}" if comma else "text" if text else ""
 
 
 def suffix_kind(path: Path) -> str | None:
