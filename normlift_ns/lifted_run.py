@@ -296,7 +296,10 @@ class LiftedRun:
                 f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
-        points = exports.read_cloud(check_path("cloud", cloud))
+        cloud = check_path("cloud", cloud)
+        if path.exists() and path.samefile(cloud):
+            raise InputError(f"{path} is the cloud to read, so the labeled cloud cannot be written there")
+        points = exports.read_cloud(cloud)
         rule = exports.CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
         return exports.transfer_labels(
             self.scene, self.field, answer, exports.answer_instances(answer), rule, path, overwrite=overwrite

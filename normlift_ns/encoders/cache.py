@@ -206,9 +206,11 @@ def _read(
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:
-    """Return whether a cached tensor is a valid label map of the image."""
+    """Return whether a cached tensor is a valid label map of the image, without gaps in the ids of a level."""
     matches = labels.dtype in (torch.int16, torch.int32) and labels.ndim == 4 and labels.shape[2:] == image.shape[:2]
-    return matches and labels.numel() > 0 and int(labels.min()) >= -1
+    if not matches or labels.numel() == 0 or int(labels.min()) < -1 or int(labels.max()) >= labels[0].numel():
+        return False
+    return all(bool(torch.bincount(level.flatten().int() + 1)[1:].all()) for level in labels)
 
 
 def _are_units(rows: Tensor, count: int) -> bool:

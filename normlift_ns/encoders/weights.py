@@ -111,7 +111,7 @@ def is_local_path(name: str, parts: int) -> bool:
     (False, True, True)
     """
     path = Path(name)
-    return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
+    return path.is_absolute() or name[:1] in ("~", ".") or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
 
 
 def read_json(path: Path) -> dict[str, Any]:
