@@ -66,9 +66,9 @@ def _check_access(path: Path, flag: str) -> None:
 def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
     """Raise if a file cannot be written, or exists and must not be replaced."""
     files = [path for path in paths if path is not None]
+    refuse_existing(*files, overwrite=overwrite, flags=flags)
     for path in files:
         check_writable_file(path, flags)
-    refuse_existing(*files, overwrite=overwrite, flags=flags)
 
 
 def check_writable_file(path: Path | None, flag: str) -> None:

@@ -528,7 +528,7 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
     for path in paths:
         if not overwrite and os.path.lexists(path):
             raise FileExistsError(f"{path} exists; give another {flags}, or --overwrite True.")
-        refuse_other_kinds(path, suffix_kind(path))
+        refuse_other_kinds(path, suffix_kind(path), flags)
 
 
 def safe_file_name(text: str) -> str:

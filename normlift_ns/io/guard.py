@@ -7,7 +7,6 @@ import json
 import os
 import re
 import stat
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
@@ -148,12 +147,13 @@ def _input_files() -> dict[tuple[int, int], str]:
     return found
 
 
-def refuse_other_kinds(path: Path, kind: str | None) -> None:
+def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=True") -> None:
     """Raise if an output would replace anything but an empty file or a regular file of its own kind.
 
     Args:
         path: the output; if it does not exist, nothing is checked.
         kind: kind of the output as of `file_kind`; None: not known yet.
+        flags: flags that name the output, for the error message.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, or its content is of another kind.
     """
@@ -162,7 +162,9 @@ def refuse_other_kinds(path: Path, kind: str | None) -> None:
     try:
         found = file_kind(path)
     except (OSError, InputError):
-        raise InputError(f"{path} exists and is not a readable regular file; give another name, or delete it") from None
+        raise InputError(
+            f"{path}, given with {flags}, exists and is not a regular file that can be read; give another name"
+        ) from None
     if found != "" and kind is not None and kind != found:
         raise InputError(
             f"{path} holds {found}, and would be replaced by {kind}; give another name, "
@@ -201,6 +203,8 @@ def suffix_kind(path: Path) -> str | None:
 
 
 def _is_npz(file: BinaryIO) -> bool:
+    import zipfile  # noqa: PLC0415 (its import takes 8 ms, and few commands need it)
+
     try:
         with zipfile.ZipFile(file) as archive:
             return all(name.endswith(".npy") for name in archive.namelist())

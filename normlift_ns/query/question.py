@@ -201,6 +201,8 @@ def load_query(folder: Path) -> Query | None:
     if not os.path.lexists(path):
         return None
     try:
+        if not os.path.isfile(path):
+            raise InputError("it is not a regular file")
         arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
         if set(metadata) != {_METADATA_KEY}:
             raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")

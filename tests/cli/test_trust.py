@@ -18,6 +18,7 @@ from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import read_field
 from normlift_ns.io.run_dir import read_manifest, write_manifest
 from tests.cli.conftest import QUICK, run_entry, said
+from tests.io.test_digests import example
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -61,11 +62,7 @@ def test_no_output_of_a_command_or_of_python_replaces_what_is_not_ours(own: Path
         lambda: opened.transfer(cloud, cloud, answer, overwrite=True),
         lambda: opened.transfer(cloud, next(run.glob("nerfstudio_models/*.ckpt")), answer, overwrite=True),
         lambda: opened.export(diary, overwrite=True),
-        lambda: (
-            opened.field.store.evidence.save(diary)
-            if hasattr(opened.field.store, "evidence")
-            else opened.export(diary, overwrite=True)
-        ),
+        lambda: example("evidence").store.evidence.save(diary),
     ):
         with pytest.raises(InputError):
             write()
@@ -100,17 +97,17 @@ def test_no_cell_of_a_table_is_a_formula() -> None:
     assert [csv_text(text) for text in ("red mug", "a=b", "", "1-2")] == ["red mug", "a=b", "", "1-2"]
 
 
-def test_forged_caches_and_fields_are_damaged(own: Path, tmp_path: Path) -> None:
+def test_forged_caches_and_fields_are_damaged(tmp_path: Path) -> None:
     image, labels = torch.zeros(40, 50, 3, dtype=torch.uint8), torch.arange(2000).reshape(1, 1, 40, 50).short()
     assert _are_labels(labels, image)
     for wrong in (32767, 2000, -2, 7):  # too large, one too many, too small, leaves a gap
         forged = labels.clone()
         forged[0, 0, 0, 5] = wrong
         assert not _are_labels(forged, image), wrong
-    folder = own.parents[2] / "normlift" / "t" / "normlift"
-    arrays = load_file(folder / "field.safetensors")
-    facts, listed = read_manifest(folder)
-    assert facts["form"] == "evidence" and (arrays["norm"] == 0).any()
+    folder = tmp_path / "field"
+    example("evidence").save(folder)
+    arrays, (facts, listed) = load_file(folder / "field.safetensors"), read_manifest(folder)
+    assert (arrays["weight"] == 0).any()
     arrays["norm"] = np.ones_like(arrays["norm"])
     digest = save_arrays(folder / "field.safetensors", arrays, overwrite=True)
     (folder / "manifest.json").unlink()
