@@ -390,8 +390,7 @@ def write_run(
             write_text_file(
                 folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True, own=True
             )
-            replaced = written_files(path) if overwrite and exact_name else None
-            if commit_directory(folder, path, replaced=replaced):
+            if commit_directory(folder, path, replaced=written_files if overwrite and exact_name else None):
                 return path
     refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
     raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")

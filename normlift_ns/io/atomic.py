@@ -353,11 +353,12 @@ def draft_directory(path: Path) -> Iterator[Path]:
         yield draft
 
 
-def commit_directory(draft: Path, path: Path, *, replaced: Collection[str] | None = None) -> bool:
+def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Collection[str]] | None = None) -> bool:
     """Rename a folder of `draft_directory` to its final path; return False if that exists and `replaced` is None.
 
     Args:
-        replaced: files of an existing folder, relative to it, that the new one replaces. All others are kept.
+        replaced: function that returns the files of an existing folder, relative to it, that the new one replaces. All
+            others are kept.
     Raises:
         ValueError: both folders have a file that is not in `replaced`; nothing has changed then.
 
@@ -369,8 +370,8 @@ def commit_directory(draft: Path, path: Path, *, replaced: Collection[str] | Non
         if not rename_if_absent(draft, path):
             if replaced is None:
                 return False
-            _link_others(path, draft, replaced)
-            old = draft
+            old, names = draft, replaced(path)
+            _link_others(path, draft, names)
             if not _rename(draft, path, _EXCHANGE):  # not supported
                 temporary = draft.parent
                 old = temporary / f"{path.name}.old"
@@ -381,7 +382,7 @@ def commit_directory(draft: Path, path: Path, *, replaced: Collection[str] | Non
                     os.rename(draft, path)
                 finally:
                     complete_journal(temporary)
-            _link_others(old, path, replaced, is_new=lambda file: not os.path.lexists(file))  # written meanwhile
+            _link_others(old, path, names, is_new=lambda file: not os.path.lexists(file))  # written meanwhile
     _flush_names(path.parent)
     return True
 

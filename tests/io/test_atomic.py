@@ -138,7 +138,7 @@ def make_folder(path: Path, text: str, *, overwrite: bool = False) -> bool:
         for i in range(2):
             atomic.write_text_file(draft / "inner" / f"{i}.txt", text)
         replaced = {f"inner/{i}.txt" for i in range(2)}
-        return atomic.commit_directory(draft, path, replaced=replaced if overwrite else None)
+        return atomic.commit_directory(draft, path, replaced=(lambda _: replaced) if overwrite else None)
 
 
 def content(path: Path) -> str:

@@ -207,11 +207,12 @@ def test_all_readers_use_the_one_opener() -> None:
         for node in ast.walk(ast.parse(file.read_text("utf8"))):
             call = node.func if isinstance(node, ast.Call) else None
             if isinstance(call, ast.Attribute) and (
-                (call.attr in ("read_bytes", "read_text")
-                and ast.unparse(call.value) != "guard")
-                or (call.attr == "open"
-                and isinstance(node, ast.Call)
-                and any(isinstance(x, ast.Constant) and str(x.value).startswith("r") for x in node.args))
+                (call.attr in ("read_bytes", "read_text") and ast.unparse(call.value) != "guard")
+                or (
+                    call.attr == "open"
+                    and isinstance(node, ast.Call)
+                    and any(isinstance(x, ast.Constant) and str(x.value).startswith("r") for x in node.args)
+                )
             ):
                 found.append(f"{file.relative_to(root).as_posix()}: {ast.unparse(call)[:60]}")
     assert [line for line in found if line.split(":")[0] not in BESIDE] == []
