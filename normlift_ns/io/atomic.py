@@ -426,6 +426,8 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
             return folder / draft.name
     for path in remove:
         path.unlink(missing_ok=True)
+    if journal is not None:  # completing it later would remove what another process writes meanwhile
+        journal.unlink()
     return None
 
 
