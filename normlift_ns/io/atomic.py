@@ -382,14 +382,12 @@ def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Coll
                     os.rename(draft, path)
                 finally:
                     complete_journal(temporary)
-            _link_others(old, path, names, is_new=lambda file: not os.path.lexists(file))  # written meanwhile
+            _link_others(old, path, names, keep_new=True)  # written meanwhile
     _flush_names(path.parent)
     return True
 
 
-def _link_others(
-    old: Path, new: Path, replaced: Collection[str], is_new: Callable[[Path], bool] = lambda file: True
-) -> None:
+def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: bool = False) -> None:
     """Link the files of an old folder that are not replaced into a new one; copy them where links are not supported."""
     for parent, folders, files in os.walk(old):
         source, target = Path(parent), new / Path(parent).relative_to(old)
@@ -398,7 +396,7 @@ def _link_others(
             shutil.copystat(source, target)
         for name in (*files, *(name for name in folders if (source / name).is_symlink())):
             file = target / name
-            if file.relative_to(new).as_posix() in replaced or not is_new(file):
+            if file.relative_to(new).as_posix() in replaced or (keep_new and os.path.lexists(file)):
                 continue
             if os.path.lexists(file):
                 raise InputError(f"{source / name} is not a file of the run, but the new run has one; move it away")

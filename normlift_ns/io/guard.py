@@ -8,8 +8,8 @@ import os
 import re
 import stat
 from collections.abc import Iterable
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from normlift_ns.errors import InputError
 
@@ -17,7 +17,7 @@ MAX_TEXT_BYTES = 2**26
 """Size limit of a text file; normlift_ns writes a few thousand bytes."""
 
 
-def open_regular(path: str | Path, *, max_bytes: int | None = None) -> BinaryIO:
+def open_regular(path: str | Path, *, max_bytes: int | None = None) -> BufferedReader:
     """Open a regular file for reading, without waiting for a pipe.
 
     Raises:
@@ -69,7 +69,6 @@ _OWNERS = (
     *(("data set", (name,), _DATA_SET) for name in ("sparse/cameras.txt", "colmap/sparse", "database.db")),
 )
 """Kind of folder, entries that identify it, and a pattern of the entries that belong to it."""
-_CACHE = ".cache"
 _KINDS = {
     ".ply": rb"ply\r?\n", ".png": rb"\x89PNG\r\n\x1a\n", ".npy": rb"\x93NUMPY", ".jpg": rb"\xff\xd8\xff",
     ".pdf": rb"%PDF-", ".safetensors": rb'(?s).{8}\{"', ".svg": rb"<\?xml[^>]*>\s*(<!DOCTYPE svg|<svg)|<svg",
@@ -113,7 +112,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
         for kind, parent, names in entries[folder]:
             if names.fullmatch(Path(resolved).relative_to(parent).parts[0]) and (exists or kind == "run"):
                 owner = f"the {kind} {parent}"
-        if exists and _CACHE in Path(folder).parts:
+        if exists and ".cache" in Path(folder).parts:
             owner = f"the cache {folder}"
         if exists and owner is None:
             inputs = _input_files() if inputs is None else inputs
@@ -138,11 +137,8 @@ def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
 def _input_files() -> dict[tuple[int, int], str]:
     """Return the names of the inputs that exist by device and inode, so that links are recognized."""
     found = {}
-    for name in _inputs:
-        try:
-            status = os.stat(name)
-        except OSError:
-            continue
+    for name in filter(os.path.exists, _inputs):
+        status = os.stat(name)
         found[status.st_dev, status.st_ino] = name
     return found
 
@@ -202,7 +198,7 @@ def suffix_kind(path: Path) -> str | None:
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 
-def _is_npz(file: BinaryIO) -> bool:
+def _is_npz(file: BufferedReader) -> bool:
     import zipfile  # noqa: PLC0415 (its import takes 8 ms, and few commands need it)
 
     try:
@@ -212,7 +208,7 @@ def _is_npz(file: BinaryIO) -> bool:
         return False
 
 
-def _is_json(file: BinaryIO) -> bool:
+def _is_json(file: BufferedReader) -> bool:
     try:
         json.loads(file.read(MAX_TEXT_BYTES))
     except (ValueError, RecursionError):

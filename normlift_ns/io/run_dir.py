@@ -174,9 +174,10 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
         raise InputError(f"{run_dir} is the run that is lifted, and a lift cannot replace it; give another {flags}")
     if not overwrite and os.path.lexists(run_dir):
         raise FileExistsError(f"{run_dir} exists; give another {flags}, or --overwrite True.")
-    if os.path.lexists(run_dir) and not (run_dir / "config.yml").is_file():
+    is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
+    if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
-            f"{run_dir} is not a run (it has no config.yml), so --overwrite does not replace it; give another "
+            f"{run_dir} is not a lifted run (it has no config.yml or no {FIELD_FOLDER}/), so --overwrite does not replace it; give another "
             "--timestamp or --output-dir, or delete it yourself"
         )
 

@@ -62,7 +62,7 @@ def test_no_output_of_a_command_or_of_python_replaces_what_is_not_ours(own: Path
         lambda: opened.transfer(cloud, cloud, answer, overwrite=True),
         lambda: opened.transfer(cloud, next(run.glob("nerfstudio_models/*.ckpt")), answer, overwrite=True),
         lambda: opened.export(diary, overwrite=True),
-        lambda: example("evidence").store.evidence.save(diary),
+        lambda: example("evidence").store.evidence.save(diary),  # type: ignore[union-attr]
     ):
         with pytest.raises(InputError):
             write()
