@@ -356,8 +356,9 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
     """
     inherited = {name: value for name, value in os.environ.items() if name not in TORCHRUN_VARIABLES}
     environment = inherited | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # keeps the last line complete
+    log.unlink(missing_ok=True)
     with (
-        log.open("wb") as output,
+        log.open("xb") as output,  # never into a pipe, or through a link
         subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,

@@ -177,8 +177,8 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
     is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
     if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
-            f"{run_dir} is not a lifted run (it has no config.yml or no {FIELD_FOLDER}/), so --overwrite does not replace it; give another "
-            "--timestamp or --output-dir, or delete it yourself"
+            f"{run_dir} is not a lifted run (it has no config.yml or no {FIELD_FOLDER}/), so --overwrite does not "
+            "replace it; give another --timestamp or --output-dir, or delete it yourself"
         )
 
 
