@@ -77,8 +77,6 @@ def check_writable_file(path: Path | None, flag: str) -> None:
         return
     if path.name == "":
         raise InputError(f"{path}, given with {flag}, is the name of a folder; give a file name")
-    if os.path.lexists(path) and not path.is_file():
-        raise InputError(f"{path}, given with {flag}, exists and is not a regular file; give another name")
     check_writable_folder(path.parent, flag)
 
 

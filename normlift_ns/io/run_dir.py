@@ -36,7 +36,6 @@ _WRITTEN = (
     *("../splat.json", "../transforms.json", "../added_photographs.json"),
 )
 """Files of a lift, relative to the folder of the field."""
-_CHECKPOINTS = "nerfstudio_models/step-*.ckpt"
 SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
@@ -193,7 +192,8 @@ def written_files(run_dir: Path) -> set[str]:
     except (OSError, ValueError):
         listed = None
     if listed is None:
-        listed = dict.fromkeys((*_WRITTEN, *(f"../{x.parent.name}/{x.name}" for x in run_dir.glob(_CHECKPOINTS))))
+        checkpoints = (f"../nerfstudio_models/{x.name}" for x in run_dir.glob("nerfstudio_models/step-*.ckpt"))
+        listed = dict.fromkeys((*_WRITTEN, *checkpoints))
     return names | {os.path.normpath(f"{FIELD_FOLDER}/{name}").replace(os.sep, "/") for name in listed}
 
 

@@ -26,8 +26,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def test_no_output_of_a_command_or_of_python_replaces_what_is_not_ours(own: Path, tmp_path: Path, monkeypatch, capsys):
-    run, room, out = own.parents[2] / "normlift" / "t", own.parents[4] / "room", tmp_path / "out"
-    room = next(path for path in own.parents if (path / "room" / "transforms.json").exists()) / "room"
+    run, room, out = own.parents[2] / "normlift" / "t", tmp_path / "own" / "room", tmp_path / "out"
     out.mkdir()
     config, cloud, diary = run / "config.yml", out / "cloud.ply", out / "diary.txt"
     assert run_entry(monkeypatch, export.entrypoint, "--load-config", config, "--output-dir", out,
