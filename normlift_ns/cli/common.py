@@ -172,10 +172,7 @@ def _open_log(path: Path) -> IO[str]:
             with open_regular(path) as file:
                 first = file.readline(2**16)
             if first != b"" and _LOG_LINE.match(first) is None:
-                raise InputError(
-                    f"{path}, given with --log-file, is not a log of normlift_ns, so nothing is appended; give another "
-                    "name"
-                )
+                raise InputError(f"{path}, given with --log-file, is not a log of normlift_ns; give another name")
         protect_inputs(path)
         return path.open("a", encoding="utf8", errors="backslashreplace")
     except OSError as error:
