@@ -94,6 +94,9 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
                 assert f"{existing.name} exists" in shown and output in shown and "--overwrite True" in shown
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
         views = ("--render-views", "0003") if pictures else ()
+        assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 1
+        assert "holds text" in said(capsys) and existing.read_text() == "mine"
+        existing.write_text("")
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
         assert existing.stat().st_size > 100
         assert len(list(folder.iterdir())) == (2 if pictures else 4 if objects else 1)
