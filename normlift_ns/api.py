@@ -50,6 +50,7 @@ from normlift_ns.io.run_dir import (
     refuse_existing_run,
     run_directory,
     run_file_digests,
+    written_files,
 )
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import (
@@ -250,7 +251,7 @@ def check_target(prepared: PreparedLift) -> None:
     """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
     complete_interrupted_lifts(prepared.run_dir)
     if prepared.request.timestamp is not None:
-        refuse_existing_run(prepared.run_dir, prepared.request.overwrite)
+        refuse_existing_run(prepared.run_dir, prepared.request.overwrite, prepared.scene.checkpoint_path)
 
 
 def announce(prepared: PreparedLift) -> None:
@@ -360,7 +361,7 @@ def write_run(
     """
     complete_interrupted_lifts(run_dir)
     if exact_name:
-        refuse_existing_run(run_dir, overwrite)
+        refuse_existing_run(run_dir, overwrite, source.checkpoint_path)
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
         raise InputError(
             f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
@@ -391,8 +392,10 @@ def write_run(
         if question is not None:
             save_query(field_dir, question)
         for path in (run_dir,) if exact_name else numbered_paths(run_dir):
-            write_text_file(folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True)
-            if commit_directory(folder, path, overwrite=overwrite and exact_name):
+            write_text_file(
+                folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True, own=True
+            )
+            if commit_directory(folder, path, replaced=written_files if overwrite and exact_name else None):
                 return path
     refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
     raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")

@@ -37,7 +37,7 @@ from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError, MissingImageError
-from normlift_ns.io.atomic import refuse_run_files
+from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
     cache_folder,
@@ -203,7 +203,7 @@ class LiftedRun:
         path = check_path("path", path)
         if path.name == "":
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
-        refuse_run_files(*exports.export_paths(path), instead="name")
+        refuse_inputs(exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
@@ -296,7 +296,10 @@ class LiftedRun:
                 f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
-        points = exports.read_cloud(check_path("cloud", cloud))
+        cloud = check_path("cloud", cloud)
+        if path.exists() and path.samefile(cloud):
+            raise InputError(f"{path} is the cloud to read, so the labeled cloud cannot be written there")
+        points = exports.read_cloud(cloud)
         rule = exports.CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
         return exports.transfer_labels(
             self.scene, self.field, answer, exports.answer_instances(answer), rule, path, overwrite=overwrite

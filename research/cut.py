@@ -7,7 +7,7 @@ prototype, the normalized mean of the features of the regions inside its polygon
 click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
 labeled images and compared with the polygons; a text has one figure, pooled over its images.
 
-Keys: <capture>.<label>.ap; .best and .default, the IoU at the best threshold of that text and at the default one; for
+Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and .default, the IoU at the best threshold of that text and at the default one; for
 prototypes also other candidates. <capture>.mean.<cut>, the mean over texts of IoU divided by the best;
 <capture>.worst.<cut>, the smallest of these.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -63,17 +63,26 @@ def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         yield image, whole | {name: np.array(part) for name, part in parts.items()}
 
 
-def prototypes(run: Any, views: dict[str, Any], masks: dict[str, dict[str, np.ndarray]]) -> dict[str, torch.Tensor]:
+def region_rows(run: Any, views: dict[str, Any], images: Iterable[str]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Return the features of every labeled image, and the row of each pixel among them, -1 without one."""
+    source, rows = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu"), {}
+    for image in images:
+        found = source.view(views[image].image, views[image].name)
+        cell = found.labels.long()
+        rows[image] = (found.features, torch.where(cell >= 0, found.region_of_cell[0].long()[cell.clamp(min=0)], -1))
+    return rows
+
+
+def prototypes(
+    rows: dict[str, tuple[torch.Tensor, torch.Tensor]], masks: dict[str, dict[str, np.ndarray]]
+) -> dict[str, torch.Tensor]:
     """Return the vector of every label: the mean of the features of the regions under its pixels, by area."""
     total: dict[str, torch.Tensor] = {}
-    source = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu")
     for image, labels in masks.items():
-        found = source.view(views[image].image, views[image].name)
-        cells = found.region_of_cell[0].long()
+        features, row = rows[image]
         for name, mask in labels.items():
-            cell = found.labels[torch.from_numpy(mask)].long()
-            region = cells[cell[cell >= 0]]
-            total[name] = total.get(name, 0) + found.features[region[region >= 0]].double().sum(0)
+            inside = row[torch.from_numpy(mask)]
+            total[name] = total.get(name, 0) + features[inside[inside >= 0]].double().sum(0)
     return {name: normalize(vector, dim=0).float() for name, vector in total.items()}
 
 
@@ -102,7 +111,8 @@ def measure(report: Report, capture: str, config: Path) -> None:
     run, masks = nl.open_run(config), dict(label_masks(capture))
     scene, field = run.scene, run.field
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
-    vectors = prototypes(run, views, masks)
+    rows = region_rows(run, views, masks)
+    vectors = prototypes(rows, masks)
     asked = {name: (name, Query((name,), row[None].numpy(), suggest_threshold=True)) for name, row in vectors.items()}
     for name in vectors:
         with suppress(InputError):  # a word that the encoder does not know
@@ -123,6 +133,10 @@ def measure(report: Report, capture: str, config: Path) -> None:
         if not key.startswith("word "):
             cuts |= candidate_cuts(answer.relevancy[answer.valid, 0].numpy())
         report.add(f"{capture}.{key}.ap", average_precision(values, truth), "of 1")
+        vector = normalize(torch.from_numpy(asked[key][1].embeddings[0]).float(), dim=0)
+        flat = [torch.cat([features @ vector, vector.new_tensor([-1])])[row] for features, row in (rows[x] for x in images)]
+        in_images = torch.cat([x.ravel() for x in flat]).numpy()
+        report.add(f"{capture}.{key}.images", average_precision(in_images, truth), "of 1, without a lift")
         report.add(f"{capture}.{key}.best", best, "IoU")
         for name, cut in cuts.items():
             value = float(((values > cut) & truth).sum() / ((values > cut) | truth).sum())

@@ -569,7 +569,17 @@ def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
         best = [*item.best_views, *[""] * (MAX_BEST_VIEWS - len(item.best_views))]
         places = [(x.centroid, x.extent, x.box.center, x.box.size, *x.box.axes) for x in (item.capture, item.scene)]
         numbers = np.array(places).ravel().tolist()
-        yield [item.id, item.text, item.class_id, item.gaussians, item.reliability, item.views, *best, *numbers]
+        names = [csv_text(item.text), *map(csv_text, best)]
+        yield [item.id, names[0], item.class_id, item.gaussians, item.reliability, item.views, *names[1:], *numbers]
+
+
+def csv_text(text: str) -> str:
+    """Return a text as a cell that no spreadsheet takes for a formula.
+
+    >>> csv_text("=1+1"), csv_text("red mug")
+    ("'=1+1", 'red mug')
+    """
+    return f"'{text}" if text.lstrip()[:1] in tuple("=+-@|") or text[:1] in tuple("\t\r\n") else text
 
 
 def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterable[OrientedBox]) -> None:

@@ -32,6 +32,7 @@ from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, 
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
+from normlift_ns.io.guard import read_file, read_text
 from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
 from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
@@ -79,7 +80,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
             "line per capture."
         )
     try:
-        text = path.read_text("utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path} is not UTF-8 text. Expected a list of captures, one path per line.") from None
     captures: dict[str, tuple[int, Capture]] = {}
@@ -357,8 +358,9 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
     """
     inherited = {name: value for name, value in os.environ.items() if name not in TORCHRUN_VARIABLES}
     environment = inherited | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # keeps the last line complete
+    log.unlink(missing_ok=True)
     with (
-        log.open("wb") as output,
+        log.open("xb") as output,  # never into a pipe, or through a link
         subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -382,7 +384,7 @@ def failure_reason(code: int, log: Path) -> str:
     """Return why a process failed: the signal that killed it, or the last line that it printed."""
     if code < 0:
         return f"its process was killed by {describe_signal(-code)}; see its output in {log}"
-    lines = map(str.strip, log.read_bytes().decode("utf8", "replace").split("\n"))
+    lines = map(str.strip, read_file(log, max_bytes=2**31).decode("utf8", "replace").split("\n"))
     *_, last = (f"its process ended with exit code {code} and without output", *filter(None, lines))
     return last
 

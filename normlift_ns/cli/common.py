@@ -29,6 +29,7 @@ from rich.text import Text
 
 import normlift_ns
 from normlift_ns.errors import EXIT_USER_ERROR, InputError, OutputError, describe_error, escape_unprintable
+from normlift_ns.io.guard import forget_inputs, open_regular, protect_inputs, refuse_inputs
 from normlift_ns.options import VOTE_FLAGS, RefineConfig, named_as_flags, rename_flags, renamed_flags
 
 _CORNERS = ("╭", "┏")
@@ -100,6 +101,10 @@ _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 """Terminal escape sequences that set colors or move the cursor."""
 
 
+_LOG_LINE = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d\d:\d\d .*normlift")
+"""First line of a log: the time and the command."""
+
+
 class OutputSettings(NamedTuple):
     """Output settings of a command."""
 
@@ -143,7 +148,7 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
     stdout, stderr = sys.stdout, sys.stderr
     with nullcontext() if terminal.log_file is None else _open_log(terminal.log_file) as log:
         if log is not None:
-            log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} {command}\n")
+            log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} normlift_ns: {command}\n")
         sys.stdout = cast(Any, _OutputStream(stdout, log, _output_errors))
         sys.stderr = cast(Any, _OutputStream(stderr, log, nullcontext))
         output_settings.append(terminal)
@@ -155,9 +160,20 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
 
 
 def _open_log(path: Path) -> IO[str]:
+    """Open a log to append to: a new file, an empty one, or one that began as a log and no command reads."""
     try:
-        if path.exists() and not path.is_file():
+        if os.path.lexists(path) and not path.is_file():
             raise InputError(f"{path}, given with --log-file, exists and is not a regular file; give another name")
+        refuse_inputs([path], instead="--log-file")
+        arguments = [os.path.realpath(word.partition("=")[2] or word) for word in sys.argv[1:]]
+        if arguments.count(os.path.realpath(path)) > 1:
+            raise InputError(f"{path}, given with --log-file, is also another argument; give another name")
+        if path.exists():
+            with open_regular(path) as file:
+                first = file.readline(2**16)
+            if first != b"" and _LOG_LINE.match(first) is None:
+                raise InputError(f"{path}, given with --log-file, is not a log of normlift_ns; give another name")
+        protect_inputs(path)
         return path.open("a", encoding="utf8", errors="backslashreplace")
     except OSError as error:
         raise InputError(f"{path}, given with --log-file, cannot be written: {error.strerror}") from error
@@ -237,6 +253,7 @@ def run_command(command: type[CommandProtocol]) -> None:
     for stream in streams:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # for code pages that lack a character
+    forget_inputs()
     try:
         words, flags = split_output_flags(sys.argv[1:])
         with apply_output_settings(flags, shlex.join(sys.argv)):

@@ -60,6 +60,9 @@ class Demo(CheckedOptions):
     def main(self) -> dict[str, float]:
         """Run the demo and return the mIoU before and after refinement, and the IoU of the thing if it was found."""
         check_writable_folder(self.folder, "--folder")
+        room = self.folder / "room"
+        if (room / "images").exists() and not (room / "instance").exists():
+            raise InputError(f"{room} is a data set that the demo did not write; give another --folder")
         has_networks = _fetch_weights()
         CONSOLE.rule("Generating a room")
         for category in (FutureWarning, SyntaxWarning):  # from dependencies

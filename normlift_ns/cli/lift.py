@@ -193,7 +193,7 @@ class NormLift(CheckedOptions):
         run_dir = run_directory(outputs or Path(), name or "run", self.timestamp)
         if name is not None and outputs is not None:
             if self.timestamp is not None:
-                refuse_existing_run(run_dir, self.overwrite)
+                refuse_existing_run(run_dir, self.overwrite, self.load_config)
             preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def _check_splat(self) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
+from normlift_ns.io.guard import protect_inputs
 from normlift_ns.io.run_dir import field_folder, read_manifest, text_cache_folder
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
 
@@ -31,6 +32,8 @@ def _check_readable(path: Path | None, flag: str, expected: str, advice: str) ->
     kind = {stat.S_IFREG: "a file", stat.S_IFDIR: "a folder"}.get(stat.S_IFMT(mode), "a pipe or a device")
     if kind != expected:
         raise InputError(f"{path}, given with {flag}, is {kind}; give {advice}")
+    if flag != "--colmap":  # a project folder, which may also hold outputs
+        protect_inputs(path)
     _check_access(path, flag)
 
 
@@ -74,8 +77,6 @@ def check_writable_file(path: Path | None, flag: str) -> None:
         return
     if path.name == "":
         raise InputError(f"{path}, given with {flag}, is the name of a folder; give a file name")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}, given with {flag}, exists and is not a regular file; give another name")
     check_writable_folder(path.parent, flag)
 
 

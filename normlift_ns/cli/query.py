@@ -19,6 +19,7 @@ from normlift_ns.cli import common
 from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
+from normlift_ns.io.guard import read_text
 from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder
 from normlift_ns.options import (
     CATALOG_FILES,
@@ -362,7 +363,7 @@ def read_vocabulary(path: Path) -> list[str]:
     if not path.is_file():
         raise FileNotFoundError(f"--vocabulary {path} does not exist; give a text file with one word per line")
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_text(path, "utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"--vocabulary {path} is not a text file in UTF-8 ({error}); save it as UTF-8") from error
     words = list(dict.fromkeys(filter(None, map(str.strip, lines))))

@@ -21,6 +21,7 @@ from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
+from normlift_ns.io.guard import refuse_other_kinds
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""
@@ -254,6 +255,8 @@ class Evidence(TensorRecord):
         tensors["region_view"] = self.region_view
         counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
         metadata = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
+        if not key:
+            refuse_other_kinds(Path(path), ".safetensors")
         return save_arrays(Path(path), tensors, metadata, key=key, overwrite=True)
 
     @staticmethod

@@ -223,7 +223,8 @@ class SemanticField(TensorRecord):
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
         # a folder without a manifest is incomplete and may be overwritten
-        (folder / MANIFEST_FILE).unlink(missing_ok=True)
+        for name in (MANIFEST_FILE, EVIDENCE_FILE):
+            (folder / name).unlink(missing_ok=True)
         stored = {"features": self.store.features} if isinstance(self.store, StoredEvidence) else vars(self.store)
         named = {
             "source": self.source,
@@ -236,8 +237,6 @@ class SemanticField(TensorRecord):
         digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, tensors, overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
-        else:
-            (folder / EVIDENCE_FILE).unlink(missing_ok=True)
         write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod

@@ -25,6 +25,7 @@ from normlift_ns.data.splat import (
     validate_splat,
 )
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import check_regular
 
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
 
@@ -206,6 +207,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected a file written by torch.save; {advice}.")
+    check_regular(path)
     _check_archive(path, advice)
     try:
         with allow_numpy_scalars(), warnings.catch_warnings():

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from normlift_ns.data.frames import PERSPECTIVE_MODELS, Frame, Intrinsics, find_images, find_masks
 from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import read_file
 
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -221,12 +222,12 @@ def _read(
         )
     try:
         if path.suffix == ".bin":
-            data = _ByteReader(path.read_bytes())
+            data = _ByteReader(read_file(path, max_bytes=2**34))
             entries = list(parse_binary(data))
             if data.offset != len(data.data):
                 raise InputError(f"{len(data.data) - data.offset:,} bytes too many")
             return entries
-        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
+        lines = [line.strip() for line in read_file(path, max_bytes=2**34).decode("utf-8-sig").splitlines()]
         return list(parse_text([line for line in lines if not line.startswith("#")]))
     except (ValueError, IndexError, struct.error, KeyError, OverflowError) as error:
         raise InputError(f"{path} is damaged or not a COLMAP file ({error}). {_ADVICE}") from error

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import open_regular
 
 _FORMATS = {"JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "DIB", "PPM", "GIF", "TGA", "JPEG2000", "AVIF"}
 """Formats that Pillow reads without other programs and that hold images rather than documents."""
@@ -49,7 +50,7 @@ def read_image_header(file: Path) -> ImageHeader:
     if not file.is_file():
         raise InputError(f"{file} is not a regular file. Expected an image; copy it again from the capture.")
     try:
-        with Image.open(file) as image:
+        with open_regular(file) as stream, Image.open(stream) as image:
             size, format_, mode = image.size, image.format, image.mode
             rotated, multi_frame = _is_rotated(image), format_ != "MPO" and bool(getattr(image, "is_animated", False))
     except Exception as error:  # Pillow's readers raise any kind of exception on a damaged header

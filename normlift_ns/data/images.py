@@ -19,6 +19,7 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
 from normlift_ns.data.frames import Frame, ImageHeader, Intrinsics, check_mask, image_warnings, read_image_header
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import open_regular, protect_inputs, read_text
 
 
 def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images: Sequence[str]) -> frozenset[str]:
@@ -71,7 +72,7 @@ def _read_names(file: Path) -> list[str]:
     if not file.is_file():
         raise InputError(f"--eval-images names the file {file}, which does not exist. Expected one name per line.")
     try:
-        names = [line.strip() for line in file.read_text("utf-8-sig").splitlines()]
+        names = [line.strip() for line in read_text(file, "utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:
         raise InputError(f"{file} is not UTF-8 text ({error}). Expected one image name per line.") from error
     if not any(names):
@@ -128,7 +129,7 @@ def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
 @contextmanager
 def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
     """Open an image, resized by nerfstudio's camera_res_scale_factor."""
-    with Image.open(file) as opened:
+    with open_regular(file) as stream, Image.open(stream) as opened:
         yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
 
 
@@ -169,6 +170,7 @@ class SplitViews:
         """Image files relative to the dataset, with forward slashes."""
         self._masks, self._sizes, self._poses = masks or [None] * len(self.files), sizes, poses
         self._background, self._scale = background, scale
+        protect_inputs(*self.files, *self._masks)
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
         """Read an image at the size of the camera; not called in subclasses with their own `_load`."""
@@ -321,7 +323,7 @@ class ImageViews(SplitViews):
             raise InputError(f"{self.files[index]} cannot be read: {problem}.")
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
-        with Image.open(file) as image:
+        with open_regular(file) as stream, Image.open(stream) as image:
             if problem := _mode_problem(image.mode):
                 raise InputError(problem)
             mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"

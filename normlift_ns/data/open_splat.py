@@ -15,6 +15,7 @@ from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, validate_splat
 from normlift_ns.data.transforms import CameraFile
 from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.io.guard import open_regular, protect_inputs
 from normlift_ns.options import SplatOptions
 from normlift_ns.registry import Registry
 
@@ -123,6 +124,7 @@ def _read(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError, ValueError: If the file is missing or not a splat, or the reader of another package fails.
     """
+    protect_inputs(path)
     name = _format(path)
     read = SPLAT_READERS.load(name)
     if name in SPLAT_READERS.built_in:
@@ -148,7 +150,7 @@ def _format(path: Path) -> str:
         return name
     if not path.is_file():
         return "ply"
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return "pt" if file.read(2) == b"PK" else "ply"  # torch.save writes ZIP archives
 
 

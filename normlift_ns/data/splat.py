@@ -16,6 +16,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import file_kind, open_regular
 from normlift_ns.options import RasterizeMode
 
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
@@ -162,7 +163,7 @@ class SplatFile(NamedTuple):
     """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
 
 
-_MAX_HEADER_BYTES = 2**20
+_MAX_HEADER_BYTES, _MAX_LINE_BYTES = 2**20, 2**16
 _PLY_BLOCK_ROWS = 2**18
 """Number of Gaussians read at a time."""
 _MODES: dict[str, RasterizeMode] = {
@@ -204,7 +205,7 @@ def _parse_ply(path: Path) -> PlyData:
             f"the file, for example with: splat-transform {path.name} clean.ply"
         ) from error
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
-        if path.open("rb").read(3) == b"ply":
+        if file_kind(path) == ".ply":
             raise InputError(
                 f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
                 "do not match its header. Copy it again."
@@ -239,12 +240,18 @@ def check_ply_header(path: Path) -> None:
     """Raise if the file is too small for the rows that its header declares, which are allocated before reading.
 
     Raises:
-        ValueError: if the header is invalid or declares more data than the file holds.
+        ValueError: if the header is invalid, has no end within 1 MB, or declares more data than the file holds.
     """
     size = path.stat().st_size
-    with path.open("rb") as file:
-        header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0]
-    lines = [line.split() for line in header.replace(b"\r", b"\n").split(b"\n")]
+    with open_regular(path) as file:
+        header, end, _ = file.read(_MAX_HEADER_BYTES).partition(b"end_header")
+    lines = header.replace(b"\r", b"\n").split(b"\n")
+    if header.startswith(b"ply") and (end == b"" or max(map(len, lines)) > _MAX_LINE_BYTES):
+        raise InputError(
+            f"{path} is truncated or damaged: its header has no end_header in the first {_MAX_HEADER_BYTES:,} bytes, "
+            f"or a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
+        )
+    lines = [line.split() for line in lines]
     starts = [i for i, words in enumerate(lines) if words[:1] == [b"element"]]
     declared = 0
     for start, end in zip(starts, [*starts[1:], len(lines)]):
@@ -302,7 +309,7 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
     Blocks are read rather than mapped, because mapped pages count as memory of the process.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         is_mapped = isinstance(table, np.memmap)
         if isinstance(table, np.memmap):
             file.seek(table.offset)

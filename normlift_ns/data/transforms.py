@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import io
 import json
 import math
 import tokenize
@@ -27,6 +28,7 @@ from normlift_ns.data.frames import (
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
+from normlift_ns.io.guard import read_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
@@ -114,7 +116,7 @@ def read_json_file(path: Path, expected: str) -> Any:
             f"{path} has {path.stat().st_size:,} bytes, more than the limit of {_MAX_JSON_BYTES:,}. Expected "
             f"{expected}."
         )
-    text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    text = read_file(path, max_bytes=_MAX_JSON_BYTES).removeprefix(codecs.BOM_UTF8)
     try:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
@@ -472,7 +474,8 @@ def _read_values(path: Path) -> Any:
         raise InputError(
             f"{path} has {path.stat().st_size:,} bytes, too many for 4 x 4 numbers. Expected {_EXPECTED_MATRIX}."
         )
-    return (np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path)).tolist()
+    content = io.BytesIO(read_file(path))
+    return (np.load(content, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(content)).tolist()
 
 
 def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> WorldTransform:

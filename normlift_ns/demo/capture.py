@@ -69,7 +69,7 @@ def write_capture(
     for path, camera in zip(paths, cameras):
         color, shares = render(room.scene, camera, channels)[0].tensor_split([3], dim=2)
         for file, pixels in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
-            with atomic_file(folder / file, overwrite=True) as draft:
+            with atomic_file(folder / file, overwrite=True, own=True) as draft:
                 Image.fromarray(pixels.numpy()).save(draft, compress_level=1)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
     transforms = {
@@ -83,7 +83,7 @@ def write_capture(
     }
     labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
     for name, content in (("transforms.json", transforms), ("labels.json", labels)):
-        write_text_file(folder / name, json.dumps(content, indent=1), overwrite=True)
+        write_text_file(folder / name, json.dumps(content, indent=1), overwrite=True, own=True)
 
 
 def _one_hot(room: DemoRoom) -> Float[Tensor, "n classes"]:

@@ -24,6 +24,7 @@ from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatur
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import load_arrays, save_arrays
+from normlift_ns.io.guard import read_file
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 REMEDY = "restore it by lifting again with: ns-normlift (the same options)"
@@ -85,7 +86,7 @@ class CachedRegions(_Cached):
 
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
         """Return the cache path of the label maps of an image, whether the file exists or not."""
-        files = [file.read_bytes() for file in self.files(name)]
+        files = [read_file(file, max_bytes=2**31) for file in self.files(name)]
         return cache_path(self.folder, self.identity, name.encode(), *_key_parts(image), *files)
 
 
@@ -205,9 +206,11 @@ def _read(
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:
-    """Return whether a cached tensor is a valid label map of the image."""
+    """Return whether a cached tensor is a valid label map of the image, without gaps in the ids of a level."""
     matches = labels.dtype in (torch.int16, torch.int32) and labels.ndim == 4 and labels.shape[2:] == image.shape[:2]
-    return matches and labels.numel() > 0 and int(labels.min()) >= -1
+    if not matches or labels.numel() == 0 or int(labels.min()) < -1 or int(labels.max()) >= labels[0].numel():
+        return False
+    return all(bool(torch.bincount(level.flatten().int() + 1)[1:].all()) for level in labels)
 
 
 def _are_units(rows: Tensor, count: int) -> bool:

@@ -30,6 +30,7 @@ from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.weights import third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import file_digest
+from normlift_ns.io.guard import check_regular
 from normlift_ns.options import CropFill
 
 _CLASSES = {"siglip": "Siglip", "siglip2": "Siglip2", "metaclip_2": "MetaClip2"}
@@ -197,6 +198,8 @@ def _build_model(folder: huggingface.ModelFolder) -> Any:
         )
     with torch.device("meta"):
         model = getattr(transformers, f"{name}Model")(config)
+    for file in folder.weights:
+        check_regular(file)
     state = {name: value for file in folder.weights for name, value in load_file(file).items()}
     state = {name: value for name, value in state.items() if not name.endswith(".position_ids")}
     integers = [name for name, value in state.items() if not value.is_floating_point()]

@@ -38,6 +38,7 @@ from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.atomic import atomic_file
+from normlift_ns.io.guard import read_file
 from normlift_ns.options import MissingFeatures
 from normlift_ns.segmentation.regions import resample_nearest
 
@@ -139,7 +140,11 @@ def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
     np.save(buffer, array)
     content = buffer.getvalue()
     if os.path.lexists(path):
-        if os.path.isfile(path) and path.read_bytes() == content:
+        if (
+            os.path.isfile(path)
+            and os.path.getsize(path) == len(content)
+            and read_file(path, max_bytes=2**40) == content
+        ):
             return
         if not overwrite:
             raise FileExistsError(

@@ -28,6 +28,7 @@ from normlift_ns.encoders.open_clip import (
 from normlift_ns.encoders.text_files import check_prompts, check_template, prompt_templates
 from normlift_ns.encoders.weights import CONNECT_ONCE, third_party_errors
 from normlift_ns.io.atomic import file_digest
+from normlift_ns.io.guard import check_regular
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
 
 
@@ -278,6 +279,7 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
 
 def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
     """Read the named tensors of a weight file and nothing else. Raises any exception for a bad file."""
+    check_regular(path)
     if path.suffix == ".safetensors":
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in names}

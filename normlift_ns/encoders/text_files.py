@@ -23,6 +23,7 @@ from xxhash import xxh3_128
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.io.arrays import array_digest, load_arrays, read_npy_bytes, save_arrays
 from normlift_ns.io.atomic import atomic_file, file_digest
+from normlift_ns.io.guard import open_regular, read_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -141,7 +142,8 @@ class TextEmbeddingFile(LazyTextEncoder):
     @property
     def identity(self) -> dict[str, Any]:
         """A digest of the content of the file, independent of its path."""
-        return {"kind": "text_vectors", "content": blake2b(self.file.read_bytes(), digest_size=16).hexdigest()}
+        content = read_file(self.file, max_bytes=_MAX_FILE_BYTES)
+        return {"kind": "text_vectors", "content": blake2b(content, digest_size=16).hexdigest()}
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -170,7 +172,7 @@ class TextEmbeddingFile(LazyTextEncoder):
     @cached_property
     def _vectors(self) -> dict[str, np.ndarray]:
         try:
-            with zipfile.ZipFile(self.file) as archive:
+            with open_regular(self.file) as file, zipfile.ZipFile(file) as archive:
                 arrays, comment = dict(_entries(archive)), archive.comment
             expected = _digest_comment(arrays)
             if comment.startswith(_COMMENT_PREFIX) and comment != expected:
@@ -243,7 +245,7 @@ def write_text_embeddings(file: Path, vectors: Mapping[str, Any]) -> None:
         FileExistsError, OSError: As `atomic_file`.
     """
     units = {text: unit_rows(vector) for text, vector in vectors.items()}
-    with atomic_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
+    with atomic_file(file, own=True) as draft, zipfile.ZipFile(draft, "w") as archive:
         for text, unit in units.items():  # numpy.savez does not accept a text named "file"
             with archive.open(f"{text}.npy", "w") as entry:
                 np.lib.format.write_array(entry, unit, allow_pickle=False)

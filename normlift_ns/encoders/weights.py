@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.io.guard import read_text
 
 CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
@@ -60,7 +61,7 @@ def find_in_hub_cache(repository: str, *names: str) -> Path | None:
     repository, or None. Needs no network."""
     folder = hub_folder(repository)
     try:
-        snapshot = folder / "snapshots" / (folder / "refs" / "main").read_text("utf8").strip()
+        snapshot = folder / "snapshots" / read_text(folder / "refs" / "main").strip()
         return next((snapshot / name for name in names if os.path.isfile(snapshot / name)), None)
     except (OSError, ValueError):
         return None
@@ -110,7 +111,7 @@ def is_local_path(name: str, parts: int) -> bool:
     (False, True, True)
     """
     path = Path(name)
-    return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
+    return path.is_absolute() or name[:1] in ("~", ".") or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -124,7 +125,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
     try:
-        content = json.loads(path.read_text("utf8"))
+        content = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
     if not isinstance(content, dict):

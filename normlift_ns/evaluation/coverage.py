@@ -31,7 +31,8 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import MAX_SUGGESTED_POSES, pose_output_paths
 from normlift_ns.evaluation.studies import make_figure, recorded_vote, voting_scalars
 from normlift_ns.evidence_collection import sample_evenly
-from normlift_ns.io.atomic import atomic_files, refuse_run_files
+from normlift_ns.io.atomic import atomic_files
+from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import RasterizeMode, check_number, check_path
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
@@ -738,7 +739,7 @@ class Coverage:
         if path.name in ("", ".."):
             raise InputError(f"{path} is not a valid file name; give one such as next.json")
         stem = path.with_suffix("")
-        refuse_run_files(path, *pose_output_paths(stem), instead="name")
+        refuse_inputs((path, *pose_output_paths(stem)), instead="name")
         documents = {path: self.to_json()}
         return write_poses(stem, self.poses, self.pictures, documents=documents, overwrite=overwrite)
 

@@ -14,7 +14,7 @@ import msgspec
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
-from normlift_ns.io.run_dir import read_text
+from normlift_ns.io.guard import read_text
 from normlift_ns.options import CheckedOptions, WithoutDirection
 
 Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]

@@ -21,6 +21,7 @@ from xxhash import xxh3_128
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file
+from normlift_ns.io.guard import check_regular, open_regular
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number allowed in a file."""
@@ -96,7 +97,7 @@ def save_arrays(
         content = {name: tensor.detach().contiguous().cpu() for name, tensor in arrays.items()}
     metadata = dict(facts or {})
     digest = array_digest(content, metadata, key)
-    with atomic_file(path, overwrite=overwrite) as draft:
+    with atomic_file(path, overwrite=overwrite, own=True) as draft:
         save_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
         sort_metadata(draft)
     return digest
@@ -125,6 +126,7 @@ def read_metadata(path: Path) -> dict[str, str]:
         ValueError: the file is damaged or not a safetensors file.
     """
     try:
+        check_regular(path)
         with safe_open(path, framework="np") as file:
             return dict(file.metadata() or {})
     except FileNotFoundError:
@@ -153,9 +155,8 @@ def load_arrays(
         FileNotFoundError: the file does not exist.
         ValueError: the digest does not match, or the file is not a safetensors file.
     """
-    if path.exists() and not path.is_file():  # reading a pipe would never end
-        raise InputError(f"{path} is not a regular file; {remedy}")
     try:
+        check_regular(path)
         with safe_open(path, framework=framework) as file:
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
@@ -221,7 +222,7 @@ def read_npy(path: Path, description: str) -> np.ndarray:
             raise InputError(f"{description} {path} is not a file; expected an NPY file as written by numpy.save")
         raise FileNotFoundError(f"{description} {path} does not exist; check the folder")
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             _check_npy(file)
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from hashlib import blake2b
@@ -27,6 +27,7 @@ from safetensors import SafetensorError
 from xxhash import xxh3_128
 
 from normlift_ns.errors import InputError, user_state_folder
+from normlift_ns.io.guard import file_kind, open_regular, read_file, refuse_inputs, refuse_other_kinds, suffix_kind
 
 _BLOCK_SIZE = 2**20
 _LEGACY_PREFIX = "blake2b:"
@@ -63,7 +64,7 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
     new_hash: Callable[[], Any] = partial(blake2b, digest_size=16) if legacy else xxh3_128
     state, block = new_hash(), bytearray(_BLOCK_SIZE)
     for file in files:
-        with file.open("rb", buffering=0) as stream:
+        with open_regular(file) as stream:
             while size := stream.readinto(block):
                 state.update(memoryview(block)[:size])
     return f"{_LEGACY_PREFIX if legacy else 'xxh3_128:'}{state.hexdigest()}"
@@ -231,9 +232,9 @@ def complete_journal(temporary: Path) -> bool:
 
 def _read(journal: Path) -> dict[str, Any] | None:
     """Return the steps of a journal; None if its signature is not valid."""
-    if journal.is_symlink() or not journal.is_file() or journal.stat().st_size > _MAX_JOURNAL_BYTES:
+    if journal.is_symlink() or not journal.is_file():
         return None
-    signature, _, text = journal.read_bytes().decode("utf8", "replace").partition("\n")
+    signature, _, text = read_file(journal, max_bytes=_MAX_JOURNAL_BYTES).decode("utf8", "replace").partition("\n")
     valid = hmac.compare_digest(signature.encode(), _signature(journal.parent, text).encode())
     return json.loads(text) if valid else None
 
@@ -259,7 +260,7 @@ def _key() -> bytes:
                 file.write(new)
             rename_if_absent(draft, path)  # another process may have been faster
             draft.unlink(missing_ok=True)
-        stored = path.read_bytes() if path.is_file() else b""
+        stored = read_file(path) if path.is_file() else b""
         if len(stored) == _KEY_BYTES and (os.name == "nt" or path.stat().st_uid == os.getuid()):
             return stored
     return new
@@ -273,8 +274,6 @@ def _key() -> bytes:
 
 _TEMPORARY_PREFIX = ".normlift-"
 _TEMPORARY_NAME = re.compile(r"\.normlift-[0-9a-f]{16}")
-_RUN_FILES = {"config.yml", "dataparser_transforms.json", "splat.json", "transforms.json"}
-_RUN_FILES |= {"nerfstudio_models", "normlift"}
 _MAX_AGE = 86400
 """Seconds after which a temporary folder counts as left over on systems without locks."""
 
@@ -284,7 +283,9 @@ class NotWrittenError(OSError):
 
 
 @contextmanager
-def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
+def atomic_files(
+    *paths: Path, overwrite: bool = False, delete: Sequence[Path] = (), own: bool = False
+) -> Iterator[tuple[Path, ...]]:
     """Yield a temporary path for each path; when the block ends, rename all of them to their final paths together.
 
     If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
@@ -292,10 +293,12 @@ def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] =
 
     Args:
         paths: the final paths, all in one folder.
-        overwrite: replace existing files.
-        delete: existing files to delete in the same step.
+        overwrite: replace existing files of the same kind.
+        delete: existing files of the kind of their suffix, to delete in the same step.
+        own: the paths are parts of a run or a cache that belong to this package, which may replace them.
     Raises:
         FileExistsError: a path exists, and `overwrite` is False.
+        ValueError: as in `refuse_inputs`; or `overwrite` would replace a file of another kind. Nothing has changed.
         NotWrittenError: writing failed, for instance because the disk is full; nothing has changed then.
 
     >>> import tempfile
@@ -306,6 +309,8 @@ def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] =
     'text'
     """
     folder, existing = paths[0].parent, None
+    if not own:
+        refuse_inputs((*paths, *delete))
     with _draft_folder(*paths) as temporary:
         drafts = tuple(temporary / path.name for path in paths)
         yield drafts
@@ -313,6 +318,10 @@ def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] =
         with locked(folder):
             if not overwrite:
                 existing = next((path for path in paths if os.path.lexists(path)), None)
+            elif not own:
+                kinds = (*map(file_kind, drafts), *map(suffix_kind, delete))
+                for path, kind in zip((*paths, *delete), kinds):
+                    refuse_other_kinds(path, kind)
             if existing is None:
                 existing = _rename_drafts(temporary, drafts, overwrite, delete)
         _flush_names(folder)
@@ -321,15 +330,15 @@ def atomic_files(*paths: Path, overwrite: bool = False, delete: Sequence[Path] =
 
 
 @contextmanager
-def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path, *, overwrite: bool = False, own: bool = False) -> Iterator[Path]:
     """Yield a temporary path for a single file; see `atomic_files`."""
-    with atomic_files(path, overwrite=overwrite) as (draft,):
+    with atomic_files(path, overwrite=overwrite, own=own) as (draft,):
         yield draft
 
 
-def write_text_file(path: Path, text: str, *, overwrite: bool = False) -> None:
-    """Write a UTF-8 text file atomically; raises the errors of `atomic_files`."""
-    with atomic_file(path, overwrite=overwrite) as draft:
+def write_text_file(path: Path, text: str, *, overwrite: bool = False, own: bool = False) -> None:
+    """Write a UTF-8 text file atomically; see `atomic_files`."""
+    with atomic_file(path, overwrite=overwrite, own=own) as draft:
         draft.write_text(text, "utf8")
 
 
@@ -346,8 +355,14 @@ def draft_directory(path: Path) -> Iterator[Path]:
         yield draft
 
 
-def commit_directory(draft: Path, path: Path, *, overwrite: bool = False) -> bool:
-    """Rename a folder of `draft_directory` to its final path; return False if that exists and `overwrite` is False.
+def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Collection[str]] | None = None) -> bool:
+    """Rename a folder of `draft_directory` to its final path; return False if that exists and `replaced` is None.
+
+    Args:
+        replaced: function that returns the files of an existing folder, relative to it, that the new one replaces. All
+            others are kept.
+    Raises:
+        ValueError: both folders have a file that is not in `replaced`; nothing has changed then.
 
     A replaced folder exists at every instant, old or new, because the two are exchanged. If the system cannot exchange
     folders, a journal records the steps, and the next command that opens or writes the run completes them.
@@ -355,19 +370,43 @@ def commit_directory(draft: Path, path: Path, *, overwrite: bool = False) -> boo
     _flush(draft)
     with locked(path.parent):
         if not rename_if_absent(draft, path):
-            if not overwrite:
+            if replaced is None:
                 return False
+            old, names = draft, replaced(path)
+            _link_others(path, draft, names)
             if not _rename(draft, path, _EXCHANGE):  # not supported
-                old, temporary = f"{path.name}.old", draft.parent
-                write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
+                temporary = draft.parent
+                old = temporary / f"{path.name}.old"
+                write_journal(temporary, {"place": path.name, "new": draft.name, "old": old.name})
                 _flush_names(temporary)
                 try:
-                    os.rename(path, temporary / old)
+                    os.rename(path, old)
                     os.rename(draft, path)
                 finally:
                     complete_journal(temporary)
+            _link_others(old, path, names, keep_new=True)  # written meanwhile
     _flush_names(path.parent)
     return True
+
+
+def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: bool = False) -> None:
+    """Link the files of an old folder that are not replaced into a new one; copy them where links are not supported."""
+    for parent, folders, files in os.walk(old):
+        source, target = Path(parent), new / Path(parent).relative_to(old)
+        if not target.is_dir():
+            target.mkdir()
+            shutil.copystat(source, target)
+        for name in (*files, *(name for name in folders if (source / name).is_symlink())):
+            file = target / name
+            if file.relative_to(new).as_posix() in replaced or (keep_new and os.path.lexists(file)):
+                continue
+            if os.path.lexists(file):
+                raise InputError(f"{source / name} is not a file of the run, but the new run has one; move it away")
+            try:
+                os.link(source / name, file, follow_symlinks=False)
+            except OSError:
+                shutil.copy2(source / name, file, follow_symlinks=False)
+        _flush_names(target)
 
 
 def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
@@ -387,6 +426,8 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
             return folder / draft.name
     for path in remove:
         path.unlink(missing_ok=True)
+    if journal is not None:  # completing it later would remove what another process writes meanwhile
+        journal.unlink()
     return None
 
 
@@ -509,14 +550,15 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
         flags: flags with which the user can choose another path, for the error message.
     Raises:
         FileExistsError: one of the paths exists and `overwrite` is False.
-        ValueError: as in `refuse_run_files`.
+        ValueError: as in `refuse_inputs`; or `overwrite` would replace a file of another kind.
     """
-    refuse_run_files(*paths, instead=flags)
+    refuse_inputs(paths, instead=flags)
     for folder in {path.parent for path in paths}:
         complete_interrupted_writes(folder)
     for path in paths:
         if not overwrite and os.path.lexists(path):
             raise FileExistsError(f"{path} exists; give another {flags}, or --overwrite True.")
+        refuse_other_kinds(path, suffix_kind(path), flags)
 
 
 def safe_file_name(text: str) -> str:
@@ -537,26 +579,3 @@ def numbered_paths(path: Path) -> Iterator[Path]:
     """
     yield path
     yield from (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in count(2))
-
-
-def refuse_run_files(*paths: Path, instead: str) -> None:
-    """Raise, before anything is computed, if an output would replace a part of a run, even with --overwrite.
-
-    A run is a folder that has config.yml and nerfstudio_models/. Figures, tables and exports next to these are allowed.
-
-    Args:
-        instead: flags with which the user can choose another path, for the error message.
-    Raises:
-        ValueError: a path, with links resolved, is a file of a run or inside one of its folders.
-
-    >>> refuse_run_files(Path("answers.json"), instead="--output-json")
-    """
-    for path in paths:
-        resolved = path.resolve()
-        for run in resolved.parents:
-            entry = resolved.relative_to(run).parts[0]
-            if entry in _RUN_FILES and (run / "config.yml").is_file() and (run / "nerfstudio_models").is_dir():
-                raise InputError(
-                    f"{path} is part of the run {run}, and replacing it would destroy the run; give another {instead} "
-                    "(--overwrite True does not allow this)"
-                )

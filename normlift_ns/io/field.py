@@ -161,6 +161,8 @@ def _check_field(
             check_array("null_level", arrays["null_level"], "float32", (n,), -1.001, 1.001)
         if evidence is not None:
             check_array("features", arrays["features"], "float32", (len(evidence.region_view), dimension), -FLOAT32_MAX)
+            if ((arrays["norm"] > 0) & (arrays["weight"] == 0)).any():
+                raise InputError("norm is above 0 for Gaussians whose weight is 0")
             if len(evidence.rows.offsets) - 1 != n:
                 raise InputError(f"{EVIDENCE_FILE} has {len(evidence.rows.offsets) - 1} Gaussians, expected {n}")
             return

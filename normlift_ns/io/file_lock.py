@@ -21,6 +21,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from normlift_ns.io.guard import read_file
+
 ABANDONED = "left"
 """Outcome of an abandoned attempt; any process may claim the task again immediately."""
 BEATS_PER_TIMEOUT = 6
@@ -139,7 +141,7 @@ def write_pulse(claim: Claim, count: int) -> bool:
 def read_pulse(claim: Claim) -> bytes:
     """Read the heartbeat of a claim; return an empty string if it cannot be read."""
     with suppress(OSError):
-        return claim.path.read_bytes()[:_PULSE_DIGITS]
+        return read_file(claim.path)[:_PULSE_DIGITS]
     return b""
 
 
@@ -245,7 +247,7 @@ def read_jsonl(folder: Path, kind: type[_Line]) -> list[_Line]:
     """
     lines = []
     for path in sorted(folder.glob(f"*{JSONL_SUFFIX}")):
-        for line in path.read_bytes().splitlines():
+        for line in read_file(path).splitlines():
             try:
                 lines.append(msgspec.json.decode(line, type=kind))
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):

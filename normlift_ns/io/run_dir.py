@@ -17,10 +17,10 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import (
     complete_interrupted_writes,
     file_digest,
-    refuse_existing,
     text_digest,
     write_text_file,
 )
+from normlift_ns.io.guard import read_file, read_text, refuse_inputs
 from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names
 
 FIELD_FOLDER = "normlift"
@@ -31,11 +31,14 @@ _MAX_NAME_BYTES = 200
 """Maximum length of a folder name; systems allow 255 bytes, and some are reserved for appended numbers."""
 _SEAL = "# Lines below: "
 """First words of a config.yml that normlift_ns wrote; the digest of the following lines comes next."""
+_WRITTEN = (
+    *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
+    *("../splat.json", "../transforms.json", "../added_photographs.json"),
+)
+"""Files of a lift, relative to the folder of the field."""
 SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
-_MAX_BYTES = 2**26
-"""Size limit of a manifest; normlift_ns writes a few thousand bytes."""
 DIGESTED_PATH = re.compile(r"(\.\./(nerfstudio_models/)?)?\w[\w.-]*")
 """Relative paths that a manifest may have digests of: files next to it, and files of its run."""
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
@@ -122,7 +125,7 @@ def check_run(run_dir: Path) -> None:
     if not run_dir.exists():
         complete_interrupted_writes(run_dir.parent)  # completes a replacement of the run that was interrupted
     path = run_dir / "config.yml"
-    text = path.read_bytes().decode("utf8", "replace").replace("\r\n", "\n") if path.is_file() else ""
+    text = read_file(path).decode("utf8", "replace").replace("\r\n", "\n") if path.is_file() else ""
     first, _, rest = text.partition("\n")
     if first.startswith(_SEAL) and first != add_digest_comment(rest).partition("\n")[0]:
         warnings.warn(
@@ -154,14 +157,44 @@ def complete_interrupted_lifts(run_dir: Path) -> None:
         complete_interrupted_writes(folder)
 
 
-def refuse_existing_run(run_dir: Path, overwrite: bool) -> None:
-    """Raise FileExistsError if the directory exists and `overwrite` is False, or if it is not a run."""
-    refuse_existing(run_dir, overwrite=overwrite, flags="--timestamp or --output-dir")
-    if os.path.lexists(run_dir) and not (run_dir / "config.yml").is_file():
+def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = None) -> None:
+    """Raise before a lift writes a run that it must not replace.
+
+    Args:
+        source: a file that the lift reads.
+    Raises:
+        FileExistsError: the directory exists and `overwrite` is False, or it is not a run.
+        ValueError: `source` is in the directory, or this is part of another run.
+    """
+    flags = "--timestamp or --output-dir"
+    refuse_inputs([run_dir], instead=flags)
+    complete_interrupted_writes(run_dir.parent)
+    if source is not None and Path(os.path.realpath(source)).is_relative_to(os.path.realpath(run_dir)):
+        raise InputError(f"{run_dir} is the run that is lifted, and a lift cannot replace it; give another {flags}")
+    if not overwrite and os.path.lexists(run_dir):
+        raise FileExistsError(f"{run_dir} exists; give another {flags}, or --overwrite True.")
+    is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
+    if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
-            f"{run_dir} is not a run (it has no config.yml), so --overwrite does not replace it; give another "
-            "--timestamp or --output-dir, or delete it yourself"
+            f"{run_dir} is not a lifted run (it has no config.yml or no {FIELD_FOLDER}/), so --overwrite does not "
+            "replace it; give another --timestamp or --output-dir, or delete it yourself"
         )
+
+
+def written_files(run_dir: Path) -> set[str]:
+    """Return the files of a run that normlift_ns wrote, relative to it: those that its manifest lists.
+
+    If the manifest is damaged or of version 0.1, these are all files with the names that a lift writes.
+    """
+    names = {"config.yml", *(f"{FIELD_FOLDER}/{name}" for name in (MANIFEST_FILE, "queries.safetensors"))}
+    try:
+        listed = read_manifest(run_dir / FIELD_FOLDER)[1]
+    except (OSError, ValueError):
+        listed = None
+    if listed is None:
+        checkpoints = (f"../nerfstudio_models/{x.name}" for x in run_dir.glob("nerfstudio_models/step-*.ckpt"))
+        listed = dict.fromkeys((*_WRITTEN, *checkpoints))
+    return names | {os.path.normpath(f"{FIELD_FOLDER}/{name}").replace(os.sep, "/") for name in listed}
 
 
 # manifest.json: metadata of a semantic field, with digests of its files and of the manifest itself.
@@ -189,7 +222,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str,
     """
     content = {"digest": None, **facts} | {"digest": "", "digests": dict(digests)}  # its own digest comes first
     text = json.dumps(content, indent=2) + "\n"
-    write_text_file(folder / MANIFEST_FILE, text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1))
+    text = text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1)
+    write_text_file(folder / MANIFEST_FILE, text, own=True)
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
@@ -238,15 +272,6 @@ def _new_names(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a manifest that record options, with the names of this version."""
     recorded = {"options": LiftOptions, "source": SourceOptions}
     return {name: new_names(recorded[name], x) for name, x in facts.items() if name in recorded and isinstance(x, dict)}
-
-
-def read_text(path: Path) -> str:
-    """Read a regular file of limited size; reading a pipe, say, might never end."""
-    if not path.is_file():
-        raise InputError("it is not a regular file")
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError(f"it has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}")
-    return path.read_bytes().decode("utf8").replace("\r\n", "\n")  # copying via Windows may change line endings
 
 
 def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapping[str, str] | None) -> None:

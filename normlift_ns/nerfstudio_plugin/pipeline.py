@@ -188,7 +188,7 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
         save_query(folder, question)
     model: Any = trainer.config.pipeline.model
     model.semantics = Path(FIELD_FOLDER)
-    write_text_file(path, add_digest_comment(yaml.dump(trainer.config)), overwrite=True)
+    write_text_file(path, add_digest_comment(yaml.dump(trainer.config)), overwrite=True, own=True)
     model.semantics = folder
     with trainer.train_lock:
         pipeline.model.attach(field, question)

@@ -105,6 +105,8 @@ def make_query(
         general = RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
         threshold = default.threshold if relevancy == default.rule else general
     needed = CANONICAL_NEGATIVES if RELEVANCY_RULES[relevancy].needs_negatives else ()
+    if needed and negatives is not None and len(negatives) == 0:
+        raise InputError(f"relevancy {relevancy} compares with negatives, and negatives is empty; name some")
     negatives = tuple((default.negatives or needed) if negatives is None else negatives)
     return Query(
         texts=tuple(texts),

@@ -22,6 +22,7 @@ from normlift_ns.encoders import weights
 from normlift_ns.encoders.weights import CONFIG_FILE, SAM_WEIGHT_FILES, read_json
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
+from normlift_ns.io.guard import check_regular
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
@@ -354,6 +355,7 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:
+    check_regular(path)
     if path.suffix == ".safetensors":
         return load_file(path)
     return torch.load(path, map_location="cpu", weights_only=True)

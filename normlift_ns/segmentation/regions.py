@@ -20,6 +20,7 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
+from normlift_ns.io.guard import open_regular
 
 _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
 """Formats of training images. Pillow would hand some other formats to external programs: PostScript to Ghostscript."""
@@ -46,7 +47,7 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
             raise InputError(f"{what} {path} is not a file; expected an image")
         raise FileNotFoundError(f"{what} {path} does not exist; check the path, or whether the dataset was moved")
     try:
-        with Image.open(path, formats=formats) as image:
+        with open_regular(path) as file, Image.open(file, formats=formats) as image:
             if image.width * image.height > _MAX_PIXELS:
                 raise InputError(f"it has {image.width} x {image.height} pixels, at most {_MAX_PIXELS:,} are accepted")
             yield image
@@ -62,7 +63,7 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
 
 def gray_bit_depth(path: Path) -> int | None:
     """Return the bits per pixel of a grayscale PNG, else None. Pillow stretches values of 2 and 4 bits to 0..255."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         head = file.read(26)
     return head[24] if head.startswith(b"\x89PNG") and len(head) == 26 and head[25] == 0 else None
 

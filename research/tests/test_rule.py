@@ -45,18 +45,13 @@ def test_a_tie_goes_to_the_simpler_and_none_is_the_fallback():
     assert set(everything_fails.verdicts["one"].broken) == {"undamaged", "3 views", "overall", "column"}
 
 
-def test_clause_1_undamaged():
-    for loss, broken in ((0.2, ()), (0.21, ("undamaged",))):
-        found = verdict(table(one=lambda cell, loss=loss: -loss if cell.undamaged else 5.0), "one")
-        assert found.undamaged == pytest.approx(loss)
-        assert found.broken == broken
-
-
-def test_clause_2_three_views():
-    for loss, holds in ((1.0, True), (1.01, False)):
-        found = verdict(table(one=lambda cell, loss=loss: -loss if cell.views == "3" else 9.0), "one")
-        assert found.three_views == pytest.approx(loss)
-        assert ("3 views" in found.broken) is not holds
+def test_clauses_1_and_2_undamaged_and_three_views():
+    clauses = (("undamaged", 0.2, lambda cell: cell.undamaged), ("3 views", 1.0, lambda cell: cell.views == "3"))
+    for name, limit, struck in clauses:
+        for loss in (limit, limit + 0.01):
+            found = verdict(table(one=lambda cell, loss=loss, struck=struck: -loss if struck(cell) else 9.0), "one")
+            assert (found.undamaged if name == "undamaged" else found.three_views) == pytest.approx(loss)
+            assert (name in found.broken) is (loss > limit)
 
 
 def test_clause_3_share_of_all_cells():

@@ -1,24 +1,19 @@
 """Commands, as the tests give them."""
 
-from __future__ import annotations
-
 import shutil
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 from unittest.mock import MagicMock
 
 import pytest
 
 from normlift_ns.cli.common import run_command
+from normlift_ns.demo.room import DemoRoom
 from tests.conftest import make_lifted, make_trained
-
-if TYPE_CHECKING:
-    from normlift_ns.demo.room import DemoRoom
 
 SMALL = ("--encoder", "color", "--vote-k", "12")
 """Flags that lift the small demo room in a moment."""
@@ -40,13 +35,6 @@ def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> in
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
-
-
-def wait_for(done: Callable[[], bool], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @dataclass
@@ -95,7 +83,6 @@ def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def little_room() -> DemoRoom:
-    """The room of `little`."""
     from tests.plain_room import plain_room  # noqa: PLC0415
 
     return plain_room(3000)
@@ -109,7 +96,6 @@ def little(little_room: DemoRoom, made_once: Any) -> Path:
 
 @pytest.fixture(scope="session")
 def little_lifted(little: Path, made_once: Any) -> Path:
-    """config.yml of a lifted run of it."""
     return make_lifted(made_once, little, "t", "--region-count", "300")
 
 

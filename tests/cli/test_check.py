@@ -80,19 +80,8 @@ def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, tr
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
     assert code == 0 and states(found)["weights"] == "warning" and found["plan"] is None
     assert "ViT-B-16" in next(row for row in found["findings"] if row["what"] == "weights")["found"]
-    flags = (
-        "--encoder",
-        "open_clip",
-        "--load-config",
-        trained,
-        "--regions",
-        "patches",
-        "--output-dir",
-        tmp_path / "out",
-        "--dry-run",
-        "True",
-    )
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
+    given = ("--load-config", trained, "--encoder", "open_clip", "--regions", "patches")
+    assert run_entry(monkeypatch, lift.entrypoint, *given, "--output-dir", tmp_path, "--dry-run", "True") == 1
     assert "weights are not on this machine" in said(capsys)
 
 

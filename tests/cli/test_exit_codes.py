@@ -164,7 +164,6 @@ run_command_process(Command)
 
 
 def started(body: str, state: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    """A process of a command."""
     program = PROGRAM.format(body=textwrap.indent(textwrap.dedent(body), " " * 8))
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     environment |= {"XDG_STATE_HOME": str(state), "PYTHONUNBUFFERED": "", **more}

@@ -1,7 +1,6 @@
 """The commands on LangSplat's files, with real vectors of CLIP, and on the trained captures."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from normlift_ns import Scene, open_run, render
+from normlift_ns import open_run, render
 from normlift_ns.cli import lift, query
 from normlift_ns.core.metrics import class_scores, confusion
 from normlift_ns.encoders.text_files import TextEmbeddingFile
@@ -25,9 +24,8 @@ COLOURS = "cream,light brown,teal,chocolate brown,sky blue,dark green,bright blu
 WORDS = "curtain,mattress,doormat,table,sofa,flowerpot,crate,stool,cone,ball,doughnut,box,vase"
 THINGS = dict(zip(COLOURS.split(","), WORDS.split(",")))
 """What the classes of the room are called here, by their colours."""
-NOISE, MERGED, UNLABELLED, SMALLEST = 1.0, 0.1, 0.2, 20
-"""Length of the noise on the unit vector of every mask; shares of masks that are merged with a neighbour and of pixels
-without any; pixels of the smallest mask."""
+NOISE, UNLABELLED, SMALLEST = 1.0, 0.2, 20
+"""Length of the noise on the unit vector of every mask; share of pixels without any; pixels of the smallest mask."""
 
 
 def pieces(labels: NDArray, cell: int | None) -> NDArray:
@@ -51,14 +49,6 @@ def damaged(truth: NDArray, cell: int | None, vectors: NDArray, rng: np.random.G
     ids = pieces(truth, cell)
     first = [truth[ids == i][0] - 1 for i in range(ids.max() + 1)]
     rows = unit(vectors[first] + NOISE * unit(rng.normal(size=(len(first), vectors.shape[1]))))
-    for i in np.flatnonzero(rng.random(len(rows)) < MERGED):
-        around = np.unique(ids[ndimage.binary_dilation(ids == i, iterations=2)])
-        near = around[(around >= 0) & (around != i)]
-        if len(near) > 0:
-            other = rng.choice(near)
-            sizes = np.array([[(ids == i).sum()], [(ids == other).sum()]])
-            rows[other] = unit((sizes * rows[[i, other]]).sum(axis=0))
-            ids[ids == i] = other
     smooth = ndimage.gaussian_filter(rng.normal(size=ids.shape), 8)
     ids[smooth < np.quantile(smooth, UNLABELLED)] = -1
     used = np.unique(ids[ids >= 0])
@@ -69,9 +59,9 @@ def unit(rows: NDArray) -> NDArray:
     return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
-def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, seed: int) -> None:
+def write_features(capture: Path, folder: Path, vectors: NDArray, views: int) -> None:
     """What LangSplat's preprocessing would leave of the training images."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     folder.mkdir()
     for path in sorted((capture / "instance").iterdir())[:views]:
         truth = np.asarray(Image.open(path)).astype(np.int64)
@@ -85,9 +75,8 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("draws", "least"), [(1, 0.9), pytest.param(3, 0.92, marks=pytest.mark.extra)])
-def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
-    """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
+def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatch):
+    """mIoU over the Gaussians of 13 classes."""
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
     from tests.plain_room import plain_room  # noqa: PLC0415
 
@@ -99,16 +88,15 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
     np.savez(tmp_path / "texts.npz", **dict(zip(THINGS.values(), vectors)))
     texts = TextEmbeddingFile(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])
 
-    def lifted(seed: int, level: str) -> tuple[Path, list[float]]:
+    features = tmp_path / "features"
+    write_features(tmp_path / "room", features, vectors, views=24)
+
+    def lifted(level: str) -> tuple[Path, list[float]]:
         """The run, and mIoU before and after refinement."""
-        features = tmp_path / f"features_{seed}"
-        if not features.exists():
-            write_features(tmp_path / "room", features, vectors, views=24, seed=seed)
-        name = f"{level}_{seed}"
         importing = ("--features", "langsplat", "--features-dir", features, "--text-embeddings", tmp_path / "texts.npz")
-        flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
+        flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", level)
         assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-        config = trained.parents[2] / "normlift" / name / "config.yml"
+        config = trained.parents[2] / "normlift" / level / "config.yml"
         field = open_run(config).field
         scores = []
         for refined in (False, True):
@@ -116,49 +104,16 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
             scores.append(class_scores(confusion(room.labels, found, len(room.names))).miou)
         return config, scores
 
-    scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}
+    before, after = lifted("l")[1]
     monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)  # another level has its evidence
-    config, summed = lifted(0, "sum")
+    config, summed = lifted("sum")
     asking = ("--text", "sofa", "--negatives", "box", "table", "--output-json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
     (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
-    before, after = np.mean(list(scores.values()), axis=0)
-    assert after >= least
-    assert all(refined > raw for raw, refined in scores.values())
-    assert after > before + 0.02
+    assert after >= 0.9 and after > before + 0.02
     assert summed[1] >= 0.9
     truth = room.labels == room.names.index("sky blue")
     assert sofa["fraction"] == pytest.approx(float(truth.float().mean()), rel=0.2)
-
-
-def maps(config: Path, texts: list[str], split: str, count: int) -> tuple[Scene, torch.Tensor]:
-    """Relevancy of the texts in the first views of a split, [V, H, W, Q]."""
-    run = open_run(config)
-    scene, relevancy = run.scene, run.ask(*texts).relevancy
-    views = getattr(scene, split).cameras[:count]
-    return scene, torch.stack(
-        [pixel_relevancy(*render(scene.gaussians, c, relevancy, rasterize_mode=scene.rasterize_mode)) for c in views]
-    )
-
-
-@pytest.mark.slow
-def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    relative = Path(os.path.relpath(source, tmp_path))
-    flags = ("--encoder", "color", "--output-dir", "lifted", "--timestamp", "t")
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
-    config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
-    asked = ("--load-config", config, "--text", "orange", "crimson", "--output-json", "a.json")
-    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
-    assert "reliability" in capsys.readouterr().out
-    orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
-    assert orange["peak"] > 0.5 and crimson["peak"] > 0.6
-    _, values = maps(config, ["orange", "crimson"], "train", 1)
-    boxes = ((180, 330, 250, 330), (750, 930, 330, 480), (100, 190, 470, 535))
-    head, wallpaper, curtain = (values[0, a:b, c:d].mean(dim=(0, 1)).tolist() for a, b, c, d in boxes)
-    assert head[0] > 3 * wallpaper[0] and head[0] > 0.2
-    assert curtain[1] > 3 * max(head[1], wallpaper[1])
 
 
 @pytest.mark.slow
@@ -169,8 +124,11 @@ def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
     flags = ("--encoder", "color", *regions, "--output-dir", tmp_path, "--timestamp", "t")
     monkeypatch.chdir(captures)
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
-    run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)
-    masks = [captures / "tabletop" / "instance" / f"{Path(name).stem}.png" for name in run.held_out.names]
+    run = open_run(tmp_path / "tabletop" / "normlift" / "t" / "config.yml")
+    relevancy, mode = run.ask("dusty red", "black").relevancy, run.scene.rasterize_mode
+    drawn = [render(run.scene.gaussians, c, relevancy, rasterize_mode=mode) for c in run.scene.held_out.cameras]
+    values = torch.stack([pixel_relevancy(*one) for one in drawn])
+    masks = [captures / "tabletop" / "instance" / f"{Path(name).stem}.png" for name in run.scene.held_out.names]
     truth = torch.from_numpy(np.stack([np.array(Image.open(mask)).astype(int) for mask in masks]))
     assert len(truth) == 4
     table = truth == 1

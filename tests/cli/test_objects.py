@@ -1,13 +1,10 @@
-"""ns-normlift-query --objects and --explain, honest answers in its table, and ns-normlift-export --select clean."""
-
-from __future__ import annotations
+"""ns-normlift-query --objects and --explain, and honest answers in its table."""
 
 import csv
 import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,15 +14,13 @@ from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, open_run
 from normlift_ns.analysis.objects import csv_columns, view_shares
-from normlift_ns.cli import export, query
+from normlift_ns.cli import query
 from normlift_ns.cli.query import print_catalog
+from normlift_ns.demo.room import DemoRoom
 from normlift_ns.exports import answer_instances
 from normlift_ns.rasterization.rasterize import render
 from normlift_ns.rasterization.settings import RasterSettings
 from tests.cli.conftest import run_entry, said
-
-if TYPE_CHECKING:
-    from normlift_ns.demo.room import DemoRoom
 
 
 @pytest.fixture(scope="module")
@@ -175,27 +170,3 @@ def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch)
     assert found.question.threshold == pytest.approx(document["threshold"], abs=1e-5)
     assert found["red"].suggested_threshold == pytest.approx(found.question.threshold)
     assert row["fraction"] == pytest.approx(found["red"].fraction, abs=1e-3)
-
-
-def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    rows = {}
-    for part in ("scene", "clean"):
-        flags = (
-            "--load-config",
-            lifted,
-            "--output-dir",
-            tmp_path,
-            "--output-filename",
-            f"{part}.ply",
-            "--select",
-            part,
-        )
-        assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
-        rows[part] = np.load(tmp_path / f"{part}_rows.npy")
-    mask = open_run(lifted).floaters().mask
-    assert np.array_equal(np.setdiff1d(rows["scene"], rows["clean"]), np.flatnonzero(mask.numpy()))
-    assert 0 < int(mask.sum()) < 0.05 * len(mask)
-    assert f"{int(mask.sum()):,} likely floaters are left out" in said(capsys)
-    limit = ("--floater-threshold", "100", "--overwrite")
-    assert run_entry(monkeypatch, export.entrypoint, *flags, *limit) == 0
-    assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), rows["scene"])

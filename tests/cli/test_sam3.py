@@ -35,26 +35,17 @@ def weights(tmp_path, monkeypatch, asked) -> Path:
     return tmp_path / "sam3"
 
 
-def in_copy(own: Path) -> Path:
-    """The lifted run of `own`."""
-    return own.parents[2] / "normlift" / "t" / "config.yml"
+@pytest.fixture
+def segmented(own: Path, weights: Path) -> tuple[object, ...]:
+    """Flags with the lifted run of `own` and the network."""
+    lifted = own.parents[2] / "normlift" / "t" / "config.yml"
+    return ("--load-config", lifted, "--segment", "sam3", "--segment-model", weights, "--segment-views", 4)
 
 
-def test_sam3_answers_beside_the_run(own: Path, weights: Path, tmp_path, monkeypatch, capsys) -> None:
-    table, arrays, lifted = tmp_path / "table.json", tmp_path / "arrays.npz", in_copy(own)
-    flags = (
-        "--load-config",
-        lifted,
-        "--text",
-        "red",
-        "--output-json",
-        table,
-        "--output-npz",
-        arrays,
-        "--segment",
-        "sam3",
-    )
-    assert run_entry(monkeypatch, query.entrypoint, *flags, "--segment-model", weights, "--segment-views", 4) == 0
+def test_sam3_answers_beside_the_run(segmented, tmp_path, monkeypatch, capsys) -> None:
+    table, arrays = tmp_path / "table.json", tmp_path / "arrays.npz"
+    flags = (*segmented, "--text", "red", "--output-json", table, "--output-npz", arrays)
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = said(capsys)
     assert "SAM 3" in shown and "50%" in shown
     (row,) = json.loads(table.read_text())["queries"]
@@ -70,14 +61,12 @@ def test_sam3_answers_beside_the_run(own: Path, weights: Path, tmp_path, monkeyp
 
 
 def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
-    own: Path, weights: Path, asked: list[str], tmp_path, monkeypatch, capsys
+    own: Path, segmented, weights: Path, asked: list[str], tmp_path, monkeypatch, capsys
 ) -> None:
-    table, lifted = tmp_path / "table.json", in_copy(own)
-    kept = lifted.parents[1] / ".cache" / "masks"
+    table, kept = tmp_path / "table.json", own.parents[2] / "normlift" / ".cache" / "masks"
 
     def ask(*more: str) -> dict:
-        flags = ("--load-config", lifted, "--output-json", table, "--overwrite", "True", "--segment", "sam3")
-        flags = (*flags, "--segment-model", weights, "--segment-views", 4, "--threshold", 0.6)
+        flags = (*segmented, "--output-json", table, "--overwrite", "True", "--threshold", 0.6)
         assert run_entry(monkeypatch, query.entrypoint, *flags, *more) == 0
         return json.loads(table.read_text())["queries"][0]["segment"]
 

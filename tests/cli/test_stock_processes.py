@@ -5,9 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +18,11 @@ from normlift_ns.cli import query
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.query.question import load_query
-from tests.browser.server import STOCK, Server
-from tests.cli.conftest import run_entry
+from tests.cli.conftest import run_entry, said
 from tests.data.scene_files import ply_columns, write_ply
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
-SECONDS = 300
-"""Until a command must have done its work; importing nerfstudio takes 20 of them."""
-
 SCALARS = ["selection", "reliability_value", "n_eff", "relevancy_0", "relevancy_1"]
 NAMES = ["overlay", "segmentation", "reliability", *SCALARS]
 
@@ -56,7 +49,7 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     names = ("rgb", "reliability", "relevancy_0")
     flags = ("dataset", "--load-config", stranger, "--output-path", "out", "--image-format", "png", "--split", "test")
     words = [str(BIN / "ns-render"), *map(str, flags), "--rendered-output-names", *names]
-    how = {"env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": SECONDS}
+    how = {"env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": 300}
     done = subprocess.run(words, cwd=tmp_path, check=False, **how)
     assert done.returncode == 0, done.stdout + done.stderr
     for name in names:
@@ -66,24 +59,6 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     rendered = np.asarray(Image.open(tmp_path / "out" / "test" / "rgb" / "0006.png").convert("RGB")).astype(float)
     photo = np.asarray(Image.open(stranger.parents[4] / "room" / "images" / "0006.png").convert("RGB"))
     assert np.abs(rendered - photo).mean() < 3
-
-
-@pytest.mark.slow
-def test_ns_viewer_answers(stranger, tmp_path):
-    assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
-
-
-def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
-    """The page that ns-viewer serves, if it still runs two seconds later."""
-    viewer = Server(STOCK, config, log, cwd=cwd)
-    try:
-        viewer.start(CUDA_VISIBLE_DEVICES="")
-        page = urllib.request.urlopen(viewer.address, timeout=60).read()
-        time.sleep(2)
-        assert viewer.alive(), viewer.said()
-        return page
-    finally:
-        viewer.stop()
 
 
 @pytest.fixture(autouse=True)
@@ -118,7 +93,7 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
 
 
-def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queries_are_stored_and_replaced_beside_their_checkpoint(lifted, tmp_path, monkeypatch, capsys) -> None:
     copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
     shutil.copytree(lifted.parent, copy.parent)
     flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save-query", "True")
@@ -132,3 +107,7 @@ def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypat
     assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
     assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 0
     assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
+    (checkpoint,) = (copy.parent / "nerfstudio_models").iterdir()
+    checkpoint.write_bytes(checkpoint.read_bytes() + b"of another run")
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 1
+    assert checkpoint.name in said(capsys)

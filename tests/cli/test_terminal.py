@@ -57,18 +57,12 @@ def test_mistakes_are_messages(ended) -> None:
         (("--log-file", "."), ".", "not a regular file"),
         (("--log-file", "nowhere/a.log"), "nowhere/a.log, given with --log-file", "No such file"),
         (("--log-file",), "--log-file"),
+        (("--log-file", "--word"), "--log-file"),
         (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
     ):
         code, out, err = ended(common.info, *flags)
         assert (code, out) == (1, "") and "Traceback" not in err
         assert [fact for fact in facts if fact not in err] == [], flags
-
-
-def test_words_for_another_command_stay() -> None:
-    words = ["list.txt", "--quiet", "False", "--", "--quiet", "--log-file", "x"]
-    assert common.split_output_flags(words) == (["list.txt", *words[3:]], common.OutputSettings())
-    with pytest.raises(InputError):
-        common.split_output_flags(["--log-file", "--vote-k"])
 
 
 def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -9,7 +9,6 @@ LOW, HIGH = np.full(3, -1.0), np.full(3, 1.0)
 
 
 def solids() -> dict[str, tuple[shapes.Distance, float]]:
-    """Shapes, and their surfaces."""
     return {
         "sphere": (shapes.sphere(0.5), math.pi),
         "box": (shapes.box(1.0, 0.8, 0.6), 2 * (0.8 + 0.6 + 0.48)),

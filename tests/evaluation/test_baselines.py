@@ -24,6 +24,7 @@ from tests.random_scenes import Photographs, dense, generator, made_scene, orbit
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
 OPTIONS = SourceOptions(encoder="color", regions="grid", region_count=12)
+PLAIN = LiftOptions(refine=False, max_views=4, consensus=False, consensus_min_agreement=0.0)  # cells count as things
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +34,7 @@ def lifted(tmp_path_factory) -> EvaluatedRun:
     masks = [torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 3 * i for i in range(VIEWS)]
     photographs = Photographs([f"{i}.png" for i in range(VIEWS)], orbit(VIEWS), masks=masks)
     scene = made_scene(random_scene(N, dtype=torch.float32, size=0.3), photographs)
-    options = LiftOptions(
-        refine=False, max_views=4, consensus=False, consensus_min_agreement=0.0
-    )  # cells count as things
-    found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
+    found = lift_scene(scene, make_source(OPTIONS), PLAIN, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
     return EvaluatedRun(scene, replace(found, manifest=manifest), make_source(OPTIONS), False, folder)
 
@@ -141,15 +139,7 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
 
 @pytest.mark.parametrize("power", [0.0, 2.0])
 def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
-    """As `lift_scene` lifts them, numbers that vote included."""
-    options = LiftOptions(
-        refine=False,
-        max_views=4,
-        consensus=True,
-        consensus_power=power,
-        consensus_sample=9,
-        consensus_min_agreement=0.0,
-    )
+    options = replace(PLAIN, consensus=True, consensus_power=power, consensus_sample=9)
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}
     agreed = replace(lifted, field=replace(found, manifest=json.loads(json.dumps(manifest))))

@@ -153,14 +153,11 @@ def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text(json.dumps(NAMES))
     names = read_names(tmp_path / "labels.json")
     masks = LabelFiles(tmp_path, description="instance mask", flag="--labels")
-    for array, message in (
-        (np.zeros((2, 3), np.float32), "instance mask .*a.npy holds float32"),
-        (np.zeros((2, 2, 3), int), r"a\.npy has shape \(2, 2, 3\), but its image x/a\.png is 2 x 3"),
-        (np.zeros((3, 2), int), r"a\.npy has shape \(3, 2\), but its image x/a\.png is 2 x 3"),
-    ):
+    for array in (np.zeros((2, 2, 3), int), np.zeros((3, 2), int)):
         np.save(tmp_path / "a.npy", array)
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=r"a\.npy has .* its image x/a\.png is 2 x 3") as caught:
             read_classes(masks, "x/a.png", names, 2, 3)
+        assert str(array.shape) in str(caught.value)
     np.save(tmp_path / "a.npy", np.array([[-(2**62), 7, 2**62]]))
     assert read_classes(masks, "x/a.png", names, 1, 3).tolist() == [[-1, 0, -1]]
     with pytest.raises(FileNotFoundError, match=r"nowhere .*--labels"):

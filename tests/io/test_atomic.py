@@ -137,7 +137,8 @@ def make_folder(path: Path, text: str, *, overwrite: bool = False) -> bool:
     with atomic.draft_directory(path) as draft:
         for i in range(2):
             atomic.write_text_file(draft / "inner" / f"{i}.txt", text)
-        return atomic.commit_directory(draft, path, overwrite=overwrite)
+        replaced = {f"inner/{i}.txt" for i in range(2)}
+        return atomic.commit_directory(draft, path, replaced=(lambda _: replaced) if overwrite else None)
 
 
 def content(path: Path) -> str:
@@ -150,7 +151,7 @@ def content(path: Path) -> str:
 
 def test_of_processes_that_write_at_once_none_loses_anything(system: str, tmp_path: Path):
     """One writes a new file or folder, each finds a numbered name, all replace a folder, and exports never mix."""
-    paths = [tmp_path / "export" / name for name in ("a.ply", "a_rows.npy", "a_objects.json")]
+    paths = [tmp_path / "export" / name for name in ("a.ply", "a_rows", "a_objects")]
     make_folder(tmp_path / "replaced", "old")
 
     def number(i: int, place: Path) -> str:
@@ -213,14 +214,19 @@ def after_kills(action: Callable[[], object], reset: Callable[[], object], folde
 @pytest.mark.usefixtures("unsynced")
 @pytest.mark.parametrize("every", EVERY)
 def test_a_killed_process_loses_no_folder(every: int, system: str, tmp_path: Path):
-    """The old folder or the new one is there, at once or when the next command looks."""
+    """The old folder or the new one is there, at once or when the next command looks, with the files of others."""
     path, seen, gaps = tmp_path / "runs" / "now", [], 0
     new, old = (lambda text=text: make_folder(path, text, overwrite=True) for text in ("new", "old"))
+    mine = {path / name: name for name in ("notes.md", "inner/2.md", "my files/deep/a.ply", ".hidden/b")}
+    for file, text in mine.items():
+        atomic.write_text_file(file, text)
+    (path / "link").symlink_to("nowhere")
     for _ in after_kills(new, old, path.parent, every):
         gaps += not path.exists()
         atomic.complete_interrupted_writes(path.parent)
         seen.append(content(path))
         assert list(path.parent.iterdir()) == [path]
+        assert {file: file.read_text() for file in mine} == mine and (path / "link").is_symlink()
     assert (seen[0], seen[-1], content(path)) == ("old", "new", "new")
     assert seen == sorted(seen, reverse=True)  # old, then new
     if every < 2:
@@ -233,7 +239,7 @@ def test_a_killed_process_loses_no_folder(every: int, system: str, tmp_path: Pat
 def test_files_that_belong_together_are_completed_after_a_kill(every: int, overwrite: bool, tmp_path: Path):
     """All are old, or all are new once the next process looks; none is of another turn."""
     folder, seen, gaps = tmp_path / "out", [], 0
-    paths = [folder / name for name in ("a.ply", "a_rows.npy", "a_objects.json")]
+    paths = [folder / name for name in ("a.ply", "a_rows", "a_objects")]
 
     def texts() -> list[str]:
         return [path.read_text() for path in paths if path.exists()]

@@ -10,7 +10,8 @@ import torch
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.io import run_dir
-from normlift_ns.io.atomic import refuse_existing, refuse_run_files
+from normlift_ns.io.atomic import refuse_existing
+from normlift_ns.io.guard import refuse_inputs
 from tests.hostile import no_files
 from tests.io.test_digests import as_version_0_1, example, flipped
 
@@ -121,7 +122,7 @@ def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
                     refuse_existing(path, overwrite=overwrite, flags="--output-json")
     for fine in (run / "answers.json", run / "ply" / "config.yml", tmp_path / "config.yml", run / "pictures" / "a.png"):
         refuse_existing(fine, overwrite=False, flags="--output-json")
-        refuse_run_files(fine, instead="--output-json")
+        refuse_inputs([fine], instead="--output-json")
 
 
 def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:

@@ -43,12 +43,7 @@ def stock(made_once: Callable[..., Path], _imported: None) -> StockRun:
         rest = trainer.pipeline.model.features_rest.data
         rest.copy_(0.2 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(0)))
 
-    def make(folder: Path) -> None:
-        write_dataset(folder / "scene")
-        train_splatfacto(folder, Path("scene"), prepare=prepare, steps=3)
-
-    folder = made_once("stock", make)
-    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+    return trained_once(made_once, "stock", write_dataset, prepare=prepare, steps=3)
 
 
 @pytest.fixture
@@ -86,15 +81,24 @@ def registered(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(params=["fox", "tabletop"])
 def capture(request: pytest.FixtureRequest) -> Path:
-    """config.yml of a real run."""
     config = SHARED / "captures" / "outputs" / request.param / "splatfacto" / "run" / "config.yml"
     if not config.exists():
         pytest.skip(f"needs the real captures, which are not part of the project: no {config}")
     return config
 
 
+def trained_once(made_once: Callable[..., Path], name: str, write: Callable[[Path], Any], **how: Any) -> StockRun:
+    """A run of a dataset, by its name in `made_once`; `how` are keywords of `train_splatfacto`."""
+
+    def make(folder: Path) -> None:
+        write(folder / "scene")
+        train_splatfacto(folder, Path("scene"), **how)
+
+    folder = made_once(name, make)
+    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+
+
 def opened(config: Path, **how: Any) -> Any:
-    """The scene of a run."""
     from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415
 
     return open_scene(config, **how)
@@ -136,5 +140,4 @@ def write(
 
 
 def field_of(scene: NerfstudioScene) -> SemanticField:
-    """The field of a lifted run."""
     return load_field(scene.location.run_dir, scene.gaussians.means, checkpoint=scene.checkpoint_path)

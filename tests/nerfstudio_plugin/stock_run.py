@@ -162,7 +162,6 @@ def splatfacto_on_cpu() -> Iterator[None]:
 
 @contextmanager
 def working_directory(folder: Path) -> Iterator[None]:
-    """Changes the current directory for a while."""
     before = Path.cwd()
     os.chdir(folder)
     try:

@@ -1,43 +1,35 @@
-import os
 import re
 import shutil
 from pathlib import Path, PureWindowsPath
 
 import pytest
-import yaml
 
 from normlift_ns.data.nerfstudio.config import locate_run, read_trainer_config
-from tests.nerfstudio_plugin.conftest import opened, read
+from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
+from tests.nerfstudio_plugin.test_allowed import refusal
 
 HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"
 
 
-def refused(path: Path, text: str, problem: str) -> None:
-    path.write_text(text)
-    with pytest.raises(ValueError, match=problem) as caught:
-        read_trainer_config(path)
-    assert str(path) in str(caught.value)
-
-
-def test_a_stock_config_is_read_as_nerfstudio_reads_it(stock: StockRun, tmp_path: Path) -> None:
-    text = stock.config.read_text()
-    assert read(stock.config) == yaml.load(text, Loader=yaml.Loader)
+def test_a_config_of_another_operating_system_is_read(stock: StockRun, tmp_path: Path) -> None:
     path = tmp_path / "config.yml"
-    path.write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))  # of another operating system
+    path.write_text(stock.config.read_text().replace("pathlib.PosixPath", "pathlib.WindowsPath"))
     output_dir = read_trainer_config(path).output_dir
     assert output_dir == Path("outputs") and not isinstance(output_dir, PureWindowsPath)
 
 
 def test_other_methods_are_refused_by_name(stock: StockRun, tmp_path: Path) -> None:
-    path, text = tmp_path / "config.yml", stock.config.read_text()
+    text = stock.config.read_text()
     for method in ("nerfacto", "splatfacto-w", "instant-ngp"):
         unknown = f"!!python/object:not_installed.Config\nmethod_name: {method}\nx: !!python/name:not_installed.f ''\n"
-        refused(path, unknown, f"'{method}'.* splatfacto-mcmc.*ns-train splatfacto.* --load-ply")
+        told = refusal(tmp_path, unknown)
+        assert re.search(f"'{method}'.* splatfacto-mcmc.*ns-train splatfacto.* --load-ply", told)
     for method in ("splatfacto-w-light", "feature-splatting", "dn-splatter"):
-        refused(path, re.sub("(?m)^method_name: .*$", f"method_name: {method}", text), f"'{method}'.* splatfacto-mcmc")
+        told = refusal(tmp_path, re.sub("(?m)^method_name: .*$", f"method_name: {method}", text))
+        assert re.search(f"'{method}'.* splatfacto-mcmc", told)
     for other in ("nerfstudio.models.nerfacto.NerfactoModelConfig", "other.model.OtherModelConfig"):
-        refused(path, text.replace("nerfstudio.models.splatfacto.SplatfactoModelConfig", other), re.escape(other))
+        assert other in refusal(tmp_path, text.replace("nerfstudio.models.splatfacto.SplatfactoModelConfig", other))
 
 
 def test_runs_of_nerfstudios_main_branch_are_read(stock: StockRun, tmp_path: Path) -> None:
@@ -51,13 +43,11 @@ def test_runs_of_nerfstudios_main_branch_are_read(stock: StockRun, tmp_path: Pat
 
 def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
     for text, problem in (
-        ("method_name: [", "YAML"),
         ("\x00\x01", "YAML"),
         ("", "no method_name"),
         ("method_name: splatfacto", "no method_name"),  # not an object of nerfstudio's
-        (HEADER, "TrainerConfig has no machine"),
     ):
-        refused(tmp_path / "config.yml", text, problem)
+        assert re.search(problem, refusal(tmp_path, text))
     with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
         read_trainer_config(tmp_path / "nowhere.yml")
     with pytest.raises(FileNotFoundError, match=f"{stock.config} exists"):
@@ -75,8 +65,7 @@ def test_a_config_runs_no_code(tmp_path: Path) -> None:
         "module:os ''",
     ):
         with working_directory(tmp_path):
-            refused(tmp_path / "config.yml", f"{HEADER}data: !!python/{value}\n", "line 3")
-        assert os.listdir(tmp_path) == ["config.yml"], value
+            assert "line 3" in refusal(tmp_path, f"{HEADER}data: !!python/{value}\n")
 
 
 def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: Path, tmp_path: Path) -> None:

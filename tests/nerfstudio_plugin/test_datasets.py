@@ -16,8 +16,8 @@ from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.errors import InputError
 from tests.data.scene_files import write_colmap
 from tests.hostile import fuzz, hostile_json
-from tests.nerfstudio_plugin.conftest import opened
-from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, train_splatfacto, write_dataset
+from tests.nerfstudio_plugin.conftest import opened, trained_once
+from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, write_dataset
 
 
 def write_project(folder: Path) -> Path:
@@ -39,12 +39,7 @@ def project(made_once: Callable[..., Path], _imported: None) -> StockRun:
     def configure(config: Any) -> None:
         config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
 
-    def make(folder: Path) -> None:
-        write_project(folder / "scene")
-        train_splatfacto(folder, Path("scene"), configure=configure)
-
-    folder = made_once("colmap-run", make)
-    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+    return trained_once(made_once, "colmap-run", write_project, configure=configure)
 
 
 @pytest.fixture
@@ -81,7 +76,6 @@ def test_missing_small_images_are_refused_without_a_question(moved: Path, tmp_pa
 
 
 def test_what_nerfstudio_reads_first_is_checked_first(moved: Path, tmp_path: Path) -> None:
-    """It prefers the text files of COLMAP."""
     model = tmp_path / "moved" / "scene" / "sparse" / "0"
     (model / "cameras.txt").write_text("1 PINHOLE wide")
     with pytest.raises(InputError, match=r"cameras\.txt is damaged"):
@@ -218,8 +212,6 @@ def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
 
 
 def test_damage_of_json_is_a_message(copied: Path) -> None:
-    """In the data set, and in what the training wrote."""
-
     def load() -> None:
         scene = opened(copied)
         assert len(scene.train.cameras) == len(scene.train)

@@ -108,16 +108,20 @@ def test_colors_without_spherical_harmonics(workspace: Path, registered: None, t
 
 def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticField) -> None:
     run = opened(stock.config)
-    outputs = _outputs(pipeline, 3)
-    assert list(outputs) == [*STOCK, "relevancy_0", "relevancy_1", *SEMANTIC]
-    answer = engine.run_query(field, run.gaussians.means, question())
+    asked = Query(("left", "right"), torch.eye(8)[:2], ("right",), torch.eye(8)[1:2], rule="margin")
+    pipeline.model.attach(field, asked)
+    answer = engine.run_query(field, run.gaussians.means, asked)
     chosen = answer.selected.any(dim=1).float()
     columns = {"relevancy_0": answer.relevancy[:, 0], "relevancy_1": answer.relevancy[:, 1], "selection": chosen}
     columns |= {"reliability_value": field.scalars.reliability, "n_eff": field.scalars.n_eff}
     expected, _ = render(run.gaussians, run.train.cameras[3], torch.stack(list(columns.values()), dim=1))
-    for i, name in enumerate(columns):
-        assert outputs[name].shape == (35, 47, 1)
-        torch.testing.assert_close(outputs[name][..., 0], expected[..., i], atol=1e-6, rtol=1e-5)
+    for on_cpu in (False, True):
+        with renderer(pipeline, on_cpu):
+            outputs = _outputs(pipeline, 3)
+        assert list(outputs) == [*STOCK, "relevancy_0", "relevancy_1", *SEMANTIC]
+        for i, name in enumerate(columns):
+            assert outputs[name].shape == (35, 47, 1)
+            torch.testing.assert_close(outputs[name][..., 0], expected[..., i], atol=1e-6, rtol=1e-4)
     for name in ("overlay", "segmentation", "reliability"):
         assert outputs[name].shape == (35, 47, 3)
         assert 0 <= float(outputs[name].min()) <= float(outputs[name].max()) <= 1
@@ -145,16 +149,6 @@ def test_no_tracer_reaches_the_renderer(pipeline: Any) -> None:
     assert not any(part in file for file in files for part in ("/raster/", "/numba/", "/matplotlib/", "legend.py"))
 
 
-def test_scalars_are_those_of_the_cpu(pipeline: Any, stock: StockRun) -> None:
-    model, view = pipeline.model, opened(stock.config).train.cameras[0]
-    values, nothing = torch.rand(model.num_points, 2), torch.zeros(model.num_points, dtype=torch.bool)
-    for rows in (None, model.means[:, 2] > model.means[:, 2].median()):
-        _, expected = model._render_on_cpu(view, values, rows)
-        torch.testing.assert_close(model._composited(view, values, rows), expected, atol=1e-6, rtol=1e-4)
-        assert model._composited(view, values[:, :0], rows).shape == (35, 47, 0)
-    assert not model._composited(view, values, nothing).any()
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_outputs_are_those_of_the_cpu(stock_lifted: Path, registered: None) -> None:
     pipeline = set_up(stock_lifted)
@@ -165,15 +159,6 @@ def test_cuda_outputs_are_those_of_the_cpu(stock_lifted: Path, registered: None)
         gap = (on_cuda[name].cpu() - value).abs() - 1e-3 * value.abs()
         assert float((gap > 1e-3).float().mean()) < 1e-3, name  # pixels where an alpha is on the other side of 1/255
         assert float(gap.max()) < 0.02, name
-
-
-def test_relevancy_of_stored_queries_uses_their_negatives(pipeline: Any, stock: StockRun) -> None:
-    field, negatives = pipeline.model.field, torch.eye(8)[1:2]
-    pipeline.model.attach(field, Query(("left",), torch.eye(8)[:1], ("right",), negatives, rule="lerf"))
-    values = field.relevancy(torch.eye(8)[:1], negatives, rule="lerf")
-    run = opened(stock.config)
-    expected, _ = render(run.gaussians, run.train.cameras[0], values)
-    torch.testing.assert_close(_outputs(pipeline)["relevancy_0"], expected, atol=1e-6, rtol=1e-5)
 
 
 def test_without_a_question_only_the_relevancies_are_missing(pipeline: Any) -> None:

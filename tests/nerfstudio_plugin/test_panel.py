@@ -27,9 +27,7 @@ from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.session import actions
-from normlift_ns.session.actions import threshold_suggestion
 from normlift_ns.session.objects import list_objects
-from normlift_ns.session.prompts import MAX_PROMPTS
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
 from normlift_ns.viewer.widgets import Action
@@ -213,18 +211,13 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert (panel.answer.question.rule, panel.answer.question.negatives) == ("lerf", ("right",))
 
     ask(panel, "left")
-    counts, usual = [], widgets.threshold.value
-    for threshold in (-0.2, 0.8, 0.99):
-        panel.act(Action("Threshold"), threshold)
-        counts.append(int(chosen(pipeline).sum()))
-        assert panel.answer.question.threshold == widgets.threshold.value == threshold
-        assert f"**{counts[-1]}** of 60" in said(panel)
-    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
-    panel.act(Action("Undo"))  # the drag of a slider is one step
-    assert widgets.threshold.value == usual > 0.5
-    panel.act(Action("Redo"))
-    assert widgets.threshold.value == 0.99
+    count = int(chosen(pipeline).sum())
+    panel.act(Action("Threshold"), 0.99)
+    assert f"**{int(chosen(pipeline).sum())}** of 60" in said(panel) and int(chosen(pipeline).sum()) < count
     panel.act(Action("Threshold"), 0.6)
+    panel.act(Action("Undo"))  # the drag of a slider is one step
+    assert int(chosen(pipeline).sum()) == count
+    panel.act(Action("Redo"))
     ask(panel, "right")
     assert panel.answer.question.threshold == 0.6  # stays for the same rule
     least = float(model.field.scalars.reliability.median())
@@ -232,8 +225,6 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert (model.field.scalars.reliability[chosen(pipeline)] >= least).all()
     ask(panel, "left")
     assert panel.answer.question.min_reliability == pytest.approx(least)
-    panel.act(Action("Suggested"))
-    assert widgets.threshold.value == pytest.approx(threshold_suggestion(panel.state), abs=1e-6)
     panel.act(Action.COLORS, "magma")
     assert pipeline.model._display.colormap == "magma" == panel._colormap
 
@@ -261,11 +252,6 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     panel.act(Action("Undo"))
     assert widgets.prompts.value == "left"
     panel.act(Action("All"))
-    ask(panel, "up")
-    for name in ("Hide", "Only"):  # nothing is hidden, and no screen is blank
-        panel.act(Action(name))
-        assert "Nothing is selected" in said(panel)
-        assert model._display.drawn is None
     widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
     panel.act(Action("Threshold"), 0.7)
     assert widgets.reliability.value == 0.25
@@ -296,23 +282,6 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     assert panel.answer.texts == ("left",)
     ask(panel, "right")
     assert panel.answer.question.min_reliability == 0.0 and chosen(pipeline).any()
-
-
-def test_what_cannot_be_asked_says_why_and_keeps_the_answer_before(panel: Any, pipeline: Any) -> None:
-    before = chosen(pipeline)
-    many = ";".join(f"left {i}" for i in range(MAX_PROMPTS + 1))
-    for prompts, message in ((" , ;", "Type"), ("x" * 10_000, "I do not know"), (many, str(MAX_PROMPTS + 1))):
-        ask(panel, prompts)
-        assert message in said(panel)
-        assert len(said(panel)) < 3000
-        assert panel._widgets.prompts.value == prompts
-        assert torch.equal(chosen(pipeline), before)
-        assert not panel._widgets.ask.disabled
-    ask(panel, "left, banana; right")
-    assert panel.answer.texts == ("left", "right")  # the rest is answered
-    (row,) = [line for line in said(panel).splitlines() if "banana" in line]
-    assert row.startswith("| ⚠ |") and "I do not know" in row
-    assert panel._widgets.prompts.value == "left, banana; right"
 
 
 def test_poor_evidence_is_said_and_can_be_left_out(panel: Any, pipeline: Any) -> None:
@@ -351,7 +320,13 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
         assert message in said(panel) and len(browser.files) == 1
 
 
-def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
+def test_fifty_prompts_markup_and_what_cannot_be_asked(panel: Any, pipeline: Any) -> None:
+    ask(panel, "x" * 10_000)
+    assert "I do not know" in said(panel) and len(said(panel)) < 3000 and panel.answer.texts == ("left",)
+    ask(panel, "left, banana; right")
+    assert (panel.answer.texts, panel._widgets.prompts.value) == (("left", "right"), "left, banana; right")
+    (row,) = [line for line in said(panel).splitlines() if "banana" in line]
+    assert row.startswith("| ⚠ |") and "I do not know" in row
     ask(panel, "; ".join(f"{side} {i}" for i in range(25) for side in ("left", "right")))
     assert sum(name.startswith("relevancy_") for name in outputs(pipeline)) == 50
     assert said(panel).count("■") == 8 and "42 more" in said(panel)
@@ -384,11 +359,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert np.linalg.norm(camera.position - camera.look_at) == pytest.approx(10 * first.extent / np.tan(0.5))
     press_row(groups[0], "export", browser)
     assert 0 < PlyData.read(io.BytesIO(browser.files["left_1.ply"]))["vertex"].count <= first.size
-    press_row(groups[0], "hide", browser)
-    assert torch.equal(pipeline.model._display.drawn, ~first.mask)
-    assert len(listed(panel)) == len(list_objects(panel.state).objects) < len(objects)
-    panel.act(Action("Undo"))
-    press_row(listed(panel)[0], "only", browser)
+    press_row(groups[0], "only", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
     assert listed(panel) == []
@@ -405,14 +376,11 @@ def test_floaters_are_selected(panel: Any, pipeline: Any, monkeypatch: pytest.Mo
     scene, likely = pipeline.model.scene(), button(panel, "Select likely floaters")
     means = scene.means.clone()
     means[7] += 1000
-    strayed, faint = replace(scene, means=means), replace(scene, opacities=torch.zeros_like(scene.opacities))
+    strayed = replace(scene, means=means)
     expected = find_floaters(strayed, pipeline.model.field.scalars).mask
-    assert 0 < int(expected.sum()) < 30
-    for shown, message in ((strayed, "press Hide"), (faint, "no likely floaters")):
-        monkeypatch.setattr(pipeline.model, "scene", lambda shown=shown: shown)
-        press(likely)
-        assert message in said(panel)
-        assert torch.equal(chosen(pipeline), expected)
+    monkeypatch.setattr(pipeline.model, "scene", lambda: strayed)
+    press(likely)
+    assert 0 < int(expected.sum()) < 30 and torch.equal(chosen(pipeline), expected)
 
 
 def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_path: Path, panel: Any) -> None:
@@ -435,9 +403,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     why = run.why(state.selection.cpu())
     text = html.unescape(reasons.content)
     assert why.words in text
-    names = {run.votes.names[vote.view] for vote in (*why.views[:3], *why.most_different[:3])}
-    assert all(name in text for name in names)
-    assert text.count("data:image/jpeg;base64,") == len(names)
+    assert 3 <= text.count("data:image/jpeg;base64,") <= 6
     panel._reasons = reasons
     panel._update_widgets()
     assert panel._widgets.reasons.content == reasons.content
@@ -505,18 +471,6 @@ def test_a_stale_answer_is_dropped(pipeline: Any, slow: tuple[Slow, list[str]], 
     for thread in threads:
         thread.join(60)
     assert panel.answer.texts == ("left", "up") and "banana" not in said(panel) and len(loaded) == 1
-    ask(panel, "left")
-    for end, texts in (("Cancel", ("left",)), ("Clear", ())):
-        encoder.go_on.clear()
-        encoder.reading.clear()
-        asking = in_thread(panel, "right")
-        assert encoder.reading.wait(60)
-        panel.act(Action(end))
-        assert not panel._widgets.ask.disabled
-        encoder.go_on.set()
-        asking.join(60)
-        assert (() if panel.answer is None else panel.answer.texts) == texts
-        assert "Reading" not in said(panel)
 
 
 def ray(pipeline: Any) -> SimpleNamespace:
@@ -533,13 +487,10 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     browser._scene_pointer_cb(SimpleNamespace(ray_origin=None, ray_direction=None))  # not on the scene
     browser._scene_pointer_cb(event)
     assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
-    similar = field.directions() @ field.directions(met[None])[0]
-    clicked = chosen(pipeline)
-    median, top = np.quantile(similar[field.valid()].cpu(), (0.5, 0.999))
-    assert panel.state.query.threshold == pytest.approx(median + 0.8 * (top - median), abs=1e-4)
+    clicked, threshold = chosen(pipeline), panel.answer.question.threshold
     asked = field.query(panel.state.query.embeddings)[:, 0]
-    assert torch.equal(clicked, (asked > panel.state.query.threshold) & field.valid())
-    threshold = panel.answer.question.threshold
+    assert torch.equal(clicked, (asked > threshold) & field.valid()) and clicked.any()
+    assert asked[met] == pytest.approx(1, abs=1e-3)
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
@@ -635,7 +586,6 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
 
 
 def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
-    """As in a training: the viewer starts before there is anything to ask."""
     panel, field = pipeline.model.normlift, pipeline.model.field
     panel.close()
     assert panel._widgets.ask.disabled

@@ -97,14 +97,15 @@ def test_optimized_poses_are_applied(stock: StockRun, workspace: Path, mode: str
     def prepare(trainer) -> None:
         trainer.pipeline.datamanager.config.cache_images = "gpu"  # nerfstudio pins memory, which fails without a GPU
         adjustment = trainer.pipeline.model.camera_optimizer.pose_adjustment.data
-        adjustment.copy_(0.05 * torch.randn(adjustment.shape, generator=torch.Generator().manual_seed(1)))
+        sizes = torch.tensor([1e-3, 0.05, 0.3]).repeat(3)[:, None]  # for small ones nerfstudio sums a series
+        adjustment.copy_(sizes * torch.randn(adjustment.shape, generator=torch.Generator().manual_seed(1)))
 
     run = train_splatfacto(workspace, Path("scene"), configure=configure, prepare=prepare)
     assert f"cache_images: {'cpu' if mode == 'SO3xR3' else 'gpu'}" in run.config.read_text()
     loaded, raw = _assert_like_the_training(run), opened(stock.config)
     assert loaded.rasterize_mode == ("classic" if mode == "SO3xR3" else "antialiased")
     moved = [a.world_to_camera - b.world_to_camera for a, b in zip(loaded.train.cameras, raw.train.cameras)]
-    assert min(float(x.abs().max()) for x in moved) > 0.01
+    assert min(float(x.abs().max()) for x in moved) > 1e-4
     for ours, theirs in zip(loaded.held_out.cameras, raw.held_out.cameras):  # splatfacto optimises training views only
         assert torch.equal(ours.world_to_camera, theirs.world_to_camera)
 

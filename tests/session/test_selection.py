@@ -68,10 +68,8 @@ def test_the_thresholds_go_on_after_a_click_that_adds_and_stay_within_their_slid
     state = actions.click(asked("red"), ray(BLOCK), "add")
     assert chosen(actions.set_threshold(state, 1.5), 1)
     assert actions.set_threshold(state, state.query.threshold) is state
-    assert torch.equal(
-        actions.set_min_reliability(asked("red"), 0.9).selection,
-        rows(0, 2) & (world().field.scalars.reliability >= 0.9),
-    )
+    sure = rows(0, 2) & (world().field.scalars.reliability >= 0.9)
+    assert torch.equal(actions.set_min_reliability(asked("red"), 0.9).selection, sure)
     for typed, threshold, reliability in ((99.0, 1.0, 1.0), (-5.0, -0.2, 0.0), (0.3, 0.3, 0.3)):
         assert actions.set_threshold(state, typed).query.threshold == threshold
         assert actions.set_min_reliability(state, typed).query.min_reliability == reliability

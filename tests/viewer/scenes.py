@@ -48,8 +48,7 @@ def run_of(folder: Path, space: SelectionContext, scene: Any = None) -> Run:
 
 
 def until(true: Callable[[], Any], said: Callable[[], Any] = str) -> None:
-    """Waits until something holds."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not true():
         assert time.monotonic() < deadline, said()
         time.sleep(0.002)

@@ -37,7 +37,6 @@ def server(pages: list[BrowserPage]) -> Iterator[ViserServer]:
 
 @contextmanager
 def browsing(server: ViserServer, pages: list[BrowserPage]) -> Iterator[tuple[ClientConnection, BrowserPage]]:
-    """A browser, and its page."""
     before = len(pages)
     with opened(server.port) as browser:
         until(lambda: len(pages) > before)
@@ -45,7 +44,6 @@ def browsing(server: ViserServer, pages: list[BrowserPage]) -> Iterator[tuple[Cl
 
 
 def received(browser: ClientConnection, kind: str) -> dict:
-    """The next message of a kind."""
     while True:
         for message in messages(browser.recv(timeout=60)):
             if message["type"] == kind:

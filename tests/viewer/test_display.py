@@ -23,7 +23,6 @@ from normlift_ns.viewer.widgets import escape_mdx
 
 
 def pictured() -> tuple[torch.Tensor, torch.Tensor]:
-    """A picture, in colours and grey."""
     rgb = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
     return rgb, rgb.mean(dim=2, keepdim=True).expand_as(rgb)
 
@@ -72,15 +71,11 @@ def shown(texts: tuple[str, ...], relevancy: torch.Tensor) -> Answer:
 
 
 def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> None:
-    display = make_display(
-        (answer := shown(("sky blue", "sky-blue"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))).field, answer
-    )
+    answer = shown(("sky blue", "sky-blue"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))
+    display = make_display(answer.field, answer)
     image, alpha = torch.rand(200, 300, 7, generator=torch.Generator().manual_seed(1)), torch.ones(200, 300)
     rgb = torch.full((200, 300, 3), 0.5)
-    told, seen = (
-        render_outputs(display, rgb, image, alpha),
-        render_outputs(display, rgb, image, alpha, named_by_text=True),
-    )
+    told, seen = (render_outputs(display, rgb, image, alpha, named_by_text=named) for named in (False, True))
     assert list(told)[:2] == ["relevancy_0", "relevancy_1"]
     assert list(seen)[:2] == ["relevancy_sky_blue", "relevancy_sky_blue_2"]
     others = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
@@ -97,10 +92,8 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
 
 
 def test_the_scale_is_that_of_all_prompts_and_views() -> None:
-    assert make_display((a := shown(("a", "b"), torch.rand(3, 2) * 0.3)).field, a).map_scale == (
-        0.0,
-        pytest.approx(0.55),
-    )
+    low = shown(("a", "b"), torch.rand(3, 2) * 0.3)
+    assert make_display(low.field, low).map_scale == (0.0, pytest.approx(0.55))
     answer = shown(("a", "b"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))
     for one in (None, 0, 1):
         assert make_display(answer.field, answer, shown=one).map_scale == (0.0, pytest.approx(0.9))

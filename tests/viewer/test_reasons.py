@@ -42,12 +42,8 @@ class FakeVotes:
             yield VoteImage(NAMES[vote.view], vote, torch.full((12, 16, 3), 40 * vote.view, dtype=torch.uint8))
 
 
-def told(votes: Any, *cubes_: int) -> str:
-    return explanation_mdx(votes, rows(*cubes_))
-
-
 def test_three_that_weigh_most_and_those_that_disagree():
-    lines = told(FakeVotes(), 0)
+    lines = explanation_mdx(FakeVotes(), rows(0))
     named = [line for line in lines.splitlines() if line.startswith("a&#47;")]
     assert len(named) == 2  # it weighs most, and disagrees a little
     assert not any(set("[]()/") & set(line) for line in named)
@@ -56,11 +52,11 @@ def test_three_that_weigh_most_and_those_that_disagree():
     assert "a/[x](y).png: 33% of the weight (320 pixels, 1 region), cosine 1.00" in most
     assert [name in most for name in NAMES] == [True, True, True, False, False]
     assert "e.png: 7% of the weight" in different and "of the disagreement" in different
-    alike = told(FakeVotes(), 1)
+    alike = explanation_mdx(FakeVotes(), rows(1))
     assert "disagree most" not in alike
     assert [text.count("data:image/jpeg") for text in (lines, alike)] == [4, 3]  # e.png too, and each once
     for problem in (InputError("they were given from Python"), FileNotFoundError("b.png is missing")):
-        text = html.unescape(told(FakeVotes(problem), 0))
+        text = html.unescape(explanation_mdx(FakeVotes(problem), rows(0)))
         assert f": {problem}" in text and "33% of the weight" in text and "data:image" not in text
 
 

@@ -99,11 +99,8 @@ def test_colours_show_what_is_selected_and_hidden():
     assert drawn.reshape(4, -1).all(axis=1).tolist() == [False, True, False, True]
     assert colours[BLOCK].tolist() == 3 * [grey]
     assert colours[0].tolist() == [253, 231, 37]  # the best match: all of the last colour of the map
-    assert painted(records, actions.add(State(space, color_mode="overlay"), rows(1)))[0][BLOCK].tolist() == [
-        255,
-        191,
-        26,
-    ]
+    by_hand = actions.add(State(space, color_mode="overlay"), rows(1))
+    assert painted(records, by_hand)[0][BLOCK].tolist() == [255, 191, 26]
     assert "0.80 relevancy 1.00" in legend(state)
     colours, _ = painted(records, actions.set_color_mode(state, "reliability"))
     assert len(np.unique(colours, axis=0)) >= 2

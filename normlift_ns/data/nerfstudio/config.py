@@ -25,6 +25,7 @@ from normlift_ns.data.nerfstudio.config_classes import (
     TrainerConfig,
 )
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import read_text
 from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 
 # The YAML of a config.yml, and the current paths of its run's files; reading them constructs no objects.
@@ -66,7 +67,7 @@ def compose_config(path: Path) -> yaml.MappingNode:
             f"{path} is not a nerfstudio config: it has {size:,} bytes, more than {_MAX_BYTES:,}. {_EXPECTED}"
         )
     try:
-        root = yaml.compose(path.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        root = yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except OSError as error:
         raise OSError(f"{path} cannot be read: {error.strerror}. {_EXPECTED}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:

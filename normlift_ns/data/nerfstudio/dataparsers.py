@@ -21,6 +21,7 @@ from normlift_ns.data.frames import PERSPECTIVE_MODELS, read_image_header
 from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.transforms import DISTORTION, FrameEntry, TransformsEntries, read_transforms_entries
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import read_text
 
 _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
 
@@ -546,7 +547,7 @@ def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]
     folder, lists = parser.data / parser.images_path, {}
     for split in ("train", "test", "validation"):
         path = parser.data / f"{split}_list.txt"
-        lists[split] = [folder / name for name in path.read_text("utf8").splitlines()] if path.is_file() else None
+        lists[split] = [folder / name for name in read_text(path).splitlines()] if path.is_file() else None
     return lists
 
 
