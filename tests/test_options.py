@@ -134,6 +134,7 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
     for name in ("regions", "features", "crop_fill", "features_missing"):
         for value in ("x", "", 1, None):
             refused(SourceOptions, name, value, "must be one of ")
+    refused(RefineConfig, "vote", "mean", "must be one of ")
     for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "prompt_template"):
         for value in ("a\0b", "a\udc80"):
             refused(SourceOptions, name, value)

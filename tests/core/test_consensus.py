@@ -121,24 +121,6 @@ def test_overlaps_are_symmetric_shares_and_rows_unit_or_zero(seed):
     assert torch.allclose(found[kept].norm(dim=1), torch.ones(int(kept.sum())), atol=1e-6)
 
 
-@examples(5)
-@given(seed=SEEDS, views=st.permutations(range(5)))
-def test_order_does_not_matter(seed, views):
-    evidence = things(seed)
-    features = unit_rows(evidence.num_regions, 6, seed)
-    found = consensus(evidence, features).features
-    columns = evidence.columns_of(list(views))
-    turned = consensus(evidence.select_views(list(views)), features[columns]).features
-    assert torch.allclose(turned, found[columns], rtol=0, atol=1e-12)
-    shuffled = evidence.rows.select_rows(torch.randperm(len(evidence.rows), generator=generator(seed)))
-    assert torch.allclose(consensus(replace(evidence, rows=shuffled), features).features, found, rtol=0, atol=1e-12)
-    within = torch.cat([4 * v + torch.randperm(4, generator=generator(seed + v)) for v in range(5)])
-    weight = dense(evidence.rows, 20)[:, within]
-    assert torch.allclose(
-        consensus(of_dense(weight, [4] * 5), features[within]).features, found[within], rtol=0, atol=1e-12
-    )
-
-
 def test_a_region_that_overlaps_nothing_keeps_its_feature():
     weight = dense(things(0).rows, 20)
     weight = torch.cat([weight, torch.zeros(len(weight), 2)], 1)
@@ -323,13 +305,3 @@ def test_refusals(unchecked):
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_gpu_equals_cpu():
-    evidence = large(2000, 50_000, 40)
-    features = unit_rows(2000, 64, 0, torch.float32)
-    here, there = consensus(evidence, features), consensus(evidence.to("cuda"), features.cuda())
-    assert here.gaussians == there.gaussians
-    assert there.agreement[0] == pytest.approx(here.agreement[0], abs=1e-5)
-    assert torch.allclose(there.features.cpu(), here.features, atol=1e-4)

@@ -140,7 +140,7 @@ def test_cells_give_the_evidence_of_every_level(power, dtype, seed):
         assert found.rows.weight.dtype == alone.rows.weight.dtype == dtype
 
 
-def test_save_and_load_are_exact_and_name_the_file(tmp_path):
+def test_save_and_load_are_exact(tmp_path):
     path = tmp_path / "e.safetensors"
     with pytest.raises(FileNotFoundError):
         Evidence.load(path)
@@ -149,10 +149,6 @@ def test_save_and_load_are_exact_and_name_the_file(tmp_path):
         evidence.save(path)
         assert same(Evidence.load(path), evidence)
         assert list(tmp_path.iterdir()) == [path]
-    for content in (b"no tensors", path.read_bytes()[:-40]):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"e\.safetensors is damaged"):
-            Evidence.load(path)
 
 
 def test_from_entries_keeps_unlabelled_weight_apart():

@@ -35,6 +35,8 @@ def test_equals_the_definition(seed, unlabeled, beta):
     lifted = lift(evidence, features, beta=beta, unlabeled=unlabeled)
     matrix, blank = dense(evidence.rows, S), dense(evidence.unlabeled, 5)
     directions, views = lifted.directions(), [evidence.region_view == v for v in range(5)]
+    some = torch.randperm(25, generator=generator(seed))[:7]
+    assert torch.equal(lifted.directions(some), directions[some])
     for j in range(25):
         s_jv = [matrix[j, view] @ features[view] for view in views]
         w_jv = [matrix[j, view].sum() + (blank[j, v] if unlabeled == "dilute" else 0) for v, view in enumerate(views)]
@@ -78,33 +80,6 @@ def test_identities(seed):
     value = (lifted.directions() * gradient).sum(1)
     assert (value[:, None] >= gradient @ unit_rows(200, D, seed + 1).T - 1e-9).all()
     assert torch.allclose(value, lifted.scalars.weight * lifted.scalars.norm, rtol=1e-10, atol=1e-12)
-
-
-@examples(5)
-@given(seed=SEEDS, scale=st.floats(1e-3, 1e3), cut=st.integers(1, 4))
-def test_invariances(seed, scale, cut):
-    """Order of views, shards, subsets of Gaussians, a common scale of all weights, rotation of the feature space."""
-    evidence, features = random_evidence(25, VIEWS, seed), unit_rows(S, D, seed)
-    lifted, directions = lift(evidence, features), lift(evidence, features).directions()
-
-    order = torch.randperm(5, generator=generator(seed)).tolist()
-    shuffled = lift(evidence.select_views(order), features[evidence.columns_of(order)])
-    shards = Evidence.merge(evidence.select_views(range(cut)), evidence.select_views(range(cut, 5)))
-    scaled = replace(evidence, rows=replace(evidence.rows, weight=evidence.rows.weight * scale))
-    for other in (shuffled, lift(shards, features), lift(scaled, features)):
-        for name in STATISTICS[:-1]:
-            assert torch.allclose(
-                getattr(other.scalars, name), getattr(lifted.scalars, name), rtol=1e-10, atol=1e-12
-            ), name
-        assert (other.directions() - directions).abs().max() < 1e-10
-
-    rotation = torch.linalg.qr(torch.randn(D, D, generator=generator(seed), dtype=torch.float64)).Q
-    turned = lift(evidence, features @ rotation)
-    assert torch.allclose(turned.scalars.reliability, lifted.scalars.reliability, rtol=1e-9, atol=1e-12)
-    assert (turned.directions() - directions @ rotation).abs().max() < 1e-9
-
-    some = torch.randperm(25, generator=generator(seed))[:7]
-    assert torch.equal(lifted.directions(some), directions[some])
 
 
 def test_chunks_do_not_change_directions(monkeypatch):
