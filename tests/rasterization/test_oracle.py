@@ -46,15 +46,6 @@ def test_evidence_and_pictures_equal_the_python_loops(mode):
             assert (alpha - matrix.sum(-1)).abs().max() < 1e-12
 
 
-def test_pixels_as_regions_give_the_matrix_itself():
-    scene, camera = random_scene(30, seed=3, size=0.5), orbit_camera(0.3, width=18, height=17)
-    labels = torch.arange(18 * 17, dtype=torch.int32).view(17, 18)
-    expected = torch.from_numpy(compositing_matrix(scene, camera)).view(-1, 30).T
-    for backend in BACKENDS:
-        evidence = rasterize_evidence(scene, [camera], [labels], backend=backend)
-        assert (dense(evidence.rows, 306) - expected).abs().max() < 1e-13
-
-
 def test_equal_depths_are_drawn_by_index():
     """Two Gaussians at the same place: the first one hides the second."""
     scene = GaussianScene(
