@@ -96,29 +96,12 @@ def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torc
 def test_equals_the_formula(seed, power, levels):
     for evidence, of in ((things(seed, gaussians=25), levels), (random_evidence(20, VIEWS, seed), 1)):
         features = unit_rows(evidence.num_regions, 6, seed)
+        features[seed % 3 :: 5] = 0
         level = torch.arange(evidence.num_regions) % of
         found = consensus(evidence, features, level=level, power=power)
         assert torch.allclose(found.features, oracle(evidence, features, power, level), rtol=0, atol=1e-12)
         if power == 1 and of == 1:
             assert torch.equal(consensus(evidence, features).features, found.features)  # that is the default
-
-
-@given(seed=SEEDS)
-def test_overlaps_are_symmetric_shares_and_rows_unit_or_zero(seed):
-    evidence, view = things(seed), things(seed).region_view
-    iou, inside, agreement = region_overlaps(evidence.rows, view)
-    table = dense(iou, evidence.num_regions)
-    assert torch.equal(table, table.T)
-    assert bool(((iou.weight >= 0.1) & (iou.weight <= 1) & (inside >= iou.weight - 1e-12) & (inside <= 1)).all())
-    assert bool((table[view[:, None] == view] == 0).all())
-    assert 0 < agreement <= 1
-    features = unit_rows(evidence.num_regions, 7, seed, torch.float32)
-    features[::4] = 0
-    found = consensus(evidence, features).features
-    assert found.dtype == torch.float32
-    assert torch.equal(found[::4], features[::4])
-    kept = torch.arange(len(found)) % 4 != 0
-    assert torch.allclose(found[kept].norm(dim=1), torch.ones(int(kept.sum())), atol=1e-6)
 
 
 def test_a_region_that_overlaps_nothing_keeps_its_feature():
