@@ -130,6 +130,18 @@ def test_weights_too_small_for_float32_are_no_evidence_and_too_large_ones_refuse
             lift(evidence, table)
 
 
+def test_very_many_entries_keep_their_digits():
+    """Added up one after the other in float32 they lose three digits."""
+    n = 200_000
+    features = unit_rows(1, 8, 0, torch.float32).expand(n, -1)
+    offsets, column = torch.tensor([0, n]), torch.arange(n, dtype=torch.int32)
+    rows = SparseRows(offsets, column, torch.full((n,), 1.1e-6))
+    none = SparseRows(torch.zeros(2, dtype=torch.int64), column[:0], rows.weight[:0])
+    lifted = lift(Evidence(rows, torch.zeros(n, dtype=torch.int32), none, 1), features)
+    assert abs(lifted.scalars.norm.item() - 1) < 1e-6
+    assert (lifted.directions() - features[:1]).norm() < 1e-6
+
+
 def test_no_evidence_at_all():
     lifted = lift(random_evidence(6, [0, 0], 0), torch.zeros(0, D))
     assert lifted.scalars.norm.tolist() == [0] * 6
