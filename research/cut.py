@@ -7,9 +7,9 @@ prototype, the normalized mean of the features of the regions inside its polygon
 click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
 labeled images and compared with the polygons; a text has one figure, pooled over its images.
 
-Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and .default, the IoU at the best threshold of that text and at the default one; for
-prototypes also other candidates. <capture>.mean.<cut>, the mean over texts of IoU divided by the best;
-<capture>.worst.<cut>, the smallest of these.
+Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
+.default, the IoU at the best threshold of that text and at the default one; for prototypes also other candidates.
+<capture>.mean.<cut>, the mean over texts of IoU divided by the best; <capture>.worst.<cut>, the smallest of these.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ def measure(report: Report, capture: str, config: Path) -> None:
             cuts |= candidate_cuts(answer.relevancy[answer.valid, 0].numpy())
         report.add(f"{capture}.{key}.ap", average_precision(values, truth), "of 1")
         vector = normalize(torch.from_numpy(asked[key][1].embeddings[0]).float(), dim=0)
-        flat = [torch.cat([features @ vector, vector.new_tensor([-1])])[row] for features, row in (rows[x] for x in images)]
-        in_images = torch.cat([x.ravel() for x in flat]).numpy()
+        cosines = [(torch.cat([rows[x][0] @ vector, vector.new_tensor([-1])]), rows[x][1]) for x in images]
+        in_images = np.concatenate([cosine[row].numpy().ravel() for cosine, row in cosines])
         report.add(f"{capture}.{key}.images", average_precision(in_images, truth), "of 1, without a lift")
         report.add(f"{capture}.{key}.best", best, "IoU")
         for name, cut in cuts.items():

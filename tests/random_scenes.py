@@ -81,6 +81,16 @@ def dense(rows: SparseRows, columns: int) -> Tensor:
     return out
 
 
+def same_evidence(a: Evidence, b: Evidence) -> bool:
+    arrays = ("offsets", "column", "weight")
+    return (
+        torch.equal(a.region_view, b.region_view)
+        and all(torch.equal(getattr(a.rows, name), getattr(b.rows, name)) for name in arrays)
+        and all(torch.equal(getattr(a.unlabeled, name), getattr(b.unlabeled, name)) for name in arrays)
+        and (a.num_views, a.weight_power, a.num_excluded) == (b.num_views, b.weight_power, b.num_excluded)
+    )
+
+
 @dataclass
 class Photographs:
     """Images of noise from cameras."""

@@ -16,7 +16,7 @@ from normlift_ns.evidence_collection import RasterConfig, ViewBatch, batch_evide
 from normlift_ns.options import BackendName
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.segmentation.regions import Superpixels
-from tests.random_scenes import Photographs, made_scene, orbit_camera, random_scene
+from tests.random_scenes import Photographs, made_scene, orbit_camera, random_scene, same_evidence
 
 ALL = tuple(range(11))
 OLD = (0, 2, 3, 5, 6, 7, 9, 10)
@@ -67,11 +67,7 @@ def test_more_views_cost_only_the_new_ones(worked: dict[str, int], tmp_path: Pat
     for found, numbers in ((more, ALL), (again, ALL), (fewer, OLD[::2])):
         expected = lifted(numbers, tmp_path / f"fresh{len(numbers)}").store.evidence
         evidence = found.store.evidence
-        for part in ("rows", "unlabeled"):
-            ours, theirs = getattr(evidence, part), getattr(expected, part)
-            for name in ("offsets", "column", "weight"):
-                assert torch.equal(getattr(ours, name), getattr(theirs, name))
-        assert torch.equal(evidence.region_view, expected.region_view)
+        assert same_evidence(evidence, expected)
         assert evidence.nnz > 50 * len(numbers)
 
 
@@ -91,7 +87,7 @@ def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path:
     found = lifted((2, 1, 3, 1), tmp_path / "cache").store.evidence
     assert worked["rasterized"] == 4
     expected = lifted((2, 1, 3, 1), tmp_path / "fresh").store.evidence
-    assert torch.equal(found.rows.column, expected.rows.column) and torch.equal(found.rows.weight, expected.rows.weight)
+    assert same_evidence(found, expected)
 
 
 def evidence_of(

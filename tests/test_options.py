@@ -134,6 +134,7 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
     for name in ("regions", "features", "crop_fill", "features_missing"):
         for value in ("x", "", 1, None):
             refused(SourceOptions, name, value, "must be one of ")
+    refused(RefineConfig, "vote", "mean", "must be one of ")
     for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "prompt_template"):
         for value in ("a\0b", "a\udc80"):
             refused(SourceOptions, name, value)
@@ -174,8 +175,9 @@ def test_more_neighbours_than_there_are_and_a_reach_that_cannot_be():
         warnings.simplefilter("error")
         kept = clamp_k(RefineConfig(), 6000)
         assert kept == replace(RefineConfig(), **kept.numbers._asdict())  # the defaults in numbers
-    with pytest.raises(InputError, match="k must be at most 1,024, got 100,000"):
-        nearest_neighbors(means, 100_000)
+    for k, message in ((100_000, "k must be at most 1,024, got 100,000"), (0, "k .* 0")):
+        with pytest.raises(InputError, match=message):
+            nearest_neighbors(means, k)
     for max_gap in (math.nan, math.inf, 0.0, -1.0):
         with pytest.raises(InputError, match="object_max_gap must be"):
             connected_components(means, means[:, 0] >= 0, max_gap=max_gap)

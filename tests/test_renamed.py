@@ -1,6 +1,5 @@
 """Options and keywords by their names of version 0.2, which work for one version."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -151,13 +150,3 @@ def test_manifests_and_keys_of_version_0_2_stay_valid(tmp_path):
     )
     typed += " --eval-images 0.1 --gsplat-version 1.5 --check-alignment False --prompt-template {}"
     assert _capture_key(parse_flags(NormLift, typed.split())) == "495e8479442da25a"  # of version 0.2
-
-
-def test_the_encoder_color_has_two_names():
-    color, colour = (make_encoder(SourceOptions(encoder=name)) for name in ("color", "colour"))
-    assert color.identity == colour.identity == {"kind": "colour", "sigma": 30.0}
-    with pytest.raises(InputError, match="unknown encoder 'purple'; --encoder is one of color, imagenet, metaclip2"):
-        make_encoder(SourceOptions(encoder="purple"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert SourceOptions(encoder="colour").encoder == "colour"

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, InputError, lift
+from normlift_ns import Evidence, InputError
 from normlift_ns.analysis.explain import Why, draw_outlines, explain_selection
 from normlift_ns.core.evidence import Entries
 from tests.examples import examples
@@ -71,15 +71,6 @@ def test_votes_are_the_sums_that_the_module_says(seed, share, copies):
         for vote in why.most_different:
             expected = length[vote.view] * (1 - vote.agreement) / length.sum() / lost
             assert vote.disagreement == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_selection_of_one_is_that_gaussian():
-    evidence, features, _ = votes(3)
-    scalars = lift(evidence, features).scalars
-    for j in range(N):
-        why = explain_selection(evidence, features, torch.arange(N) == j)
-        for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability"):
-            assert getattr(why, name) == pytest.approx(float(getattr(scalars, name)[j]), abs=1e-6), name
 
 
 def test_unlabelled_pixels_dilute_where_they_did_in_the_lift():

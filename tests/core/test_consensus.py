@@ -96,47 +96,12 @@ def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torc
 def test_equals_the_formula(seed, power, levels):
     for evidence, of in ((things(seed, gaussians=25), levels), (random_evidence(20, VIEWS, seed), 1)):
         features = unit_rows(evidence.num_regions, 6, seed)
+        features[seed % 3 :: 5] = 0
         level = torch.arange(evidence.num_regions) % of
         found = consensus(evidence, features, level=level, power=power)
         assert torch.allclose(found.features, oracle(evidence, features, power, level), rtol=0, atol=1e-12)
         if power == 1 and of == 1:
             assert torch.equal(consensus(evidence, features).features, found.features)  # that is the default
-
-
-@given(seed=SEEDS)
-def test_overlaps_are_symmetric_shares_and_rows_unit_or_zero(seed):
-    evidence, view = things(seed), things(seed).region_view
-    iou, inside, agreement = region_overlaps(evidence.rows, view)
-    table = dense(iou, evidence.num_regions)
-    assert torch.equal(table, table.T)
-    assert bool(((iou.weight >= 0.1) & (iou.weight <= 1) & (inside >= iou.weight - 1e-12) & (inside <= 1)).all())
-    assert bool((table[view[:, None] == view] == 0).all())
-    assert 0 < agreement <= 1
-    features = unit_rows(evidence.num_regions, 7, seed, torch.float32)
-    features[::4] = 0
-    found = consensus(evidence, features).features
-    assert found.dtype == torch.float32
-    assert torch.equal(found[::4], features[::4])
-    kept = torch.arange(len(found)) % 4 != 0
-    assert torch.allclose(found[kept].norm(dim=1), torch.ones(int(kept.sum())), atol=1e-6)
-
-
-@examples(5)
-@given(seed=SEEDS, views=st.permutations(range(5)))
-def test_order_does_not_matter(seed, views):
-    evidence = things(seed)
-    features = unit_rows(evidence.num_regions, 6, seed)
-    found = consensus(evidence, features).features
-    columns = evidence.columns_of(list(views))
-    turned = consensus(evidence.select_views(list(views)), features[columns]).features
-    assert torch.allclose(turned, found[columns], rtol=0, atol=1e-12)
-    shuffled = evidence.rows.select_rows(torch.randperm(len(evidence.rows), generator=generator(seed)))
-    assert torch.allclose(consensus(replace(evidence, rows=shuffled), features).features, found, rtol=0, atol=1e-12)
-    within = torch.cat([4 * v + torch.randperm(4, generator=generator(seed + v)) for v in range(5)])
-    weight = dense(evidence.rows, 20)[:, within]
-    assert torch.allclose(
-        consensus(of_dense(weight, [4] * 5), features[within]).features, found[within], rtol=0, atol=1e-12
-    )
 
 
 def test_a_region_that_overlaps_nothing_keeps_its_feature():
@@ -321,13 +286,3 @@ def test_refusals(unchecked):
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_gpu_equals_cpu():
-    evidence = large(2000, 50_000, 40)
-    features = unit_rows(2000, 64, 0, torch.float32)
-    here, there = consensus(evidence, features), consensus(evidence.to("cuda"), features.cuda())
-    assert here.gaussians == there.gaussians
-    assert there.agreement[0] == pytest.approx(here.agreement[0], abs=1e-5)
-    assert torch.allclose(there.features.cpu(), here.features, atol=1e-4)

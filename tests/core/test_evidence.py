@@ -7,23 +7,21 @@ from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift, rasterize_evidence
 from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
-from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.base import joint_partition
 from tests.examples import examples
-from tests.random_scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
+from tests.random_scenes import (
+    dense,
+    generator,
+    orbit,
+    random_evidence,
+    random_labels,
+    random_scene,
+    same_evidence,
+    unit_rows,
+)
 
 VIEWS = [3, 0, 1, 5, 2]
 SEEDS = st.integers(0, 2**31)
-
-
-def same(a: Evidence, b: Evidence) -> bool:
-    arrays = ("offsets", "column", "weight")
-    return (
-        torch.equal(a.region_view, b.region_view)
-        and all(torch.equal(getattr(a.rows, name), getattr(b.rows, name)) for name in arrays)
-        and all(torch.equal(getattr(a.unlabeled, name), getattr(b.unlabeled, name)) for name in arrays)
-        and (a.num_views, a.weight_power, a.num_excluded) == (b.num_views, b.weight_power, b.num_excluded)
-    )
 
 
 @given(seed=SEEDS)
@@ -47,7 +45,7 @@ def test_views_are_selected_in_the_order_asked_and_shards_give_the_whole(seed, v
     assert torch.equal(dense(part.unlabeled, keep), dense(evidence.unlabeled, 5)[:, chosen])
     assert part.region_view.tolist() == [i for i, v in enumerate(chosen) for _ in range(VIEWS[v])]
     shards = [evidence.select_views(range(keep)), evidence.select_views(range(keep, 5))]
-    assert same(Evidence.merge(*shards), evidence) and same(Evidence.merge(evidence), evidence)
+    assert same_evidence(Evidence.merge(*shards), evidence) and same_evidence(Evidence.merge(evidence), evidence)
 
 
 @given(seed=SEEDS)
@@ -71,7 +69,7 @@ def test_regrouping_adds_up_columns(seed):
     assert torch.allclose(dense(regrouped.rows, 7), expected, rtol=1e-14, atol=0)
     assert torch.allclose(dense(regrouped.unlabeled, 5), blank, rtol=1e-14, atol=0)
     assert torch.equal(regrouped.region_view, region_view)
-    assert same(evidence.regroup(columns, region_view), regrouped)
+    assert same_evidence(evidence.regroup(columns, region_view), regrouped)
 
 
 def test_regrouping_columns_into_themselves_changes_nothing():
@@ -140,37 +138,15 @@ def test_cells_give_the_evidence_of_every_level(power, dtype, seed):
         assert found.rows.weight.dtype == alone.rows.weight.dtype == dtype
 
 
-def test_save_and_load_are_exact_and_name_the_file(tmp_path):
+def test_save_and_load_are_exact(tmp_path):
     path = tmp_path / "e.safetensors"
     with pytest.raises(FileNotFoundError):
         Evidence.load(path)
     for dtype in (torch.float32, torch.float64):
         evidence = random_evidence(15, VIEWS, 3, dtype=dtype)
         evidence.save(path)
-        assert same(Evidence.load(path), evidence)
+        assert same_evidence(Evidence.load(path), evidence)
         assert list(tmp_path.iterdir()) == [path]
-    for content in (b"no tensors", path.read_bytes()[:-40]):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"e\.safetensors is damaged"):
-            Evidence.load(path)
-
-
-def test_from_entries_keeps_unlabelled_weight_apart():
-    g = torch.tensor([0, 0, 2])
-    one = Entries(g, torch.tensor([0, 2, 1]), torch.tensor([0.5, 1.0, 2.0]), (2,))
-    two = Entries(torch.tensor([1, 2]), torch.tensor([1, 0]), torch.tensor([3.0, 4.0]), (1,))
-    evidence = Evidence.from_entries([one, two], 3)
-    assert dense(evidence.rows, 3).tolist() == [[0, 1, 0], [0, 0, 3], [2, 0, 0]]
-    assert dense(evidence.unlabeled, 2).tolist() == [[0.5, 0], [0, 0], [0, 4]]
-
-
-@given(seed=SEEDS)
-def test_sums_of_duplicates_do_not_depend_on_order_beyond_rounding(seed):
-    g = generator(seed)
-    row, column = torch.randint(0, 5, (60,), generator=g), torch.randint(0, 4, (60,), generator=g)
-    weight = torch.rand(60, generator=g, dtype=torch.float64)
-    expected = torch.zeros(5, 4, dtype=torch.float64).index_put_((row, column), weight, accumulate=True)
-    assert torch.allclose(dense(SparseRows.from_coo(row, column, weight, 5), 4), expected, rtol=1e-14)
 
 
 @st.composite
@@ -199,9 +175,3 @@ def test_both_ways_to_join_give_the_same_matrices(case):
     assert evidence.region_view.tolist() == [v for v, count in enumerate(counts) for _ in range(count)]
     total = sum(float(part.weight.sum()) for part in parts)
     assert float(evidence.rows.weight.sum() + evidence.unlabeled.weight.sum()) == total
-
-
-def test_no_view_at_all():
-    evidence = Evidence.from_entries([], 3)
-    assert evidence.rows.row_sums().tolist() == [0.0, 0.0, 0.0]
-    assert evidence.region_view.dtype == torch.int32

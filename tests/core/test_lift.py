@@ -1,4 +1,4 @@
-"""The lift against its definition, its identities, and the cases that break floating point."""
+"""The lift against its definition and its identities; tests/test_numerics.py has what breaks floating point."""
 
 import math
 from dataclasses import replace
@@ -35,6 +35,8 @@ def test_equals_the_definition(seed, unlabeled, beta):
     lifted = lift(evidence, features, beta=beta, unlabeled=unlabeled)
     matrix, blank = dense(evidence.rows, S), dense(evidence.unlabeled, 5)
     directions, views = lifted.directions(), [evidence.region_view == v for v in range(5)]
+    some = torch.randperm(25, generator=generator(seed))[:7]
+    assert torch.equal(lifted.directions(some), directions[some])
     for j in range(25):
         s_jv = [matrix[j, view] @ features[view] for view in views]
         w_jv = [matrix[j, view].sum() + (blank[j, v] if unlabeled == "dilute" else 0) for v, view in enumerate(views)]
@@ -80,33 +82,6 @@ def test_identities(seed):
     assert torch.allclose(value, lifted.scalars.weight * lifted.scalars.norm, rtol=1e-10, atol=1e-12)
 
 
-@examples(5)
-@given(seed=SEEDS, scale=st.floats(1e-3, 1e3), cut=st.integers(1, 4))
-def test_invariances(seed, scale, cut):
-    """Order of views, shards, subsets of Gaussians, a common scale of all weights, rotation of the feature space."""
-    evidence, features = random_evidence(25, VIEWS, seed), unit_rows(S, D, seed)
-    lifted, directions = lift(evidence, features), lift(evidence, features).directions()
-
-    order = torch.randperm(5, generator=generator(seed)).tolist()
-    shuffled = lift(evidence.select_views(order), features[evidence.columns_of(order)])
-    shards = Evidence.merge(evidence.select_views(range(cut)), evidence.select_views(range(cut, 5)))
-    scaled = replace(evidence, rows=replace(evidence.rows, weight=evidence.rows.weight * scale))
-    for other in (shuffled, lift(shards, features), lift(scaled, features)):
-        for name in STATISTICS[:-1]:
-            assert torch.allclose(
-                getattr(other.scalars, name), getattr(lifted.scalars, name), rtol=1e-10, atol=1e-12
-            ), name
-        assert (other.directions() - directions).abs().max() < 1e-10
-
-    rotation = torch.linalg.qr(torch.randn(D, D, generator=generator(seed), dtype=torch.float64)).Q
-    turned = lift(evidence, features @ rotation)
-    assert torch.allclose(turned.scalars.reliability, lifted.scalars.reliability, rtol=1e-9, atol=1e-12)
-    assert (turned.directions() - directions @ rotation).abs().max() < 1e-9
-
-    some = torch.randperm(25, generator=generator(seed))[:7]
-    assert torch.equal(lifted.directions(some), directions[some])
-
-
 def test_chunks_do_not_change_directions(monkeypatch):
     evidence, features = random_evidence(40, VIEWS, 0, dtype=torch.float32), unit_rows(S, D, 0, torch.float32)
     whole = lift(evidence, features)
@@ -134,53 +109,6 @@ def test_cases_worked_by_hand():
     single = lift(evidence_of([[1.0, 3.0]], [0, 0]), unit_rows(2, D, 0))
     norm = float((u + 3 * v).norm() / 4)
     assert told(single, "n_eff", "c_inter", "norm", "reliability") == pytest.approx([1, 1, norm, norm / 2])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_observations_that_cancel_exactly_have_no_direction(dtype):
-    u = unit_rows(1, D, 0, dtype)
-    lifted = lift(evidence_of([[1, 1], [0, 0], [1, 0]], [0, 1], dtype), torch.cat([u, -u]))
-    for name in STATISTICS[:5]:
-        values = getattr(lifted.scalars, name)
-        assert values[:2].tolist() == [0, 0]
-        assert values[2] > 0
-    assert lifted.scalars.view_count.tolist() == [2, 0, 1]
-    assert lifted.directions()[:2].abs().max() == 0
-
-
-@pytest.mark.parametrize(("gap", "same_view"), [(1e-1, True), (1e-3, False), (1e-4, True), (1e-5, True), (1e-5, False)])
-def test_observations_that_nearly_cancel_keep_their_digits(gap, same_view):
-    """float32 features half turned against each other by all but `gap`: norm and direction as float64 gives them for
-    the same numbers.
-    """
-    g = generator(1)
-    features = torch.nn.functional.normalize(torch.randn(1, 512, generator=g).double(), dim=1)
-    other = torch.nn.functional.normalize(-features + gap * torch.randn(1, 512, generator=g).double() / 512**0.5, dim=1)
-    table = torch.cat([features, other]).float()
-    views = [0, 0] if same_view else [0, 1]
-    single = lift(evidence_of([[1.0, 1.0]], views, torch.float32), table)
-    exact = lift(evidence_of([[1.0, 1.0]], views), single.features.double())
-    assert exact.scalars.norm.item() == pytest.approx(gap / 2, rel=0.1)
-    # Renormalising float32 rows in float64 moves them by 6e-8, the resolution that a float32 table has.
-    assert single.scalars.norm.item() == pytest.approx(exact.scalars.norm.item(), abs=1e-7)
-    assert (single.directions().double() - exact.directions()).norm() < 2e-7 / gap
-    assert single.scalars.c_intra.item() * single.scalars.c_inter.item() == pytest.approx(
-        single.scalars.norm.item(), rel=1e-5
-    )
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_weights_from_1e_minus_12_to_1e6(dtype):
-    """Rows of tiny weights next to rows of huge ones, and both in one sum."""
-    features = unit_rows(3, D, 0, dtype)
-    matrix = [[1e-12, 2e-12, 0], [1e6, 1e-12, 3.0], [1e-12, 2e-12, 1e-12], [1e6, 1e6, 1e6]]
-    lifted = lift(evidence_of(matrix, [0, 1, 2], dtype), features)
-    exact = lift(evidence_of(matrix, [0, 1, 2]), features.double())
-    for name in STATISTICS:
-        assert torch.allclose(
-            getattr(lifted.scalars, name).double(), getattr(exact.scalars, name).double(), rtol=1e-6
-        ), name
-    assert lifted.scalars.norm[0].item() == pytest.approx(((features[0] + 2 * features[1]) / 3).norm().item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -81,11 +81,6 @@ def test_many_coincident_points_stay_cheap():
     assert found.index[20_004].tolist() == [20_000, 20_001, 20_002, 20_003]
 
 
-def test_k_must_be_positive():
-    with pytest.raises(ValueError, match=r"k .* 0"):
-        nearest_neighbors(torch.zeros(3, 3), 0)
-
-
 def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
     means, told = lattice(), []
     whole = nearest_neighbors(means, 7)

@@ -22,7 +22,7 @@ from normlift_ns.options import Storage
 from normlift_ns.pipeline import vote_directions
 from normlift_ns.progress import StageTimer
 from tests.distributed.threads import Threads, together
-from tests.random_scenes import generator, random_evidence, unit_rows
+from tests.random_scenes import generator, random_evidence, same_evidence, unit_rows
 
 N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
 
@@ -71,11 +71,7 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
         return redistribute_evidence(pieces, portion, len(chunks)), portion.indices
 
     for found, gaussians in together(size, work):
-        expected = evidence.select_gaussians(gaussians)
-        assert torch.equal(found.region_view, expected.region_view)
-        assert found.num_views == expected.num_views
-        for a, b in ((found.rows, expected.rows), (found.unlabeled, expected.unlabeled)):
-            assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("offsets", "column", "weight"))
+        assert same_evidence(found, evidence.select_gaussians(gaussians))
 
 
 def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:

@@ -216,30 +216,6 @@ def test_refine_with_kernels_gives_one_answer_however_directions_are_given(monke
     assert lost.tolist() == [False] * 35 + [True] * 10
 
 
-@pytest.mark.parametrize("kind", ["paper", "posterior"])
-@pytest.mark.parametrize(("n", "k", "dimension"), [(30, 12, 70), pytest.param(20, 36, 33, marks=pytest.mark.extra)])
-def test_equals_the_plain_vote(n, k, dimension, kind):
-    g = generator(n)
-    means = torch.randn(n, 3, generator=g)
-    classes = unit_rows(4, dimension, 1, torch.float32)[torch.randint(0, 4, (n,), generator=g)]
-    directions = torch.nn.functional.normalize(classes + 0.03 * torch.randn(n, dimension, generator=g), dim=1)
-    reliability = torch.rand(n, generator=g)
-    directions[:6], reliability[:6] = 0.0, 0.0
-    means[6:9] *= 30
-    config, own = RefineConfig(vote=kind, k=k, delta=0.02), own_evidence(reliability)
-    neighbors = nearest_neighbors(means, k)
-    expected = refine(means, directions, reliability, config, own=own, neighbors=neighbors)
-    # voters in two calls, directions in another order
-    perm = torch.randperm(n, generator=g)
-    source = torch.arange(n, dtype=torch.int32).to(DEVICE)
-    for voters in spatial_order(means).split(n // 2 + 1):
-        arrays = (voters, neighbors.index, neighbors.distance, directions[perm], perm.argsort().int(), reliability)
-        posterior = {"own": own.to(DEVICE), "prior": config.prior} if kind == "posterior" else {}
-        vote(*(x.to(DEVICE) for x in arrays), source, **numbers(config, neighbors), **posterior)
-    assert (expected != torch.arange(n)).float().mean() > 0.2
-    assert torch.equal(source.cpu(), expected)
-
-
 def test_nothing_changes_where_nobody_is_reliable():
     neighbors = nearest_neighbors(torch.randn(10, 3, generator=generator(0)), 4)
     directions, reliability = unit_rows(10, 16, 0, torch.float32), torch.zeros(10)

@@ -192,23 +192,6 @@ def test_projection_is_that_of_gsplat_bit_for_bit(kind, mode):
 
 
 @needs_gpu
-@pytest.mark.parametrize("rules", ["1.4", "1.5", "1.6"])
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_leaving_cells_out_changes_no_bit_on_a_gpu(rules, mode):
-    scene = random_scene(20_000, seed=3, dtype=torch.float32, size=0.1).to("cuda")
-    cameras = orbit(3, width=333, height=201, focal=300.0)
-    labels = [random_labels(camera, 40, seed=v).cuda() for v, camera in enumerate(cameras)]
-    constants = RasterJob(scene, mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
-    found, whole, again = (
-        triton.views_evidence(constants, RasterBatch(cameras, labels, [40] * 3), cull=cull)
-        for cull in (True, False, True)
-    )
-    for ours, theirs, repeated in zip(found[:3], whole[:3], again[:3]):
-        assert torch.equal(ours, theirs)
-        assert torch.equal(ours, repeated)
-
-
-@needs_gpu
 @needs_shared
 def test_weights_on_the_gpu_are_those_of_gsplat_1_4():
     for path in weight_fixtures():

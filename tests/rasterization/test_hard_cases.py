@@ -1,43 +1,28 @@
-"""Scenes that break rasterizers, each with what must come out."""
+"""Scenes and inputs that break rasterizers, each with what must come out; tests/test_numerics.py has more of them."""
 
 import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence, render
-from tests.examples import examples
-from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene
-
-BACKENDS = ["torch", "numba"]
+from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene, same_evidence
 
 
-def one_gaussian(
-    mean=(0.0, 0.0, 0.0), scale=(0.3, 0.3, 0.3), opacity=0.5, quat=(1.0, 0.0, 0.0, 0.0), dtype=torch.float32
-):
-    rows = (torch.tensor([x], dtype=dtype) for x in (mean, quat, scale))
-    means, quats, scales = rows
-    return GaussianScene(means, quats, scales, torch.tensor([opacity], dtype=dtype))
+@pytest.fixture(params=["torch", "numba"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return request.param
 
 
-def total_weight(scene: GaussianScene, camera: Camera, backend: str, **kwargs) -> torch.Tensor:
+def one_gaussian(scale: float = 0.3, quat=(1.0, 0.0, 0.0, 0.0)) -> GaussianScene:
+    return GaussianScene(torch.zeros(1, 3), torch.tensor([quat]), torch.full((1, 3), scale), torch.tensor([0.5]))
+
+
+def total_weight(scene: GaussianScene, camera: Camera, backend: str) -> torch.Tensor:
     labels = torch.zeros(camera.height, camera.width, dtype=torch.int32)
-    return rasterize_evidence(scene, [camera], [labels], backend=backend, **kwargs).rows.row_sums()
+    return rasterize_evidence(scene, [camera], [labels], backend=backend).rows.row_sums()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_opacity_at_its_ends(backend):
-    """Opacity 0 draws nothing, 1 is capped at 0.999."""
-    pose = orbit_camera(0.0).world_to_camera.float()
-    camera = Camera(torch.tensor([[40.0, 0, 16.5], [0, 40, 16.5], [0, 0, 1]]), pose, 32, 32)
-    for opacity, peak in ((0.0, 0.0), (1 / 256, 0.0), (1 / 254, 1 / 254), (0.999, 0.999), (1.0, 0.999)):
-        _, alpha = render(one_gaussian(opacity=opacity), camera, torch.ones(1, 1), backend=backend)
-        assert alpha.max().item() == pytest.approx(peak, abs=1e-6), opacity
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_non_finite_gaussians_are_counted_and_not_drawn(backend):
     camera, names = orbit_camera(0.5), ("means", "quats", "scales", "opacities")
     labels = [random_labels(camera, 3)]
@@ -55,50 +40,13 @@ def test_non_finite_gaussians_are_counted_and_not_drawn(backend):
         assert total_weight(one_gaussian(quat=(0.0, 0, 0, 0)), camera, backend).tolist() == [0]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_needles_pancakes_and_points(backend):
-    """float32 stays within 1 % of float64, or within what rounding a needle's exponent allows: never NaN."""
-    camera, quat = orbit_camera(0.7, width=64, height=48), (0.9, 0.2, -0.3, 0.1)
-    for scale in ((3.0, 1e-6, 1e-6), (1e-9, 1e-9, 1e-9), (2.0, 2.0, 1e-7), (0.0, 0.0, 0.0), (50.0, 1e-8, 0.5)):
-        exact = total_weight(one_gaussian(scale=scale, quat=quat, dtype=torch.float64), camera, backend)
-        single = total_weight(one_gaussian(scale=scale, quat=quat), camera, backend)
-        assert exact.isfinite().all() and exact.item() > 0.1, scale
-        assert single.item() == pytest.approx(exact.item(), rel=1e-2), scale
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_near_plane_giants_and_images_of_any_size(backend):
-    """Behind the camera nothing is drawn; a huge Gaussian covers every pixel with its opacity, until float32 overflows:
-    then it is not drawn.
-    """
-    camera = orbit_camera(0.0, distance=0.0)
-    for z, drawn in ((-1.0, False), (0.0, False), (0.00999, False), (0.0101, True), (1.0, True), (2e10, False)):
-        weight = total_weight(one_gaussian(mean=(0.0, 0.0, z), scale=(1e-3, 1e-3, 1e-3)), camera, backend)
-        assert weight.isfinite().all() and bool(weight[0] > 0) == drawn, z
-    camera = orbit_camera(0.0)
-    for scale in (100.0, 1e6, 1e12, 1e20):
-        weight = total_weight(one_gaussian(scale=(scale,) * 3, opacity=0.25), camera, backend).item()
-        expected = 0.25 * camera.width * camera.height
-        assert weight == pytest.approx(expected, rel=1e-3) or (scale >= 1e12 and weight == 0), scale
+def test_a_giant_covers_images_of_any_size(backend):
     for width, height in ((1, 1), (15, 17), (16, 16), (17, 15), (33, 1), (1, 40)):
         camera = orbit_camera(0.2, width=width, height=height, focal=10.0)
-        weight = total_weight(one_gaussian(scale=(1e3,) * 3, opacity=0.5), camera, backend).item()
+        weight = total_weight(one_gaussian(scale=1e3), camera, backend).item()
         assert weight == pytest.approx(0.5 * width * height, rel=1e-3), (width, height)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_stack_stops_at_the_transmittance_limit(backend):
-    """40 sheets of opacity 0.5 straight ahead: the 14th would leave 2 ** -14 < 1e-4 and is not drawn."""
-    means = torch.stack([torch.zeros(40), torch.zeros(40), torch.linspace(0, 1, 40)], 1)
-    scene = GaussianScene(
-        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), torch.full((40, 3), 1e3), torch.full((40,), 0.5)
-    )
-    weight = total_weight(scene, orbit_camera(0.0, width=8, height=8), backend) / 64
-    assert weight[:13].tolist() == pytest.approx([0.5 ** (i + 1) for i in range(13)], rel=1e-3)
-    assert weight[13:].tolist() == [0] * 27
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_views_without_regions_and_regions_without_pixels(backend):
     scene, cameras = random_scene(30, size=0.4), orbit(3)
     blank = torch.full((cameras[0].height, cameras[0].width), -1, dtype=torch.int32)
@@ -117,7 +65,6 @@ def test_views_without_regions_and_regions_without_pixels(backend):
     assert (nobody.num_gaussians, nobody.num_views, nobody.nnz) == (0, 1, 0)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_masked_pixels_are_no_observation(backend):
     scene, camera = random_scene(40, size=0.4), orbit_camera(0.0)
     labels = random_labels(camera, 3)
@@ -136,7 +83,6 @@ def test_masked_pixels_are_no_observation(backend):
     assert (nothing.nnz, nothing.unlabeled.weight.numel(), nothing.num_regions) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_thousands_of_regions(backend):
     scene, camera = random_scene(40, size=0.4), orbit_camera(0.0, width=80, height=70)
     labels = torch.randperm(80 * 70, generator=torch.Generator().manual_seed(0)).view(70, 80).int() - 600
@@ -148,24 +94,6 @@ def test_thousands_of_regions(backend):
     assert torch.allclose(parts, whole, rtol=1e-12, atol=0)
 
 
-@examples(5)
-@given(seed=st.integers(0, 2**31))
-def test_backends_agree_and_float32_is_near_float64(seed):
-    scene = random_scene(80, seed=seed, dtype=torch.float32, size=0.5)
-    cameras = orbit(2)
-    labels = [random_labels(camera, 5, seed=seed) for camera in cameras]
-
-    def matrix(backend: str, dtype: torch.dtype) -> torch.Tensor:
-        evidence = rasterize_evidence(scene, cameras, labels, backend=backend, dtype=dtype, num_regions=[5, 5])
-        return dense(evidence.rows, 10)
-
-    exact = matrix("torch", torch.float64)
-    assert (matrix("numba", torch.float64) - exact).abs().max() < 1e-11
-    assert (matrix("numba", torch.float32) - exact).norm() < 1e-4 * exact.norm()
-    assert (matrix("torch", torch.float32) - exact).norm() < 1e-4 * exact.norm()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_bitwise_equal_between_runs_and_shards_whatever_the_order_and_progress_is_told(backend):
     scene = random_scene(300, seed=7, dtype=torch.float32, size=0.4)
     cameras = orbit(4)
@@ -178,10 +106,7 @@ def test_bitwise_equal_between_runs_and_shards_whatever_the_order_and_progress_i
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4), (1, None), (2, None), (3, None), (4, None)]
     shards = [rasterize_evidence(scene, [c], [x], num_regions=[4], backend=backend) for c, x in zip(cameras, labels)]
     for other in (again, Evidence.merge(*shards)):
-        for name in ("offsets", "column", "weight"):
-            assert torch.equal(getattr(whole.rows, name), getattr(other.rows, name))
-        assert torch.equal(whole.region_view, other.region_view)
-        assert torch.equal(whole.unlabeled.weight, other.unlabeled.weight)
+        assert same_evidence(whole, other)
 
     order = torch.randperm(300, generator=torch.Generator().manual_seed(1))
     shuffled = GaussianScene(*(getattr(scene, name)[order] for name in ("means", "quats", "scales", "opacities")))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns import GaussianScene, rasterize_evidence, render
-from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene
+from normlift_ns import rasterize_evidence, render
+from tests.random_scenes import dense, orbit, random_labels, random_scene
 from tests.rasterization.oracle import compositing_matrix
 
 BACKENDS = ["torch", "numba"]
@@ -44,27 +44,3 @@ def test_evidence_and_pictures_equal_the_python_loops(mode):
             image, alpha = render(scene, cameras[view], values, **how)
             assert (image - matrix @ values).abs().max() < 1e-12
             assert (alpha - matrix.sum(-1)).abs().max() < 1e-12
-
-
-def test_pixels_as_regions_give_the_matrix_itself():
-    scene, camera = random_scene(30, seed=3, size=0.5), orbit_camera(0.3, width=18, height=17)
-    labels = torch.arange(18 * 17, dtype=torch.int32).view(17, 18)
-    expected = torch.from_numpy(compositing_matrix(scene, camera)).view(-1, 30).T
-    for backend in BACKENDS:
-        evidence = rasterize_evidence(scene, [camera], [labels], backend=backend)
-        assert (dense(evidence.rows, 306) - expected).abs().max() < 1e-13
-
-
-def test_equal_depths_are_drawn_by_index():
-    """Two Gaussians at the same place: the first one hides the second."""
-    scene = GaussianScene(
-        torch.zeros(2, 3),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
-        torch.full((2, 3), 0.5),
-        torch.tensor([0.9, 0.9]),
-    )
-    camera = orbit_camera(0.0)
-    labels = torch.zeros(camera.height, camera.width, dtype=torch.int32)
-    for backend in BACKENDS:
-        first, second = rasterize_evidence(scene, [camera], [labels], backend=backend).rows.row_sums().tolist()
-        assert first > 1.5 * second

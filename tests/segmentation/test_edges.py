@@ -12,10 +12,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import label
 
 from normlift_ns.cli.preflight import check_source_options
-from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.build import make_source
-from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.package_files import EDGES
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.edges import (
@@ -116,17 +113,6 @@ def test_regions_of_images_of_any_size():
     assert found == list(EDGE_COUNTS)
     few = tiny_regions(count=77).labels(image, "a.png")
     assert len(few) == 1 and int(few.max()) == 76
-
-
-@pytest.mark.parametrize("encoder", ["clip", "colour"])
-def test_encoders_describe_every_region(encoder, request, tmp_path):
-    encoder = ColorEncoder() if encoder == "colour" else request.getfixturevalue(encoder)
-    source, image = RegionFeatures(tiny_regions(), encoder), noise(40, 60)
-    view, maps = source.view(image, "a.png"), tiny_regions().labels(image, "a.png")
-    assert torch.equal(view.region_of_cell[0][view.labels.long()], maps[1, 0])
-    assert len(view.features) == int(maps[1].max()) + 1 > 20
-    again = cached(source, tmp_path).view(image, "a.png")
-    assert torch.equal(again.labels, view.labels) and torch.equal(again.features, view.features)
 
 
 def test_options_choose_a_level_or_a_number(monkeypatch, tmp_path):
