@@ -295,7 +295,8 @@ def test_clicks_are_armed_cancelled_and_asked_again(crowd, run):
     page.says("one prompt")
     page.press("Link")
     page.until(lambda: page.link != "")
-    assert (link := read_link(page.link)) is not None and link.clicks == {"like click 1": BLOCK + 7}  # the uppermost
+    link = read_link(page.link)
+    assert link is not None and link.clicks == {"like click 1": BLOCK + 7}  # the uppermost
     again = opened(crowd, 1, "another")
     again.until(lambda: again.gui["Prompts"].value == "like click 1")
     again.press("Ask")
@@ -367,8 +368,8 @@ def test_a_link_carries_question_and_camera(crowd):
     page.camera.position = np.array([1.0, 2, 3])
     page.press("Link")
     page.until(lambda: page.link != "")
-    assert (link := read_link(page.link)) is not None
-    assert (link.prompts, link.threshold, link.look) == ("red, blue", 0.25, "overlay")
+    link = read_link(page.link)
+    assert link is not None and (link.prompts, link.threshold, link.look) == ("red, blue", 0.25, "overlay")
     other = opened(crowd, 1, "two", page.link)
     other.selects(3 * BLOCK)
     np.testing.assert_allclose(other.camera.position, [1, 2, 3])
