@@ -19,7 +19,6 @@ from normlift_ns.data.nerfstudio.config import read_trainer_config
 from normlift_ns.encoders.registry import make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import read_manifest, write_manifest
-from normlift_ns.method_configs import entry
 from normlift_ns.options import VOTE_FLAGS, AskOptions, LiftOptions, SourceOptions, SplatOptions, _print_renamed
 from normlift_ns.query.text_encoder import encoder_settings, text_encoder_for
 
@@ -100,6 +99,8 @@ def test_functions_have_old_keywords():
 
 
 def test_ns_train_has_old_options_of_our_methods(capsys):
+    from normlift_ns.method_configs import entry  # noqa: PLC0415
+
     _print_renamed.cache_clear()
     old = [
         "normlift",
@@ -111,10 +112,8 @@ def test_ns_train_has_old_options_of_our_methods(capsys):
     ]
     new = [*old[:1], "--pipeline.lift.reliability-beta", "2", "--pipeline.source.prompt-template=a {}", *old[4:]]
     assert entry._rename_flags(["/bin/ns-train", *old]) == ["/bin/ns-train", *new]
-    assert [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()] == [
-        old[1],
-        old[3].partition("=")[0],
-    ]
+    renamed = [line.partition(" is now ")[0] for line in capsys.readouterr().err.splitlines()]
+    assert renamed == [old[1], old[3].partition("=")[0]]
     for others in (["/bin/ns-viewer", *old], ["/bin/ns-train", "splatfacto", *old[1:]], ["ns-train"], []):
         assert entry._rename_flags(others) == others
 

@@ -67,6 +67,7 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, tmp_pa
 
     page.page.get_by_text("Box", exact=True).click()
     page.press("Around")
+    page.until(lambda: page.typed("Size") != "1", "the box is around the ball")  # Outside reads it
     page.press("Outside")
     page.selects(lambda count: count == 0, "cut")
     page.press("None")

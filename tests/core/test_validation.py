@@ -8,7 +8,6 @@ import torch
 
 from normlift_ns import Evidence, RefineConfig, consensus, lift, refine
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.lift import check_unit_rows
 from tests.random_scenes import generator, unit_rows
 
 EVIDENCE = Evidence.from_entries(
@@ -81,8 +80,3 @@ def test_a_vote_of_nobody_says_so():
         with pytest.warns(UserWarning, match=f"with {n} Gaussian"):
             source = refine(torch.zeros(n, 3), torch.ones(n, 1), torch.ones(n), own=torch.ones(n))
         assert source.tolist() == list(range(n))
-
-
-def test_half_precision_rows_are_unit_rows():
-    rows = unit_rows(500, 300, seed=4).half()
-    assert (check_unit_rows(rows, "rows", "") - 1).abs().max() < 1e-3

@@ -246,12 +246,10 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
     seen = coverage.view_weights(drawn, [pose.camera, aslant]).select_rows(torch.arange(SIDE * SIDE, 2 * SIDE * SIDE))
     whole, slanted = (float(seen.weight[seen.column == view].sum()) for view in (0, 1))
-    assert whole > 0.05  # share of the picture
-    assert whole > 0.5 * slanted
+    assert whole > max(0.05, 0.5 * slanted)  # shares of the picture
     eye = pose.camera.camera_to_world()[:3, 3]
     assert float(eye[0]) > 0.3  # not in the wall, nor behind it
-    assert pose.regions[0] == 1
-    assert pose.shown >= 0.3
+    assert pose.regions[0] == 1 and pose.shown >= 0.3
     assert found.poses[0].gain >= found.poses[-1].gain > 0
     assert found.pictures[0].image.shape[:2] == found.pictures[0].reliability.shape
     height, width = found.pictures[0].reliability.shape

@@ -22,7 +22,6 @@ from plyfile import PlyData
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.exports import TrainedSplat
-from normlift_ns.nerfstudio_plugin.panel import prompt_table
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, load_query
@@ -192,7 +191,7 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert list(outputs(pipeline))[4:7] == ["relevancy_left", "relevancy_right", "reliability"]
     assert torch.equal(chosen(pipeline), both.any(dim=1))
     best = panel.answer.relevancy[panel.answer.valid].amax(dim=0).tolist()
-    rows = [[cell.strip() for cell in line.split("|")] for line in prompt_table(panel.state).splitlines()[-2:]]
+    rows = [[cell.strip() for cell in line.split("|")] for line in widgets.prompt_table.content.splitlines()[-2:]]
     expected = [(text, str(int(n)), f"{peak:.2f}") for text, n, peak in zip(panel.answer.texts, both.sum(dim=0), best)]
     assert [(row[2], row[3], row[4]) for row in rows] == expected
     widgets.shown.value = "2: right"
