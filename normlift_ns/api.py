@@ -388,7 +388,7 @@ def write_run(
         if text_embeddings:
             write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, text_embeddings)
         files = [stored, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")]
-        field.save(field_dir, beside=run_file_digests(field_dir, files))
+        field.save(field_dir, beside=run_file_digests(field_dir, files), own=True)
         if question is not None:
             save_query(field_dir, question)
         for path in (run_dir,) if exact_name else numbered_paths(run_dir):

@@ -107,6 +107,7 @@ class LiftedRun:
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
     @renamed(rule="relevancy")
+    @check_arguments
     def ask(
         self,
         *texts: str,
@@ -131,8 +132,6 @@ class LiftedRun:
         Raises:
             ValueError: there is no prompt, a prompt is empty, or the encoder does not understand one.
         """
-        if not all(isinstance(text, str) for text in texts):
-            raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
         question = make_query(
             self.field,
             self.texts.rows,
@@ -150,6 +149,7 @@ class LiftedRun:
         question = load_query(self.folder / FIELD_FOLDER)
         return None if question is None else run_query(self.field, self.scene.gaussians.means, question)
 
+    @check_arguments
     def save(self, question: Query | Answer) -> Path:
         """Store a question in the run, replacing an earlier one. ns-render and ns-viewer draw its answer.
 
@@ -157,8 +157,6 @@ class LiftedRun:
             ValueError: the vectors have another length than the field's directions.
         """
         question = question.question if isinstance(question, Answer) else question
-        if not isinstance(question, Query):
-            raise InputError(f"save takes an answer from this run or its question, got {type(question).__name__}")
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
                 f"the question has vectors of {question.embeddings.shape[1]} numbers, but the features of "
@@ -313,6 +311,7 @@ class LiftedRun:
         """
         return RecordedVotes(self.scene, self.field, cache_folder(self.folder))
 
+    @check_arguments
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
         """Explain a selection: which images and regions voted for it, and how far they agree.
 

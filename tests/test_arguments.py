@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,34 @@ GRAY, NO = torch.zeros(16, 16, 3, dtype=torch.uint8), torch.zeros(N, dtype=torch
 MANY = torch.arange(N)
 OPTIONS = {nl.LiftOptions, nl.RefineConfig, nl.SourceOptions, nl.SplatOptions}
 Row = tuple[Callable[..., Any], dict[str, tuple[str, Any]]]
+PART = {"part": ("bool n", NO)}
+METHODS: list[Row] = [
+    (nl.LiftedRun.ask, {"negatives": ("texts|None", None), "relevancy": ("word", "auto"),
+                        "threshold": ("number|word|None", None), "min_reliability": ("number", 0.0),
+                        "refined": ("bool", True)}),
+    (nl.LiftedRun.save, {"question": ("Answer", None)}),
+    (nl.LiftedRun.export, {"path": ("path", "a.ply"), "part": ("bool n|None", None), "answer": ("Answer|None", None),
+                           "objects": ("dictionary|None", None), "object_max_gap": ("number", 2.0),
+                           "object_min_gaussians": ("whole", 5), "overwrite": ("bool", False)}),
+    (nl.LiftedRun.masks, {"folder": ("path", "a"), **PART, "rest": ("bool", False), "overwrite": ("bool", False)}),
+    (nl.LiftedRun.transfer, {"cloud": ("path", "a.ply"), "path": ("path", "b.ply"), "part": ("Answer", None),
+                             "transfer_distance": ("number", 1.0), "coordinates": ("word", "scene"),
+                             "overwrite": ("bool", False)}),
+    (nl.LiftedRun.why, PART),
+    (nl.LiftedRun.catalogue, {**PART, "meters_per_unit": ("number|None", None)}),
+    (nl.LiftedRun.inventory, {"vocabulary": ("texts|None", None), "meters_per_unit": ("number|None", None)}),
+    (nl.LiftedRun.floaters, {"limit": ("number", 1.0)}),
+    (nl.LiftedRun.camera, {"view": ("path|whole", 0)}),
+    (nl.LiftedRun.render, {"view": ("path|whole|Camera", 0), "found": ("Answer|None", None)}),
+    (nl.Coverage.save, {"path": ("path", "a.json"), "overwrite": ("bool", False)}),
+    (nl.Evidence.select_views, {"views": ("wholes|whole m", [0])}),
+    (nl.Evidence.columns_of, {"views": ("wholes|whole m", [0])}),
+    (nl.Evidence.select_gaussians, {"gaussians": ("whole m", MANY)}),
+    (nl.Evidence.regroup, {"columns": ("whole levels s", MANY[None]), "region_view": ("whole m", MANY.int())}),
+    (nl.Evidence.save, {"path": ("path", "a"), "key": ("text", ""), "remarks": ("dictionary|None", None)}),
+    (nl.SemanticField.save, {"folder": ("path", "a"), "overwrite": ("bool", False), "beside": ("dictionary", {})}),
+]
+"""Methods, called without their object: wrong arguments are refused before it is used."""
 TABLE: list[Row] = [
     (nl.GaussianScene, {"means": ("float n 3", MEANS), "quats": ("float n 4", torch.ones(N, 4)),
                         "scales": ("float n 3", torch.ones(N, 3)), "opacities": ("float n", ONES)}),
@@ -79,6 +108,9 @@ TABLE: list[Row] = [
                     "spacing": ("float m", NEAR.spacing)}),
     (nl.Contributors, {"offsets": ("whole p", MANY), "gaussian": ("whole m", MANY), "weight": ("float m", ONES)}),
     (nl.Floaters, {"score": ("float n", ONES), "mask": ("bool n", NO)}),
+    (nl.Evidence.load, {"path": ("path", "/nowhere"), "key": ("text", "")}),
+    (nl.Evidence.from_entries, {"parts": ("Entries", []), "num_gaussians": ("whole", N), "weight_power": ("whole", 1),
+                                "num_excluded": ("whole", 0)}),
     (nl.Lifted, {"scalars": ("Scalars", LIFTED.scalars), "evidence": ("Evidence", EVIDENCE),
                  "features": ("float s d", FEATURES)}),
     (LIFTED.directions, {"gaussians": ("whole m|None", None), "dtype": ("dtype|None", None)}),
@@ -92,7 +124,9 @@ TABLE: list[Row] = [
                      "options": ("SplatOptions", nl.SplatOptions(colmap=Path("/nowhere")))}),
     (nl.open_run, {"load_config": ("path", "/nowhere"), "data": ("path|None", None), "device": ("word", "cpu"),
                    "text_embeddings": ("path|None", None), "prompt_template": ("text|None", None)}),
-    (nl.coverage, {"run": ("LiftedRun", None)}),
+    (nl.coverage, {"run": ("LiftedRun", None), "min_reliability": ("number", 0.5),
+                   "device": ("text|None", None)}),
+    *((partial(method, None), arguments) for method, arguments in METHODS),
     (nl.lift_run, {"config_or_scene": ("path", "/nowhere"), "lift": ("LiftOptions|None", None),
                    "texts": ("none|None", None),
                    "queries": ("texts", ()), "load_step": ("whole|None", None), "overwrite": ("bool", False),

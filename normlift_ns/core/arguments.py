@@ -159,7 +159,10 @@ def _number_check(kind: type) -> _Check:
 
 
 def _union_check(parts: Sequence[Any]) -> _Check:
-    checks = [_check_of(part) for part in parts if part is not type(None) and not (part is str and Path in parts)]
+    words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
+    others = [part for part in parts if get_origin(part) is not Literal and part is not type(None)]
+    checks = [_check_of(part) for part in others if not (part is str and Path in parts)]
+    checks += [_generic_check(Literal, words)] if len(words) > 0 else []
     optional = type(None) in parts
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
@@ -192,13 +195,9 @@ def _items_check(origin: type, parts: Sequence[Any]) -> _Check:
             raise _error(name, expected, value)
         rows = zip(repeat(checks[0]) if every else checks, value)
         items = (one(f"{name}[{i}]", item, sizes if not every else {}) for i, (one, item) in enumerate(rows))
-        return (
-            cast(Any, type(value))(items)
-            if type(value) in (list, tuple)
-            else items
-            if origin is not Sequence
-            else value
-        )
+        if type(value) in (list, tuple):
+            return cast(Any, type(value))(items)
+        return value if origin is Sequence else items
 
     return check
 

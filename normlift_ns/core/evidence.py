@@ -21,7 +21,7 @@ from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
-from normlift_ns.io.guard import refuse_other_kinds
+from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""
@@ -155,6 +155,7 @@ class Evidence(TensorRecord):
         parts = [torch.arange(bounds[v], bounds[v + 1]) for v in chosen]
         return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 
+    @check_arguments
     def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
         """Return the evidence of some views, renumbered in the given order.
 
@@ -240,13 +241,17 @@ class Evidence(TensorRecord):
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
     @check_arguments
-    def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
+    def save(
+        self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None, own: bool = False
+    ) -> str:
         """Write a safetensors file atomically, replacing an earlier one, and return its digest.
 
         Args:
             key: cache key, which is part of the digest.
             remarks: additional metadata for the file header, by name.
+            own: the file is part of a run or a cache that belongs to this package.
         Raises:
+            ValueError: as in `io.guard.refuse_inputs`, or the file at `path` is of another kind.
             OSError: if the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
@@ -255,7 +260,8 @@ class Evidence(TensorRecord):
         tensors["region_view"] = self.region_view
         counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
         metadata = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
-        if not key:
+        if not own:
+            refuse_inputs([Path(path)])
             refuse_other_kinds(Path(path), ".safetensors")
         return save_arrays(Path(path), tensors, metadata, key=key, overwrite=True)
 

@@ -33,6 +33,7 @@ from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
+from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
 from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
 from normlift_ns.options import RelevancyRule, Storage
 
@@ -205,7 +206,12 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def save(
-        self, folder: str | Path, *, overwrite: bool = False, beside: Mapping[str, str] = MappingProxyType({})
+        self,
+        folder: str | Path,
+        *,
+        overwrite: bool = False,
+        beside: Mapping[str, str] = MappingProxyType({}),
+        own: bool = False,
     ) -> None:
         """Write field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
@@ -213,7 +219,9 @@ class SemanticField(TensorRecord):
 
         Args:
             beside: digests of other files that belong to the field, by their paths relative to the folder.
+            own: the folder is part of a run that belongs to this package.
         Raises:
+            ValueError: as in `io.guard.refuse_inputs`, or a file would replace one of another kind.
             FileExistsError: if the folder holds a field and `overwrite` is False.
             OSError: if a file cannot be written, for instance because the disk is full.
         """
@@ -222,6 +230,11 @@ class SemanticField(TensorRecord):
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
+        if not own:
+            files = [folder / name for name in (FIELD_FILE, EVIDENCE_FILE, MANIFEST_FILE)]
+            refuse_inputs(files, instead="folder")
+            for file in files:
+                refuse_other_kinds(file, file.suffix)
         # a folder without a manifest is incomplete and may be overwritten
         for name in (MANIFEST_FILE, EVIDENCE_FILE):
             (folder / name).unlink(missing_ok=True)
@@ -236,7 +249,7 @@ class SemanticField(TensorRecord):
         tensors = {name: tensor for name, tensor in named.items() if tensor is not None}
         digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, tensors, overwrite=True)}
         if isinstance(self.store, StoredEvidence):
-            digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
+            digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE, own=True)
         write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod

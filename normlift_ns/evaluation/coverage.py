@@ -719,6 +719,7 @@ class Coverage:
         rows = {name: [asdict(row) for row in plain[name]] for name in ("regions", "photographs")}
         return {**plain, **rows, "poses": [pose.to_json() for pose in self.poses]}
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
         """Write a JSON file, and next to it <stem>_pose_1.png … and <stem>_camera_path.json; return the paths.
 
