@@ -243,7 +243,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     answer = run.ask("red")
     assert "red" in answer and "blue" not in answer
     assert answer != run.ask("red") and len(repr(answer)) < 200 and len(repr(run)) < 300
-    with pytest.raises(ValueError, match="ask takes each prompt"):
+    with pytest.raises(ValueError, match="each of \\*texts"):
         run.ask(["red", "blue"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")

@@ -54,7 +54,7 @@ def check_arguments(target: _T) -> _T:
         ordered = [
             (p.name, named[p.name]) for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
-        more = next(((p.name, named[p.name]) for p in parameters if p.kind == p.VAR_POSITIONAL), None)
+        more = next(((f"each of *{p.name}", named[p.name]) for p in parameters if p.kind == p.VAR_POSITIONAL), None)
         for p in parameters:
             if p.kind == p.VAR_KEYWORD and p.name in hints:  # Unpack[a TypedDict]
                 named |= {key: _check_of(hint) for key, hint in get_type_hints(get_args(hints[p.name])[0]).items()}
@@ -192,11 +192,12 @@ def _items_check(origin: type, parts: Sequence[Any]) -> _Check:
         listed = isinstance(value, list | tuple)
         accepted = listed or (every and isinstance(value, origin) and not isinstance(value, str | bytes | Mapping))
         if not accepted or getattr(value, "ndim", 1) == 0 or (not every and len(value) != len(parts)):
-            raise _error(name, expected, value)
+            hint = f" such as [{short_repr(value)}]" if every and isinstance(value, str) else ""
+            raise _error(name, expected + hint, value)
         rows = zip(repeat(checks[0]) if every else checks, value)
         items = (one(f"{name}[{i}]", item, sizes if not every else {}) for i, (one, item) in enumerate(rows))
-        if type(value) in (list, tuple):
-            return cast(Any, type(value))(items)
+        if type(value) in (list, tuple, range):
+            return tuple(items) if type(value) is tuple else list(items)
         return value if origin is Sequence else items
 
     return check

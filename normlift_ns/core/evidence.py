@@ -140,7 +140,7 @@ class Evidence(TensorRecord):
         return SparseRows(torch.searchsorted(groups, self.rows.offsets), view, segment_sum(self.rows.weight, groups))
 
     @check_arguments
-    def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
+    def columns_of(self, views: Sequence[int] | Int[Tensor, " m"]) -> Int64[Tensor, " columns"]:
         """Return the columns of the given views, in their order.
 
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
@@ -156,7 +156,7 @@ class Evidence(TensorRecord):
         return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 
     @check_arguments
-    def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
+    def select_views(self, views: Sequence[int] | Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some views, renumbered in the given order.
 
         Raises:

@@ -158,7 +158,7 @@ def guarded(names: frozenset[str]) -> Iterator[None]:
             return status, told, with_script(content)
 
         options["compression"] = None
-        return serve(_without_tracebacks(handler), host, port, process_request=request, **options)
+        return serve(_closing_malformed(handler), host, port, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
@@ -202,7 +202,7 @@ def _guarded_one(names: frozenset[str]) -> Iterator[None]:
             headers = Headers({"Content-Type": "text/html", "Content-Length": str(len(content))})
             return Response(found.status_code, found.reason_phrase, headers, content)
 
-        return serve(_without_tracebacks(handler), *address, process_request=request, **options)
+        return serve(_closing_malformed(handler), *address, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
@@ -211,13 +211,25 @@ def _guarded_one(names: frozenset[str]) -> Iterator[None]:
         module.serve = serve
 
 
-def _without_tracebacks(handler: Any) -> Any:
-    """Let a malformed message end its connection without a traceback; callbacks run elsewhere."""
+def _closing_malformed(handler: Any) -> Any:
+    """Let a malformed message close its connection, as a browser would; viser would forget to clean up after it."""
+    from viser._messages import Message  # noqa: PLC0415
 
     @functools.wraps(handler)
-    async def handle(*connection: Any) -> None:
-        with contextlib.suppress(AssertionError, AttributeError, LookupError, TypeError, ValueError, MsgspecError):
-            await handler(*connection)
+    async def handle(connection: Any, *rest: Any) -> None:
+        receive = connection.recv
+
+        async def recv() -> Any:
+            raw = await receive()
+            try:
+                Message.deserialize(raw)
+            except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MsgspecError):
+                await connection.close(1008)
+                return await receive()  # raises viser's signal of a closed connection
+            return raw
+
+        connection.recv = recv
+        await handler(connection, *rest)
 
     return handle
 
