@@ -120,9 +120,8 @@ def relevancy(
     if not 0 < temperature < math.inf:
         raise InputError(f"temperature must be positive and finite, got {temperature}")
     if negative is not None and type(negative) is not type(positive):  # lists, or NumPy beside torch
-        negative = (
-            np.asarray(negative) if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor(negative)
-        )
+        convert = np.asarray if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor
+        negative = cast(Any, convert(negative))
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
         raise InputError('rule "contrast" compares with the null level, which the field does not have; choose "cosine"')
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
