@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.scene import Scene
@@ -39,6 +40,7 @@ from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
+from normlift_ns.io.memory import refuse_small_memory
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
     TEXT_EMBEDDINGS_FILE,
@@ -70,6 +72,7 @@ from normlift_ns.segmentation.registry import describe_choice, resolve_source
 
 
 @renamed(check="check_alignment")
+@check_arguments
 def lift_run(
     config_or_scene: str | Path | Scene,
     *,
@@ -201,6 +204,8 @@ class PreparedLift:
 def run_lift(request: LiftRequest) -> LiftedRun:
     """Lift features onto a trained scene, write the lifted run, and return it."""
     prepared, stages = prepare_lift(request), StageTimer(request.report)
+    cameras = prepared.scene.train.cameras
+    refuse_small_memory(len(prepared.scene.gaussians), max((c.width * c.height for c in cameras), default=0))
     check_target(prepared)
     announce(prepared)
     check_alignment(prepared, stages)
@@ -383,7 +388,7 @@ def write_run(
         if text_embeddings:
             write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, text_embeddings)
         files = [stored, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")]
-        field.save(field_dir, beside=run_file_digests(field_dir, files))
+        field.save(field_dir, beside=run_file_digests(field_dir, files), own=True)
         if question is not None:
             save_query(field_dir, question)
         for path in (run_dir,) if exact_name else numbered_paths(run_dir):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import secrets
 import sys
 import tempfile
@@ -26,6 +27,16 @@ class InputError(ValueError):
     ...     print(error)
     max_views must be at least 1, got 0
     """
+
+
+class ArgumentError(InputError, TypeError):
+    """InputError for an argument of the wrong kind, which Python's own functions report as a TypeError."""
+
+
+class MissingImageError(InputError, KeyError, IndexError):
+    """InputError for a training image that does not exist."""
+
+    __str__ = Exception.__str__  # KeyError would quote the message
 
 
 class OutputError(Exception):
@@ -83,6 +94,10 @@ def describe_error(error: BaseException) -> tuple[str, int]:
     return (_report_bug(error), EXIT_INTERNAL_ERROR) if message is None else (message, EXIT_USER_ERROR)
 
 
+_NO_MEMORY = re.compile(r"DefaultCPUAllocator|can't allocate memory|can't start new thread|std::bad_alloc")
+"""Errors of torch and of Python that mean a full memory."""
+
+
 def _user_message(error: BaseException) -> str | None:
     """Return the message of a user error; None for an internal error."""
     if isinstance(error, InputError):
@@ -90,8 +105,10 @@ def _user_message(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         named = error.filename is not None and error.strerror is not None
         return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
-    if isinstance(error, MemoryError):
-        return str(error) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale"
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
+        return (
+            str(error) if isinstance(error, MemoryError) else ""
+        ) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
     if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):

@@ -415,7 +415,7 @@ def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
         OSError: If the file cannot be written, for instance because the disk is full.
     """
     path = _cache_path(folder, keys)
-    evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)})
+    evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)}, own=True)
 
 
 def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import operator
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from normlift_ns.analysis.objects import (
     make_catalogue,
     similarity_to_capture,
 )
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
@@ -36,7 +36,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, MissingImageError
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -49,7 +49,6 @@ from normlift_ns.options import (
     OBJECT_MAX_GAP,
     OBJECT_MIN_GAUSSIANS,
     RelevancyRule,
-    check_bool,
     check_number,
     check_path,
     check_prompt_list,
@@ -67,6 +66,7 @@ _MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
 represented by about 5,000 Gaussians."""
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class LiftedRun:
     """A trained scene with its semantics, on disk and in memory.
@@ -107,6 +107,7 @@ class LiftedRun:
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
     @renamed(rule="relevancy")
+    @check_arguments
     def ask(
         self,
         *texts: str,
@@ -131,8 +132,6 @@ class LiftedRun:
         Raises:
             ValueError: there is no prompt, a prompt is empty, or the encoder does not understand one.
         """
-        if not all(isinstance(text, str) for text in texts):
-            raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
         question = make_query(
             self.field,
             self.texts.rows,
@@ -150,6 +149,7 @@ class LiftedRun:
         question = load_query(self.folder / FIELD_FOLDER)
         return None if question is None else run_query(self.field, self.scene.gaussians.means, question)
 
+    @check_arguments
     def save(self, question: Query | Answer) -> Path:
         """Store a question in the run, replacing an earlier one. ns-render and ns-viewer draw its answer.
 
@@ -157,8 +157,6 @@ class LiftedRun:
             ValueError: the vectors have another length than the field's directions.
         """
         question = question.question if isinstance(question, Answer) else question
-        if not isinstance(question, Query):
-            raise InputError(f"save takes an answer from this run or its question, got {type(question).__name__}")
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
                 f"the question has vectors of {question.embeddings.shape[1]} numbers, but the features of "
@@ -168,6 +166,7 @@ class LiftedRun:
         return save_query(self.folder / FIELD_FOLDER, question)
 
     @renamed(reach="object_max_gap", min_size="object_min_gaussians")
+    @check_arguments
     def export(
         self,
         path: str | Path,
@@ -200,11 +199,8 @@ class LiftedRun:
                 reserved for a file of a run.
         """
         path = check_path("path", path)
-        check_bool("overwrite", overwrite)
         if path.name == "":
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
-        if answer is not None and not isinstance(answer, Answer):
-            raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
         refuse_inputs(exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
@@ -223,6 +219,7 @@ class LiftedRun:
             overwrite=overwrite,
         )
 
+    @check_arguments
     def masks(
         self,
         folder: str | Path,
@@ -254,6 +251,7 @@ class LiftedRun:
         settings, folder = RasterSettings.recorded(self.field.manifest), check_path("folder", folder)
         return write_masks(self.scene, self._mask(part), folder, invert=rest, settings=settings, overwrite=overwrite)
 
+    @check_arguments
     def transfer(
         self,
         cloud: str | Path,
@@ -313,6 +311,7 @@ class LiftedRun:
         """
         return RecordedVotes(self.scene, self.field, cache_folder(self.folder))
 
+    @check_arguments
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
         """Explain a selection: which images and regions voted for it, and how far they agree.
 
@@ -336,6 +335,7 @@ class LiftedRun:
         return self.votes.explain(self._mask(part), refined=answer is None or answer.question.refined)
 
     @renamed(metres_per_unit="meters_per_unit")
+    @check_arguments
     def catalogue(
         self, part: Answer | Finding | Bool[Tensor, " n"], *, meters_per_unit: float | None = None
     ) -> Catalogue:
@@ -369,6 +369,7 @@ class LiftedRun:
             self.scene, self.field, instances, transform, meters_per_unit=meters_per_unit, device=self.device
         )
 
+    @check_arguments
     def inventory(self, vocabulary: Sequence[str] | None = None, *, meters_per_unit: float | None = None) -> Inventory:
         """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
 
@@ -444,6 +445,7 @@ class LiftedRun:
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
         return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 
+    @check_arguments
     def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
         """Find Gaussians that likely belong to no surface, see `analysis.objects`.
 
@@ -479,18 +481,21 @@ class LiftedRun:
             )
         return mask
 
+    @check_arguments
     def camera(self, view: str | Path | int) -> Camera:
         """Return the camera of a training image.
 
         Args:
             view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            KeyError, IndexError: there is no such image.
-            ValueError: several images have this name; include the folder.
+            ValueError: there is no such image (it is also a KeyError and an IndexError), or several images have this
+                name; include the folder.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
-            return cameras[operator.index(view)]
+            if not -len(names) <= view < len(names):
+                raise _no_image(str(view), names)
+            return cameras[view]
         name = Path(view).as_posix()
         matches = [i for i, image in enumerate(names) if image == name] or [
             i
@@ -501,9 +506,10 @@ class LiftedRun:
             options = ", ".join(names[i] for i in matches)
             raise InputError(f"{len(matches)} training images are called {name!r}: {options}; include the folder")
         if len(matches) == 0:
-            raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
+            raise _no_image(repr(name), names)
         return cameras[matches[0]]
 
+    @check_arguments
     def render(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
         """Render the scene from a camera.
 
@@ -518,8 +524,6 @@ class LiftedRun:
         image = render_image(self.scene, camera, settings=settings)
         if found is None:
             return image
-        if not isinstance(found, Answer | Finding):
-            raise TypeError(f"render draws an answer, or its finding for one prompt; got {type(found).__name__}")
         shown, answer = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
         display = make_display(self.field, answer, shown=shown)
         mode = self.scene.rasterize_mode
@@ -528,12 +532,19 @@ class LiftedRun:
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
+def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
+    return MissingImageError(
+        f"view must be a training image: there is no {name}; there are {len(names)}, {names[0]} to {names[-1]}"
+    )
+
+
 def _answer_of(part: Any) -> Answer | None:
     """Return the answer that `part` is or belongs to; None for a mask."""
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
 @renamed(text_vectors="text_embeddings", text_template="prompt_template")
+@check_arguments
 def open_run(
     load_config: str | Path,
     *,

@@ -39,6 +39,7 @@ from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, r
 from normlift_ns.encoders.open_clip import has_local_clip_weights
 from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.weights import find_local_sam
+from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import cache_folder, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
@@ -437,7 +438,7 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
     """Check that the lift fits into memory."""
     rows = []
-    free = _free_memory()
+    free = min(free_memory().values(), default=None)
     if free is not None:
         own = int((peak_gib() or 0.0) * 2**30)
         rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, {_LIFT_LESS}"))
@@ -459,17 +460,6 @@ def _check_capacity(name: str, needed: int, free: int, advice: str) -> Diagnosti
     message = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
     state: DiagnosticState = "error" if needed > free else "warning" if needed > _HIGH_SHARE * free else "ok"
     return Diagnostic(name, state, message, "" if state == "ok" else advice)
-
-
-def _free_memory() -> int | None:
-    """Return the bytes that this process may still allocate; None if the system does not report them."""
-    limits = []
-    with suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        limits += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
-    return min(limits) if len(limits) > 0 else None
 
 
 # Short measurement of a capture: encode and rasterize a few views, and lift some Gaussians.

@@ -162,16 +162,16 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
         ({"features": []}, "^0 .* 12"),
         ({"features": {}}, "empty"),
-        ({"features": [labels.numpy()] * 12}, "got ndarray"),
+        ({"features": [labels.numpy()] * 12}, "must be a tuple of 2"),
         ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
         ({"texts": {"a": np.zeros(2)}}, r"text 'a' must be \[D\], finite and not zero"),
         ({"texts": {"a": [1.0, float("nan")]}}, "text 'a' must be"),
-        ({"texts": {"a": np.ones((1, 2))}}, "text 'a' must be"),
+        ({"texts": {"a": np.ones((1, 2))}}, r"texts\['a'\] must be"),
         ({"texts": {" ": [1, 2]}}, "not a valid text"),
         ({"texts": {"fox.npy": [1, 2]}}, "not a valid text"),
         ({"texts": {5: [1, 2]}}, "dictionary"),
         ({"texts": {"a": ["x", "y"]}}, "numbers"),
-        ({"texts": {"a": [1j, 2]}}, "real"),
+        ({"texts": {"a": [1j, 2]}}, "must be an array of floating-point"),
         ({"texts": {"a": [1, 2, 3]}}, r"\[2, 3\]"),
         ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .* 1; closest: a"),
         ({"queries": ["b"]}, "is empty"),
@@ -193,7 +193,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
     with pytest.raises(FileExistsError, match="--timestamp"):
         nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
-    with pytest.raises(TypeError, match=r"config\.yml .* got int"):
+    with pytest.raises(TypeError, match=r"config_or_scene must be .* got 3"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
         nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")
@@ -243,11 +243,11 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     answer = run.ask("red")
     assert "red" in answer and "blue" not in answer
     assert answer != run.ask("red") and len(repr(answer)) < 200 and len(repr(run)) < 300
-    with pytest.raises(ValueError, match="ask takes each prompt"):
+    with pytest.raises(ValueError, match="each of \\*texts"):
         run.ask(["red", "blue"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")
-    with pytest.raises(ValueError, match="auto, contrast, cosine, lerf, margin; got 'LERF'"):
+    with pytest.raises(ValueError, match="contrast, cosine, lerf, margin, auto, got 'LERF'"):
         run.ask("red", relevancy="LERF")  # type: ignore[arg-type]
     for wrong in (
         *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),
@@ -269,11 +269,11 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     ):
         with pytest.raises(nl.InputError):
             run.export(path, **more)  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="got str"):
+    with pytest.raises(nl.InputError, match="got 'red'"):
         run.save("red")  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
     assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
-    with pytest.raises(TypeError, match="got str"):
+    with pytest.raises(TypeError, match="found must be"):
         run.render(0, "red")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r" 3 .* 343"):
         run.save(Query(("a",), torch.ones(1, 3)))

@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from normlift_ns import evidence_collection
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
@@ -78,6 +79,7 @@ class ViewVote:
     """Regions by descending weight, until at most a tenth of the image's weight is left."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Why:
     """Explanation of a selection: the votes of all images, and how well they agree.

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import MIN_OPACITY, Camera, GaussianScene
 from normlift_ns.core.lift import Scalars
@@ -628,6 +629,7 @@ _FLOATER_NEIGHBORS = 8
 _DISAGREEMENT_WEIGHT = 2.0
 
 
+@check_arguments
 class Floaters(NamedTuple):
     """Floater scores of all Gaussians, and a mask of the likely floaters.
 

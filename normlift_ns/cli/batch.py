@@ -161,6 +161,8 @@ def _parse(words: Sequence[str]) -> NormLift:
     Raises:
         InputError: ns-normlift does not know an argument, or a batch does not support it.
     """
+    if {"-h", "--help"} & set(words):
+        raise InputError("--help has no place in a batch; type ns-normlift --help for the options of a capture")
     try:
         command = parse_flags(NormLift, words, name="ns-normlift")
     except InputError as error:

@@ -149,8 +149,8 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
     with nullcontext() if terminal.log_file is None else _open_log(terminal.log_file) as log:
         if log is not None:
             log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} normlift_ns: {command}\n")
-        sys.stdout = None if stdout is None else cast(Any, _OutputStream(stdout, log, _output_errors))
-        sys.stderr = None if stderr is None else cast(Any, _OutputStream(stderr, log, nullcontext))
+        sys.stdout = cast(Any, _OutputStream(stdout, log, _output_errors))
+        sys.stderr = cast(Any, _OutputStream(stderr, log, nullcontext))
         output_settings.append(terminal)
         try:
             yield
@@ -216,7 +216,7 @@ _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highli
 CONSOLE = Console(**_PLAIN)
 """Console for results, on standard output. Markup in texts is not interpreted."""
 if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
-    CONSOLE.width = min(CONSOLE.width, shutil.get_terminal_size().columns)
+    CONSOLE.width = max(40, min(CONSOLE.width, shutil.get_terminal_size().columns))
 ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
 
 _OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it elsewhere."
@@ -238,14 +238,17 @@ class TerminatedError(BaseException):
     """SIGTERM from the system, for example before preemption."""
 
 
+_SIGNALS: dict[type, signal.Signals] = {KeyboardInterrupt: signal.SIGINT, TerminatedError: signal.SIGTERM}
+
+
 def run_command(command: type[CommandProtocol]) -> None:
     """Parse flags as nerfstudio's commands do (--flag True), run the command, and exit unless it succeeds.
 
     The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
     and 143 for SIGTERM, after partial files are removed.
     """
-    if sys.stderr is None:  # closed by the parent process
-        sys.stderr = open(os.devnull, "w", encoding="utf8")  # noqa: SIM115 (open until the process ends)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (closed by the caller)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
     for stream in streams:
         if hasattr(stream, "reconfigure"):
@@ -275,6 +278,10 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
         run_command(command)
     except SystemExit as stop:
         code = stop.code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the command has ended
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         _flush(stream, report=False)  # the output of those functions
@@ -293,8 +300,7 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
     except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:
-        interrupted = isinstance(stop, KeyboardInterrupt)
-        word, number = ("Interrupted", signal.SIGINT) if interrupted else ("Terminated", signal.SIGTERM)
+        word, number = "Interrupted" if isinstance(stop, KeyboardInterrupt) else "Terminated", _SIGNALS[type(stop)]
         print_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
     except Exception as error:  # a traceback would not help the user
@@ -330,8 +336,21 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
     arguments = fill_boolean_values(rename_flags(arguments, renamed_flags(command)), boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
-    with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
+    with _legible_help() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
+
+
+@contextmanager
+def _legible_help() -> Iterator[None]:
+    """Print help with at least 40 columns; tyro's layout of narrower ones does not end."""
+    columns = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(max(40, shutil.get_terminal_size().columns))
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS")
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def boolean_flags(options: Any) -> set[str]:
@@ -429,11 +448,22 @@ def _sigterm_raises() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
+    def report(ignored: Any) -> None:
+        number = _SIGNALS.get(ignored.exc_type)
+        if number is None:
+            hook(ignored)
+        else:  # raised while an object was deleted, where Python prints exceptions and continues
+            signal.signal(signal.SIGTERM, terminate)
+            threading.Timer(0.01, signal.raise_signal, (number,)).start()
+
+    hook, sys.unraisablehook = sys.unraisablehook, report
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+        sys.unraisablehook = hook
 
 
 @contextmanager

@@ -114,6 +114,13 @@ class NormLiftEval(CheckedOptions):
     def _check(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
+        for name in {"scannet", "lerf", "masks"} - {self.protocol}:
+            given, default = vars(getattr(self, name)), vars(type(getattr(self, name))())
+            for option in (option for option in given if given[option] != default[option]):
+                raise InputError(
+                    f"--{option.replace('_', '-')} is an option of --protocol {name}, not of {self.protocol}; leave it "
+                    "out or give that protocol"
+                )
         runs = len(self.load_config)
         if self.protocol == "none":
             self._check_without_truth()

@@ -22,6 +22,7 @@ from normlift_ns.cli import common, preflight
 from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
+from normlift_ns.io.memory import refuse_small_memory
 from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_directory
 from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, renamed
 
@@ -100,6 +101,7 @@ class NormLift(CheckedOptions):
     def main(self) -> LiftedRun | None:
         """Lift and return the new run; None for a dry run, or if another process writes the run."""
         self.check_early()
+        refuse_small_memory(loaded="torch" in sys.modules)
         if self.dry_run:
             self._plan()
             return None

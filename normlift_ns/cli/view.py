@@ -12,6 +12,7 @@ from normlift_ns.cli.common import TerminatedError, info, run_command, run_comma
 from normlift_ns.cli.preflight import check_lifted_run, check_readable_file
 from normlift_ns.errors import InputError
 from normlift_ns.options import CheckedOptions, check_device, renamed
+from normlift_ns.viewer.host_check import accepted_names
 
 if TYPE_CHECKING:
     from normlift_ns.viewer.adapter import Door
@@ -35,6 +36,9 @@ class NormLiftView(CheckedOptions):
     """Path to config YAML file of the lifted run."""
     host: str = "127.0.0.1"
     """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
+    allowed_hosts: tuple[str, ...] = ()
+    """Further names of this machine in the browser's address bar, such as that of a proxy. Pages at other names get
+    status 403."""
     port: int = 7008
     """Port to listen on, in 1..65535; if it is in use, the next free one."""
     read_only: bool = False
@@ -56,14 +60,16 @@ class NormLiftView(CheckedOptions):
         """Serve the viewer until the process is interrupted."""
         check_device(self.device)
         _check_host(self.host)
+        accepted_names(self.host, self.allowed_hosts)
         check_lifted_run(self.load_config, self.data)
         check_readable_file(self.text_embeddings, "--text-embeddings")
         from normlift_ns.viewer.adapter import Door  # noqa: PLC0415 (--help should not wait for viser)
 
-        door = Door(self.host, self.port)
+        door = Door(self.host, self.port, self.allowed_hosts)
         if door.server.port != self.port:
             info(f"Port {self.port} is already in use.")
-        host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        host = f"[{host}]" if ":" in host else host
         info(f"The viewer is at http://{host}:{door.server.port} (press Ctrl-C to stop it)")
         try:
             self.open(door)

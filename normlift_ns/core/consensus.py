@@ -33,6 +33,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Scalars, check_tensors, check_unit_rows
@@ -67,6 +68,7 @@ class Overlaps(NamedTuple):
     """B, in 0..1."""
 
 
+@check_arguments
 class Consensus(NamedTuple):
     """Feature table that the views agree on, with statistics of the consensus.
 
@@ -88,6 +90,7 @@ class Consensus(NamedTuple):
     """Number of Gaussians sampled."""
 
 
+@check_arguments
 def consensus(
     evidence: Evidence,
     features: Float[Tensor, "s d"],
@@ -139,11 +142,11 @@ def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) ->
 
 
 def _check_numbers(power: float, sample: int, least: float) -> None:
-    if not isinstance(power, int | float) or not 0 <= power < float("inf"):
+    if not 0 <= power < float("inf"):
         raise InputError(f"power must be a number >= 0, got {power!r}")
-    if not isinstance(sample, int) or sample < 1:
+    if sample < 1:
         raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
-    if not isinstance(least, int | float) or not 0 <= least <= 1:
+    if not 0 <= least <= 1:
         raise InputError(f"least must be a number in 0..1, got {least!r}")
 
 

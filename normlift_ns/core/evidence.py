@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
-from normlift_ns.io.guard import refuse_other_kinds
+from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""
@@ -37,6 +38,7 @@ class Entries(NamedTuple):
     """Number of regions of each view."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Evidence(TensorRecord):
     """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
@@ -107,6 +109,7 @@ class Evidence(TensorRecord):
         return self.rows.weight.numel()
 
     @staticmethod
+    @check_arguments
     def from_entries(
         parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
@@ -136,7 +139,8 @@ class Evidence(TensorRecord):
         view = self.region_view[self.rows.column[groups[:-1]].long()]
         return SparseRows(torch.searchsorted(groups, self.rows.offsets), view, segment_sum(self.rows.weight, groups))
 
-    def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
+    @check_arguments
+    def columns_of(self, views: Sequence[int] | Int[Tensor, " m"]) -> Int64[Tensor, " columns"]:
         """Return the columns of the given views, in their order.
 
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
@@ -151,7 +155,8 @@ class Evidence(TensorRecord):
         parts = [torch.arange(bounds[v], bounds[v + 1]) for v in chosen]
         return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
 
-    def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
+    @check_arguments
+    def select_views(self, views: Sequence[int] | Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some views, renumbered in the given order.
 
         Raises:
@@ -166,11 +171,13 @@ class Evidence(TensorRecord):
         region_view = new_view[self.region_view[columns].long()]
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
 
+    @check_arguments
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some Gaussians, in the given order."""
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 
+    @check_arguments
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """Return the evidence of coarser regions without rasterizing again.
 
@@ -213,6 +220,7 @@ class Evidence(TensorRecord):
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled)
 
     @staticmethod
+    @check_arguments
     def merge(*parts: Evidence) -> Evidence:
         """Append the views and columns of all parts in argument order; concatenate feature tables in the same order.
 
@@ -232,13 +240,18 @@ class Evidence(TensorRecord):
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
-    def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
+    @check_arguments
+    def save(
+        self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None, own: bool = False
+    ) -> str:
         """Write a safetensors file atomically, replacing an earlier one, and return its digest.
 
         Args:
             key: cache key, which is part of the digest.
             remarks: additional metadata for the file header, by name.
+            own: the file is part of a run or a cache that belongs to this package.
         Raises:
+            ValueError: as in `io.guard.refuse_inputs`, or the file at `path` is of another kind.
             OSError: if the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
@@ -247,11 +260,13 @@ class Evidence(TensorRecord):
         tensors["region_view"] = self.region_view
         counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
         metadata = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
-        if not key:
+        if not own:
+            refuse_inputs([Path(path)])
             refuse_other_kinds(Path(path), ".safetensors")
         return save_arrays(Path(path), tensors, metadata, key=key, overwrite=True)
 
     @staticmethod
+    @check_arguments
     def load(path: str | Path, *, key: str = "") -> Evidence:
         """Read a file that `save` wrote.
 

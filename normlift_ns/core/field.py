@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
@@ -32,10 +33,12 @@ from normlift_ns.core.relevancy import gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
+from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
 from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
 from normlift_ns.options import RelevancyRule, Storage
 
 
+@check_arguments
 @dataclass(frozen=True)
 class SemanticField(TensorRecord):
     """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three storage forms.
@@ -72,6 +75,7 @@ class SemanticField(TensorRecord):
         return int(self.manifest["dimension"])
 
     @staticmethod
+    @check_arguments
     def build(
         lifted: Lifted,
         means: Float[Tensor, "n 3"],
@@ -134,11 +138,13 @@ class SemanticField(TensorRecord):
         scalars = scalars.map(lambda x: x.float() if x.dtype == torch.float64 else x)
         return SemanticField(scalars, source.int(), store, manifest, means.detach().float())
 
+    @check_arguments
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
         mask = self.scalars.norm > 0
         return mask[self.source.long()] if refined else mask
 
+    @check_arguments
     def query(
         self, text_vectors: Float[Tensor, "q d"] | Float[np.ndarray, "q d"], *, refined: bool = True
     ) -> Float[Tensor, "n q"]:
@@ -149,7 +155,7 @@ class SemanticField(TensorRecord):
         Raises:
             ValueError: if a vector has another dimension, is zero or is not finite.
         """
-        if text_vectors.ndim != 2 or text_vectors.shape[1] != self.dimension:
+        if text_vectors.shape[1] != self.dimension:
             raise InputError(
                 f"text vectors must be [Q, {self.dimension}] like the field's features, got "
                 f"{tuple(text_vectors.shape)}; use the encoder that made them"
@@ -161,12 +167,14 @@ class SemanticField(TensorRecord):
         cosine = self.store.products(vectors / length, self.scalars)
         return cosine[self.source.long()] if refined else cosine
 
+    @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
         """Return the null level of every Gaussian as one column; no column if the field has no null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
 
+    @check_arguments
     def relevancy(
         self,
         text_vectors: Float[Tensor, "q d"],
@@ -189,14 +197,21 @@ class SemanticField(TensorRecord):
         negative = self.null_levels(refined=refined) if rule == "contrast" else cosine[:, count:]
         return gaussian_relevancy(cosine[:, :count], negative, self.valid(refined=refined), rule)
 
+    @check_arguments
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
         rows = self.source.long()[rows] if refined else rows
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
 
+    @check_arguments
     def save(
-        self, folder: str | Path, *, overwrite: bool = False, beside: Mapping[str, str] = MappingProxyType({})
+        self,
+        folder: str | Path,
+        *,
+        overwrite: bool = False,
+        beside: Mapping[str, str] = MappingProxyType({}),
+        own: bool = False,
     ) -> None:
         """Write field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
@@ -204,7 +219,9 @@ class SemanticField(TensorRecord):
 
         Args:
             beside: digests of other files that belong to the field, by their paths relative to the folder.
+            own: the folder is part of a run that belongs to this package.
         Raises:
+            ValueError: as in `io.guard.refuse_inputs`, or a file would replace one of another kind.
             FileExistsError: if the folder holds a field and `overwrite` is False.
             OSError: if a file cannot be written, for instance because the disk is full.
         """
@@ -213,6 +230,11 @@ class SemanticField(TensorRecord):
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
+        if not own:
+            files = [folder / name for name in (FIELD_FILE, EVIDENCE_FILE, MANIFEST_FILE)]
+            refuse_inputs(files, instead="folder")
+            for file in files:
+                refuse_other_kinds(file, file.suffix)
         # a folder without a manifest is incomplete and may be overwritten
         for name in (MANIFEST_FILE, EVIDENCE_FILE):
             (folder / name).unlink(missing_ok=True)
@@ -227,10 +249,11 @@ class SemanticField(TensorRecord):
         tensors = {name: tensor for name, tensor in named.items() if tensor is not None}
         digests = {FIELD_FILE: save_arrays(folder / FIELD_FILE, tensors, overwrite=True)}
         if isinstance(self.store, StoredEvidence):
-            digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
+            digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE, own=True)
         write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod
+    @check_arguments
     def load(
         folder: str | Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
     ) -> SemanticField:

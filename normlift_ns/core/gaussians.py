@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
 
@@ -27,6 +28,7 @@ QUATERNION_RANGE = (1e-18, 1e18)
 or silently the identity."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
@@ -56,16 +58,9 @@ class GaussianScene(TensorRecord):
     """Opacities in 0..1, not logits."""
 
     def __post_init__(self) -> None:
-        n = self.means.shape[0] if self.means.ndim > 0 else 0
-        for name, shape in (("means", (n, 3)), ("quats", (n, 4)), ("scales", (n, 3)), ("opacities", (n,))):
-            value: Tensor = getattr(self, name)
-            if tuple(value.shape) != shape:
-                raise InputError(f"GaussianScene.{name} has shape {tuple(value.shape)}, expected {shape}")
-            if not value.dtype.is_floating_point or value.device != self.means.device:
-                raise InputError(
-                    f"GaussianScene.{name} is {value.dtype} on {value.device}, expected a floating-point tensor on "
-                    f"{self.means.device}"
-                )
+        for name in ("quats", "scales", "opacities"):
+            if (device := getattr(self, name).device) != self.means.device:
+                raise InputError(f"GaussianScene.{name} is on {device}, expected {self.means.device}, as the means")
         if bool((self.scales < 0).any()):
             raise InputError(
                 "GaussianScene.scales has negative values; pass linear scales: exp() of a splatfacto "
@@ -106,6 +101,7 @@ def facing_pose(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float
     return pose
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
@@ -134,13 +130,9 @@ class Camera:
     """Image height in pixels."""
 
     def __post_init__(self) -> None:
-        for name, shape in (("K", (3, 3)), ("world_to_camera", (4, 4))):
-            value: Tensor = getattr(self, name)
-            if tuple(value.shape) != shape or not value.dtype.is_floating_point or not bool(value.isfinite().all()):
-                raise InputError(
-                    f"Camera.{name} must be a finite floating-point tensor of shape {shape}, got {value.dtype} "
-                    f"{tuple(value.shape)}: {value}"
-                )
+        for name in ("K", "world_to_camera"):
+            if not bool((value := getattr(self, name)).isfinite().all()):
+                raise InputError(f"Camera.{name} must be finite, got {value.tolist()}")
         (fx, skew, _), (zero, fy, _), last = self.K.tolist()
         if fx <= 0 or fy <= 0 or skew != 0 or zero != 0 or last != [0, 0, 1]:
             raise InputError(
@@ -161,6 +153,7 @@ class Camera:
         """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
         return self.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
 
+    @check_arguments
     def downscaled(self, factor: float) -> Camera:
         """Return the camera with its size multiplied by at most 1.
 
@@ -174,6 +167,7 @@ class Camera:
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)
 
+    @check_arguments
     def project(
         self, points: Float[Tensor, "n 3"]
     ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:

@@ -13,6 +13,7 @@ Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -21,6 +22,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
@@ -34,6 +36,7 @@ _LENGTH_TOLERANCE = 1e-2
 """Accepted deviation of the length of a unit row from 1, which half precision and files need."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Scalars(TensorRecord):
     """Scalars of every Gaussian.
@@ -77,6 +80,7 @@ class Scalars(TensorRecord):
         return Scalars(**{f.name: function(getattr(self, f.name)) for f in fields(Scalars)})
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Lifted:
     """Result of a lift: the scalars of every Gaussian, and the evidence and features that its direction follows from.
@@ -95,6 +99,7 @@ class Lifted:
     features: Float[Tensor, "s d"]
     """The feature table, normalized, in the precision of the lift."""
 
+    @check_arguments
     def directions(
         self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
     ) -> Float[Tensor, "m d"]:
@@ -129,6 +134,7 @@ class Lifted:
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
 
 
+@check_arguments
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:
@@ -158,10 +164,8 @@ def lift(
     >>> lifted.directions(), lifted.scalars.norm, lifted.scalars.reliability  # of 2 views: 0.6 * 2 / (2 + 1)
     (tensor([[1., 0.]]), tensor([0.6000]), tensor([0.4000]))
     """
-    if unlabeled not in ("ignore", "dilute"):
-        raise InputError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
-    if not beta >= 0:
-        raise InputError(f"beta must be >= 0, got {beta}")
+    if not 0 <= beta < math.inf:
+        raise InputError(f"beta must be >= 0 and finite, got {beta}")
     for name, rows in (("regions", evidence.rows), ("unlabeled pixels", evidence.unlabeled)):
         if not bool(((rows.weight >= 0) & (rows.weight <= _MAX_WEIGHT)).all()):
             low, high = (float(x) for x in rows.weight.aminmax())

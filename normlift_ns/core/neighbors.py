@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.partition import Communicator
 from normlift_ns.errors import InputError
@@ -28,6 +29,7 @@ Progress = Callable[[int, int], None]
 """Called after every block of Gaussians with (Gaussians done, Gaussians)."""
 
 
+@check_arguments
 class Neighbors(NamedTuple):
     """The K nearest neighbors of all or some Gaussians, nearest first; ties are ordered by index.
 
@@ -48,6 +50,7 @@ class Neighbors(NamedTuple):
     """Distance to the nearest Gaussian at another position; inf if there is none."""
 
 
+@check_arguments
 def nearest_neighbors(
     means: Float[Tensor, "n 3"],
     k: int,

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import can_use_triton, retry_in_halves
 from normlift_ns.core.lift import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
@@ -28,6 +29,7 @@ _MAX_KERNEL_NEIGHBORS = 63
 """Largest K that `kernels.vote` supports."""
 
 
+@check_arguments
 def refine(
     means: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
@@ -310,6 +312,7 @@ def _margin(
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))
 
 
+@check_arguments
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Return a mask of the Gaussians that voting cannot repair, because neither they nor their neighbors have R > 0.
 
@@ -321,6 +324,10 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
+    if neighbors.index.numel() > 0 and int(neighbors.index.max()) >= len(reliability):
+        raise InputError(
+            f"reliability has {len(reliability)} rows, but neighbors name row {int(neighbors.index.max())}"
+        )
     return (reliability[: len(neighbors.index)] <= 0) & ~_any_reliable(neighbors, reliability)
 
 

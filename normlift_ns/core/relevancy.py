@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule
 
@@ -90,6 +91,7 @@ RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
 }
 
 
+@check_arguments
 def relevancy(
     positive: Float[ArrayT, "*n q"],
     negative: Float[ArrayT, "*n b"] | None = None,
@@ -115,8 +117,11 @@ def relevancy(
     >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """
-    if rule not in RELEVANCY_RULES:
-        raise InputError(f"rule must be one of {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    if not 0 < temperature < math.inf:
+        raise InputError(f"temperature must be positive and finite, got {temperature}")
+    if negative is not None and type(negative) is not type(positive):  # lists, or NumPy beside torch
+        convert = np.asarray if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor
+        negative = cast(Any, convert(negative))
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
         raise InputError('rule "contrast" compares with the null level, which the field does not have; choose "cosine"')
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):

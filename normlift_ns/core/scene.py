@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
@@ -17,6 +18,7 @@ _TOLERANCE = 1e-5
 """Relative tolerance of camera parameters, with a tenth of it as absolute tolerance for values near zero."""
 
 
+@check_arguments
 class View(NamedTuple):
     """An image with its camera.
 
@@ -31,13 +33,14 @@ class View(NamedTuple):
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
-    mask: Bool[Tensor, "h w"] | None
+    mask: Bool[Tensor, "mask_h mask_w"] | None  # readers compare the size, and name the file
     """True at pixels that count; None: all pixels count."""
     name: str
     """Path of the image file relative to the dataset, with forward slashes."""
     original: tuple[int, int] | None = None
     """Width and height of the image before it was undistorted; None: it was not undistorted."""
 
+    @check_arguments
     def downscaled(self, height: int, width: int) -> View:
         """Downscale by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
         camera = self.camera

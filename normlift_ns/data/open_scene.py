@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View, Views, camera_summary, cameras_differ
@@ -230,6 +231,7 @@ def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
 # Scenes and lifted runs.
 
 
+@check_arguments
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
     """Open a trained splatfacto run or a lifted run, from any working directory.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.cameras import adjust_poses, candidate_worlds, read_camera_file
 from normlift_ns.data.frames import WorldTransform, transform_frames
@@ -19,6 +20,7 @@ from normlift_ns.options import SplatOptions
 from normlift_ns.registry import Registry
 
 
+@check_arguments
 def open_splat(
     path: str | Path, options: SplatOptions, *, say: Callable[[str], None] = lambda text: None
 ) -> SplatScene:

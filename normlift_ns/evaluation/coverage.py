@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from normlift_ns.analysis.objects import connected_components
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
 from normlift_ns.core.lift import Scalars, reliability
@@ -684,6 +685,7 @@ class SuggestedImage:
     """Numbers of the regions that it shows, from 1."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Coverage:
     """Gaps in the evidence of a lift, and views that would fill them.
@@ -717,6 +719,7 @@ class Coverage:
         rows = {name: [asdict(row) for row in plain[name]] for name in ("regions", "photographs")}
         return {**plain, **rows, "poses": [pose.to_json() for pose in self.poses]}
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
         """Write a JSON file, and next to it <stem>_pose_1.png … and <stem>_camera_path.json; return the paths.
 
@@ -742,6 +745,7 @@ class Coverage:
         return write_poses(stem, self.poses, self.pictures, documents=documents, overwrite=overwrite)
 
 
+@check_arguments
 def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
     """Find regions that lack reliable evidence, unused images that would help most, and new poses for the worst
     regions.

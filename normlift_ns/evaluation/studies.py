@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Lifted, Scalars, reliability
 from normlift_ns.core.lowrank import StoredDirections
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 Variant = Literal["none", "plain_knn", "linear", "norm_only", "support_only", "paper", "posterior"]
 
 
+@check_arguments
 def refine_variant(
     variant: Variant,
     means: Float[Tensor, "n 3"],

@@ -10,7 +10,9 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -448,20 +450,40 @@ def complete_interrupted_writes(folder: Path) -> None:
 
 
 @contextmanager
+def deferred_signals() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM wait until the end of this context, which must be short."""
+    if threading.current_thread() is not threading.main_thread():  # where no signal raises
+        yield
+        return
+    arrived, before = list[int](), dict[int, Any]()
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, lambda number, _: arrived.append(number))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        for number in arrived:
+            signal.raise_signal(number)
+
+
+@contextmanager
 def _draft_folder(*paths: Path) -> Iterator[Path]:
     """Yield a temporary folder next to the paths; error messages name these paths, not the temporary ones."""
     folder, temporary = paths[0].parent, None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         complete_interrupted_writes(folder)
-        temporary, descriptor = _temporary_folder(folder)
+        descriptor = None
         try:
+            with deferred_signals():
+                temporary, descriptor = _temporary_folder(folder)
             yield temporary
         finally:
             try:
-                complete_journal(temporary)
-                shutil.rmtree(temporary, ignore_errors=True)
+                _discard(temporary)
             finally:
+                _discard(temporary)  # again, because a signal may come just before they wait
                 release_lock(descriptor)
     except (OSError, RuntimeError, SafetensorError) as error:  # the latter two from torch and safetensors, disk full
         reason = str(error)
@@ -473,6 +495,13 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
             reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
+
+
+def _discard(temporary: Path | None) -> None:
+    if temporary is not None and temporary.exists():
+        with deferred_signals():
+            complete_journal(temporary)
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _temporary_folder(folder: Path) -> tuple[Path, int | None]:

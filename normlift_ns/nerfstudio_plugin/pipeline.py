@@ -182,7 +182,7 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     field = replace(result.field, manifest={**result.field.manifest, "source": settings})
     folder = trainer.base_dir / FIELD_FOLDER
     files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
-    field.save(folder, overwrite=True, beside=run_file_digests(folder, files))
+    field.save(folder, overwrite=True, beside=run_file_digests(folder, files), own=True)
     question = query_to_store(field, scene.gaussians.means, source, options.queries)
     if question is not None:
         save_query(folder, question)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy, top_values
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.options import RelevancyRule
@@ -130,6 +131,7 @@ class Answer:
         return [finding.to_json() for finding in self]
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Finding:
     """Result of a query for one prompt.
@@ -348,6 +350,7 @@ _EPSILON = 1e-6
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Histogram:
     """Relevancies of one prompt in bins of equal width, with the threshold within their range.

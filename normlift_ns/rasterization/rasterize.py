@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Int64, UInt8
 from torch import Tensor
 from typing_extensions import Unpack
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import has_triton, retry_in_halves
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -101,6 +102,7 @@ class RasterOptions(TypedDict, total=False):
     """
 
 
+@check_arguments
 def rasterize_evidence(
     scene: GaussianScene,
     cameras: Iterable[Camera],
@@ -155,7 +157,7 @@ def rasterize_evidence(
         warnings.warn(
             f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, "
             "and are not drawn",
-            stacklevel=2,
+            stacklevel=3,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
     parts: list[Entries] = []
@@ -194,6 +196,7 @@ def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpac
     return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
 
+@check_arguments
 def render(
     scene: GaussianScene,
     camera: Camera,
@@ -230,7 +233,7 @@ def render(
     >>> image.tolist(), alpha.tolist()
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
-    if values.ndim != 2 or len(values) != len(scene):
+    if len(values) != len(scene):
         raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job)
@@ -325,6 +328,7 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
     return max(high, UNLABELED) + 1 if count is None else count
 
 
+@check_arguments
 class Contributors(NamedTuple):
     """Gaussians that contribute to P pixels: entries offsets[p] to offsets[p + 1] belong to pixel p, nearest first.
 
@@ -341,6 +345,7 @@ class Contributors(NamedTuple):
     """Weights A_pj in 0..1; those of a pixel add up to its alpha."""
 
 
+@check_arguments
 def contributors(
     scene: GaussianScene,
     camera: Camera,
@@ -400,8 +405,6 @@ def contributors(
 
 
 def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or pixels.dtype.is_floating_point or pixels.dtype == torch.bool:
-        raise InputError(f"pixels must be integers [P, 2], (column, row), got {pixels.dtype} {tuple(pixels.shape)}")
     size = pixels.new_tensor([camera.width, camera.height])
     outside = ((pixels < 0) | (pixels >= size)).any(dim=1).nonzero()
     if len(outside) > 0:

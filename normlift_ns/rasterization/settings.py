@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS
 
 
+@check_arguments
 @dataclass(frozen=True)
 class RasterSettings:
     """Constants of gsplat's kernels, as splatfacto calls them; the defaults are those of gsplat 1.4.0.
@@ -54,7 +56,17 @@ class RasterSettings:
     min_transmittance: float = 1e-4
     """A pixel stops before the first Gaussian that would leave this or less transmittance."""
 
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("near_plane", 0.0, self.far_plane), ("eps2d", 0.0, 1e6), ("frustum_margin", 0.0, 1e6),
+            ("min_discriminant", 0.0, 1e6), ("min_compensation", 0.0, 1.0), ("radius_sigmas", 0.0, 1e6),
+            ("tile_size", 1, 2**15), ("max_alpha", 0.0, 1.0), ("min_alpha", 0.0, 1.0), ("min_transmittance", 0.0, 1.0),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must be in {low:g}..{high:g}, got {getattr(self, name)}")
+
     @staticmethod
+    @check_arguments
     def of_gsplat(version: str) -> RasterSettings:
         """Return the constants of gsplat 1.4, 1.5 or 1.6; the last is not released yet and may change.
 
@@ -76,6 +88,7 @@ class RasterSettings:
         return rectangle if minor == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)
 
     @staticmethod
+    @check_arguments
     def recorded(manifest: Mapping[str, Any]) -> RasterSettings:
         """Return the constants of the `gsplat_rules` in a manifest; without this entry, those of gsplat 1.4.
 

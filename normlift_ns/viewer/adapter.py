@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import functools
 import http
 import inspect
 import io
@@ -18,6 +19,9 @@ from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, UInt32
+from msgspec import MsgspecError
+
+from normlift_ns.viewer.host_check import accepted_names, refuse_request
 
 SCRIPT = """
 (() => {
@@ -113,10 +117,13 @@ def picture_script(jpeg: bytes) -> str:
     return _PICTURE.replace("CONTENT", base64.b64encode(jpeg).decode())
 
 
+_PLAIN_TEXT = {"Content-Type": "text/plain; charset=utf-8", "X-Content-Type-Options": "nosniff"}
+
+
 @contextlib.contextmanager
-def guarded() -> Iterator[None]:
-    """Restrict viser servers that start in this context to the files of the page, which then contains our script for
-    browsers without WebGL, and disable compression.
+def guarded(names: frozenset[str]) -> Iterator[None]:
+    """Restrict viser servers that start in this context to requests for one of `names` and to the files of the page,
+    which then contains our script for browsers without WebGL, and disable compression.
 
     Otherwise, 0.2.7 serves any file that a path with .. leads to, and spends seconds on compressing colors.
     """
@@ -124,7 +131,7 @@ def guarded() -> Iterator[None]:
 
     _infra: Any = known
     if not hasattr(_infra, "WebSocketServerProtocol"):  # 1.x
-        with _guarded_one():
+        with _guarded_one(names):
             yield
         return
     module = _infra.websockets.server
@@ -134,6 +141,9 @@ def guarded() -> Iterator[None]:
 
     def guarded_serve(handler: Any, host: str, port: int, *, process_request: Any = None, **options: Any) -> Any:
         async def request(path: str, headers: Any) -> Any:
+            refused = refuse_request(headers.get_all("Host"), headers.get_all("Origin"), names)
+            if refused is not None:
+                return http.HTTPStatus.FORBIDDEN, _PLAIN_TEXT, f"403: {refused}\n".encode()
             place = unquote(path.partition("?")[0])
             if headers.get("Upgrade") == "websocket":
                 return await process_request(path, headers)
@@ -147,7 +157,8 @@ def guarded() -> Iterator[None]:
                 return http.HTTPStatus.NOT_FOUND, {}, b"404"
             return status, told, with_script(content)
 
-        return serve(handler, host, port, process_request=request, **{**options, "compression": None})
+        options["compression"] = None
+        return serve(_closing_malformed(handler), host, port, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
@@ -157,7 +168,7 @@ def guarded() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarded_one() -> Iterator[None]:
+def _guarded_one(names: frozenset[str]) -> Iterator[None]:
     """Guard the file server of viser 1.x, which already rejects paths outside its folder and does not compress."""
     from viser.infra import _infra  # noqa: PLC0415
 
@@ -166,8 +177,13 @@ def _guarded_one() -> Iterator[None]:
     serve: Any = module.serve
     missing = (http.HTTPStatus.NOT_FOUND, "Not Found", Headers({"Content-Length": "3"}), b"404")
 
-    def guarded_serve(*handlers: Any, process_request: Any = None, **options: Any) -> Any:
+    def guarded_serve(handler: Any, *address: Any, process_request: Any = None, **options: Any) -> Any:
         def request(connection: Any, asked: Any) -> Any:
+            refused = refuse_request(asked.headers.get_all("Host"), asked.headers.get_all("Origin"), names)
+            if refused is not None:
+                content = f"403: {refused}\n".encode()
+                headers = Headers({**_PLAIN_TEXT, "Content-Length": str(len(content))})
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, content)
             place = asked.path.partition("?")[0]
             if asked.headers.get("Upgrade") == "websocket":
                 return process_request(connection, asked)
@@ -186,13 +202,36 @@ def _guarded_one() -> Iterator[None]:
             headers = Headers({"Content-Type": "text/html", "Content-Length": str(len(content))})
             return Response(found.status_code, found.reason_phrase, headers, content)
 
-        return serve(*handlers, process_request=request, **options)
+        return serve(_closing_malformed(handler), *address, process_request=request, **options)
 
     module.serve = guarded_serve
     try:
         yield
     finally:
         module.serve = serve
+
+
+def _closing_malformed(handler: Any) -> Any:
+    """Let a malformed message close its connection, as a browser would; viser would forget to clean up after it."""
+    from viser._messages import Message  # noqa: PLC0415
+
+    @functools.wraps(handler)
+    async def handle(connection: Any, *rest: Any) -> None:
+        receive = connection.recv
+
+        async def recv() -> Any:
+            raw = await receive()
+            try:
+                Message.deserialize(raw)
+            except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MsgspecError):
+                await connection.close(1008)
+                return await receive()  # raises viser's signal of a closed connection
+            return raw
+
+        connection.recv = recv
+        await handler(connection, *rest)
+
+    return handle
 
 
 # Adapter for viser in its two versions: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
@@ -294,6 +333,7 @@ class ViserServer:
         label: text above the panel of every page.
         on_page: called in a separate thread for every browser that connects or reconnects.
         on_gone: called with the number of the page when it is closed or its connection is lost.
+        allowed_hosts: further names of this server, see `host_check.accepted_names`.
     """
 
     def __init__(
@@ -303,10 +343,14 @@ class ViserServer:
         label: str,
         on_page: Callable[[BrowserPage], None],
         on_gone: Callable[[int], None],
+        allowed_hosts: Sequence[str] = (),
     ) -> None:
         import viser  # noqa: PLC0415 (--help should not wait for it)
 
-        with guarded(), contextlib.redirect_stdout(io.StringIO()):  # hides viser's table of addresses
+        with (
+            guarded(accepted_names(host, allowed_hosts)),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # hides viser's table of addresses
             self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         handle_in_order(self._server)
         self.host, self.port = host, self._server.get_port()
@@ -598,12 +642,12 @@ def _ignore_invalid_values(connection: Any) -> None:
         invalid = contextlib.suppress(ArithmeticError, AssertionError, TypeError, ValueError)
 
         def handle(number: int, message: Any) -> None:
-            if all(map(_finite, message.updates.values())):
+            if isinstance(message.updates, dict) and all(map(_finite, message.updates.values())):
                 with invalid:
                     handler(number, message)
 
         async def handle_async(number: int, message: Any) -> None:  # 1.x
-            if all(map(_finite, message.updates.values())):
+            if isinstance(message.updates, dict) and all(map(_finite, message.updates.values())):
                 with invalid:
                     await handler(number, message)
 
@@ -685,10 +729,10 @@ OPENING = "Opening the run."
 class Door:
     """Server that accepts pages immediately, before torch is imported and the run is read; the pages wait meanwhile."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, allowed_hosts: Sequence[str] = ()) -> None:
         self._lock, self._waiting = threading.Lock(), dict[int, BrowserPage]()
         self._hosts: tuple[Callable[[BrowserPage], None], Callable[[int], None]] | None = None
-        self.server = ViserServer(host, port, "normlift", self._come, self._go)
+        self.server = ViserServer(host, port, "normlift", self._come, self._go, allowed_hosts)
 
     def open(self, label: str, come: Callable[[BrowserPage], None], go: Callable[[int], None]) -> None:
         """Pass on the waiting pages and all later ones.

@@ -157,7 +157,7 @@ def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    def door(host: str, port: int) -> SimpleNamespace:
+    def door(host: str, port: int, _: object) -> SimpleNamespace:
         doors.append((host, port))
         return SimpleNamespace(server=SimpleNamespace(port=7010))
 

@@ -269,7 +269,7 @@ def test_refusals(unchecked):
     features = unit_rows(20, 4, 0)
     for arguments, message in (
         ({"features": features[:3]}, r"features.* 20.* 3"),
-        ({"level": torch.zeros(3, dtype=torch.int64)}, "level must have"),
+        ({"level": torch.zeros(3, dtype=torch.int64)}, r"level .*s = 20.*\(3,\)"),
         ({"power": -1.0}, "power .*-1"),
         ({"power": float("nan")}, "power .*nan"),
         ({"power": "1"}, "power .*'1'"),
@@ -279,12 +279,10 @@ def test_refusals(unchecked):
         ({"least": -0.1}, r"least .*-0\.1"),
         ({"least": 1.1}, r"least .*1\.1"),
         ({"least": float("nan")}, "least .*nan"),
-        ({"features": features.tolist()}, "features .*list"),
         ({"features": torch.ones(20)}, r"features .*float32 \(20,\)"),
         ({"features": features.long()}, r"int64 \(20, 4\)"),
         ({"level": torch.arange(20.0)}, "level "),
         ({"level": torch.arange(20) - 1}, "level "),
-        ({"level": [0] * 20}, "level .*list"),
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})

@@ -179,7 +179,8 @@ def test_bad_input_is_named():
         (unit_rows(3, D, 0), {}, r"features .*\[4, D\]"),
         (torch.zeros(4, D).int(), {}, "int32"),
         (good, {"beta": -1.0}, "beta .*>= 0"),
-        (good, {"beta": math.nan}, "beta .*>= 0"),
+        (good, {"beta": math.nan}, "beta .*nan"),
+        (good, {"beta": math.inf}, "beta .*>= 0"),
         (good, {"unlabeled": "drop"}, "unlabeled .*ignore.*dilute"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -296,7 +296,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     ):
         with pytest.raises((nl.InputError, FileNotFoundError), match=message):
             nl.open_splat(path, nl.SplatOptions(**options))
-    with pytest.raises(TypeError, match="SplatOptions, got str and str"):
+    with pytest.raises(TypeError, match="options must be of type SplatOptions"):
         nl.open_splat("x.ply", "capture")  # type: ignore[arg-type]
 
 

@@ -1,5 +1,6 @@
 """Damage and files in the wrong place are noticed before any number is used, and nothing is read outside of arrays."""
 
+import copy
 import json
 import random
 import shutil
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -123,20 +125,24 @@ def with_value(tensor: torch.Tensor, value: float) -> torch.Tensor:
     return changed
 
 
+def forged(record: Any, **values: Any) -> Any:
+    """Replace fields without the checks of the constructor."""
+    new = copy.copy(record)
+    for name, value in values.items():
+        object.__setattr__(new, name, value)
+    return new
+
+
 def with_scalar(name: str, value: float) -> Callable[[SemanticField], SemanticField]:
-    return lambda f: replace(f, scalars=replace(f.scalars, **{name: with_value(getattr(f.scalars, name), value)}))
+    return lambda f: forged(f, scalars=replace(f.scalars, **{name: with_value(getattr(f.scalars, name), value)}))
 
 
 def with_rows(**arrays: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
-    """Other evidence, put together without the checks of its constructor."""
-
     def change(field: SemanticField) -> SemanticField:
         assert isinstance(field.store, StoredEvidence)
-        rows = field.store.evidence.rows
-        new = replace(rows, **{name: make(getattr(rows, name)) for name, make in arrays.items()})
-        evidence = replace(field.store.evidence)
-        object.__setattr__(evidence, "rows", new)
-        return replace(field, store=replace(field.store, evidence=evidence))
+        evidence = field.store.evidence
+        rows = forged(evidence.rows, **{name: make(getattr(evidence.rows, name)) for name, make in arrays.items()})
+        return forged(field, store=forged(field.store, evidence=forged(evidence, rows=rows)))
 
     return change
 
@@ -144,7 +150,7 @@ def with_rows(**arrays: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Sem
 def with_table(make: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
     def change(field: SemanticField) -> SemanticField:
         name = "features" if isinstance(field.store, StoredEvidence) else "coordinates"
-        return replace(field, store=replace(field.store, **{name: make(getattr(field.store, name))}))
+        return forged(field, store=forged(field.store, **{name: make(getattr(field.store, name))}))
 
     return change
 
@@ -152,10 +158,10 @@ def with_table(make: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Semant
 NAN, INF = float("nan"), float("inf")
 TABLE = "(features|coordinates)"
 WRONG = {
-    "negative source": (lambda f: replace(f, source=with_value(f.source, -1)), "source .* -1"),
-    "source out of range": (lambda f: replace(f, source=with_value(f.source, N)), rf"source .*\.\.{N}"),
-    "short source": (lambda f: replace(f, source=f.source[1:]), r"source is int32 \(39,\)"),
-    "long source": (lambda f: replace(f, source=f.source.long()), r"source is int64 \(40,\)"),
+    "negative source": (lambda f: forged(f, source=with_value(f.source, -1)), "source .* -1"),
+    "source out of range": (lambda f: forged(f, source=with_value(f.source, N)), rf"source .*\.\.{N}"),
+    "short source": (lambda f: forged(f, source=f.source[1:]), r"source is int32 \(39,\)"),
+    "long source": (lambda f: forged(f, source=f.source.long()), r"source is int64 \(40,\)"),
     "NaN norm": (with_scalar("norm", NAN), "norm .* nan"),
     "negative weight": (with_scalar("weight", -1.0), "weight .* -1"),
     "infinite reliability": (with_scalar("reliability", INF), r"reliability .*\.\.inf"),

@@ -95,7 +95,7 @@ def test_other_pixels_are_refused(unchecked):
         (torch.tensor([[0, 0], [20, 3]]), r"pixels\[1\] .*\(20, 3\).* 20 columns .*10 rows"),
         (torch.tensor([[0, 10]]), r"pixels\[0\] .*\(0, 10\)"),
         (torch.tensor([[0, -1]]), r"pixels\[0\] .*\(0, -1\)"),
-        (torch.tensor([[0.5, 1.0]]), r"\[P, 2\].* torch.float32 \(1, 2\)"),
+        (torch.tensor([[0.5, 1.0]]), r"\[p, 2\].* torch.float32 \(1, 2\)"),
         (torch.tensor([1, 2]), r"torch.int64 \(2,\)"),
     ):
         with pytest.raises(ValueError, match=told):

@@ -66,9 +66,8 @@ def test_gsplat_draws_what_its_compiled_code_can(on_gpu, monkeypatch):
     with pytest.raises(ValueError, match=r"max_alpha"):
         gsplat.check(job(on_gpu, max_alpha=0.99))
     triton.check(job(on_gpu, max_alpha=0.99, tile_size=32))
-    for size in (0, 20):
-        with pytest.raises(ValueError, match=rf"tile_size .*power of two.* {size};"):
-            triton.check(job(on_gpu, tile_size=size))
+    with pytest.raises(ValueError, match=r"tile_size .*power of two.* 20;"):
+        triton.check(job(on_gpu, tile_size=20))
     for installed, rules, changed in (
         ("1.4.0", "1.4", None),
         ("1.4.0", "1.5", "per_axis, radius_sigmas"),

@@ -15,7 +15,6 @@ from tests.torture.conftest import INSTANTS, SHORT, Record, Server
 
 pytestmark = pytest.mark.slow
 
-TERMS = 1 if SHORT else 3
 Tree = dict[str, Any]
 
 
@@ -102,7 +101,8 @@ def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record)
     draw, seen = random.Random(0), Counter()
     moments: list[dict[str, Any]] = [{"step": step} for step in spread(draw, steps, INSTANTS - INSTANTS // 5)]
     moments += [{"seconds": draw.uniform(0.05, took)} for _ in range(INSTANTS // 5)]
-    moments += [{"step": step, "signal": signal.SIGTERM} for step in spread(draw, steps, TERMS)]
+    terms = 1 if SHORT else 3 if command == "lift" else INSTANTS
+    moments += [{"step": step, "signal": signal.SIGTERM} for step in spread(draw, steps, terms)]
     for moment in moments:
         place.restore()
         ((code, taken),) = place.server.run({"words": words, "folder": str(watched), **moment})
@@ -121,7 +121,7 @@ def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record)
         f"kill -9 during `{name}`",
         INSTANTS,
         "nothing lost or left over; run again it equals an undisturbed one. Found, with "
-        f"{TERMS} SIGTERM: {seen['old']} times what was there before, {seen['new']} times the new",
+        f"{terms} SIGTERM: {seen['old']} times what was there before, {seen['new']} times the new",
     )
 
 

@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection
 
 from normlift_ns.viewer.adapter import BrowserPage, ViserServer, ignore_closed_clients
 from tests.viewer.scenes import free_port, until
-from tests.viewer.wire import ONE, messages, opened
+from tests.viewer.wire import CAMERA, ONE, messages, opened
 
 pytestmark = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
 NAME, NOTICE = ("uuid", "GuiMarkdownMessage") if ONE else ("id", "GuiAddMarkdownMessage")
@@ -167,6 +167,20 @@ def test_nonsense_in_a_widget_is_passed_over_and_clicks_come_until_nobody_listen
         until(lambda: len(heard) == 3)
         assert [tuple(direction) for _, direction in clicks] == [(0, 0, 1)]
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_malformed_messages_harm_no_other_page_and_print_no_traceback(server, pages, capfd):
+    known = {"type": "GuiUpdateMessage", NAME: "none", "updates": {"value": 1}}
+    objects = [[1], 3, None, {"type": "Nothing"}, {}, known, {**known, "updates": []}, {**known, NAME: [3]},
+               {**CAMERA, "fov": "wide"}, {**CAMERA, "position": 3}, {"type": "ScenePointerMessage"}]  # fmt: skip
+    with browsing(server, pages) as (other, page):
+        for frame in (b"", b"\xc1", b"\x81", "text", bytes(range(256)), *map(msgspec.msgpack.encode, objects)):
+            with browsing(server, pages) as (browser, _):
+                browser.send(frame)
+            page.notice(f"after {frame!r}"[:60])
+            received(other, NOTICE)
+    until(lambda: all(one.gone for one in pages))
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told():

@@ -1,0 +1,84 @@
+"""Memory that this process may still allocate: of the machine, of its cgroups, and of `ulimit -v`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+_LIFT_BYTES, _GAUSSIAN_BYTES, _PIXEL_BYTES = 2**29, 600, 32
+"""Least memory of a lift of any size, per Gaussian (parameters, their copy in the new run, scalars) and per pixel of a
+view."""
+
+
+def free_memory(root: Path = Path("/")) -> dict[str, int]:
+    """Return the free bytes under each limit, by its name; empty if the system does not report them.
+
+    Args:
+        root: Folder that contains proc and sys.
+    """
+    free: dict[str, int] = {}
+    with suppress(OSError, ValueError, IndexError):
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        free["the machine"] = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    for limit, used in _cgroup_files(root):
+        with suppress(OSError, ValueError):  # such as "max"
+            left = int((limit).read_text()) - int(used.read_text())
+            free["the cgroup"] = min(left, free.get("the cgroup", left))
+    with suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415 (Unix only)
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit != resource.RLIM_INFINITY:
+            pages = int((root / "proc/self/statm").read_text().split()[0])
+            free["ulimit -v"] = limit - pages * resource.getpagesize()
+    return free
+
+
+def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the files of limit and use, of version 2 and version 1, of the own group and of those around it."""
+    lines: list[str] = []
+    with suppress(OSError, ValueError):
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    for line in lines:
+        controllers, colon, group = line.partition(":")[2].partition(":")
+        if controllers == "" and colon:
+            base, names = root / "sys/fs/cgroup", ("memory.max", "memory.current")
+        elif "memory" in controllers.split(","):
+            base, names = root / "sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes")
+        else:
+            continue
+        own = base / group.lstrip("/")
+        for folder in (own, *own.parents):
+            if folder.is_relative_to(base):  # in a container, only the outermost one may be visible
+                yield folder / names[0], folder / names[1]
+
+
+def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = True) -> None:
+    """Raise if a lift of so many Gaussians and pixels of a view certainly does not fit into memory.
+
+    Args:
+        gaussians: Number of Gaussians.
+        pixels: Number of pixels of a view.
+        loaded: False if torch is not imported yet, whose libraries count for `ulimit -v`.
+    Raises:
+        MemoryError: The lift does not fit; the message has the estimate.
+    """
+    needed = gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
+    for name, free in free_memory().items():
+        start = 0 if loaded else _library_bytes() if name == "ulimit -v" else _LIFT_BYTES
+        bytes_needed = start + needed
+        if free < bytes_needed:
+            raise MemoryError(
+                f"The lift needs at least {bytes_needed / 2**30:.2f} GiB of memory, but {name} leaves "
+                f"{max(0, free) / 2**30:.2f} GiB. Raise the limit, close other programs, or lift a smaller scene."
+            )
+
+
+def _library_bytes() -> int:
+    """Return the size of the libraries of torch and CUDA, which are mapped as a whole."""
+    spec = find_spec("torch")
+    places = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    files = [file for place in places for file in (*place.glob("lib/*.so*"), *place.parent.glob("nvidia/*/lib/*.so*"))]
+    return sum(file.stat().st_size for file in files if file.is_file())

@@ -1,0 +1,133 @@
+"""Commands end with a message or in silence: narrow terminals, signals, closed streams, small memory."""
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from normlift_ns.cli import common
+from normlift_ns.cli.batch import _parse
+from normlift_ns.cli.evaluate import NormLiftEval
+from normlift_ns.errors import InputError, describe_error
+from normlift_ns.io import memory
+from normlift_ns.io.atomic import atomic_file, deferred_signals
+from research.reference import COMMANDS
+
+RUN = [sys.executable, "-m", "normlift_ns.cli.query"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_ends_at_every_width(name, monkeypatch, capsys):
+    widths = range(1, 401) if os.environ.get("NORMLIFT_EVERY_WIDTH") else (1, 2, 39, 41, 400)
+    for columns in widths:
+        monkeypatch.setenv("COLUMNS", str(columns))
+        with pytest.raises(SystemExit) as stop:
+            common.parse_flags(COMMANDS[name], ["--help"], name)
+        assert stop.value.code == 0 and os.environ["COLUMNS"] == str(columns)
+    assert "--help" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_end_in_silence(closed):
+    for flags, code in (("--help", 0), ("--load-config /nowhere/config.yml --text a", 1), ("--zzz", 1)):
+        done = subprocess.run(f"{' '.join(RUN)} {flags} {closed}", shell=True, capture_output=True, check=False)
+        assert done.returncode == code and b"Traceback" not in done.stderr + done.stdout
+        assert b"bug" not in done.stderr + done.stdout
+
+
+def test_signals_wait_for_the_end_of_a_critical_section():
+    done = []
+    with pytest.raises(KeyboardInterrupt), deferred_signals():
+        signal.raise_signal(signal.SIGINT)
+        done.append(1)
+    assert done == [1] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    worker = threading.Thread(target=lambda: done.append(deferred_signals().__enter__()))  # changes no handler
+    worker.start()
+    worker.join()
+    assert len(done) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_no_temporary_folder_outlives_a_signal_at_any_call(number, tmp_path, monkeypatch):
+    """The signal comes at the n-th call of a function while a file is written."""
+    for instant in range(1, 400, 10):
+        calls = 0
+
+        def trace(_frame, event, _argument, instant=instant):
+            nonlocal calls
+            calls += event == "call"
+            if calls == instant:
+                calls += 1
+                signal.raise_signal(number)
+
+        try:
+            with common._sigterm_raises():
+                sys.setprofile(trace)
+                with atomic_file(tmp_path / "a.txt", overwrite=True) as draft:
+                    draft.write_text("content")
+        except (KeyboardInterrupt, common.TerminatedError):
+            pass
+        finally:
+            sys.setprofile(None)
+        gc.collect()
+        assert {path.name for path in tmp_path.iterdir()} <= {"a.txt"}, instant
+
+
+def test_a_signal_while_an_object_is_deleted_is_not_lost(capsys):
+    class Slow:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt  # as from Ctrl-C at this instant
+
+    with pytest.raises(KeyboardInterrupt), common._sigterm_raises():
+        Slow()
+        for _ in range(500):
+            time.sleep(0.01)
+    assert "ignored" not in capsys.readouterr().err
+
+
+def system(root: Path, cgroup: str, files: dict[str, object]) -> Path:
+    files = {"proc/meminfo": "MemAvailable: 8388608 kB\n", "proc/self/cgroup": cgroup, "proc/self/statm": "1", **files}
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(str(text))
+    return root
+
+
+def test_limits_of_cgroups_are_read(tmp_path):
+    v2 = {"sys/fs/cgroup/a/memory.max": 5000, "sys/fs/cgroup/a/memory.current": 1000,
+          "sys/fs/cgroup/a/b/memory.max": "max", "sys/fs/cgroup/a/b/memory.current": 10}  # fmt: skip
+    assert memory.free_memory(system(tmp_path / "2", "0::/a/b\n", v2))["the cgroup"] == 4000
+    base = "sys/fs/cgroup/memory/memory."
+    v1 = {f"{base}limit_in_bytes": 900, f"{base}usage_in_bytes": 100}
+    assert memory.free_memory(system(tmp_path / "1", "4:memory:/docker/x\n0::/\n", v1))["the cgroup"] == 800
+    assert memory.free_memory(tmp_path / "none").keys() <= {"ulimit -v"}
+    assert memory.free_memory(system(tmp_path / "0", "nonsense", {}))["the machine"] == 2**33
+
+
+def test_a_lift_that_cannot_fit_is_refused_with_the_estimate(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: {"the cgroup": 2**30})
+    memory.refuse_small_memory(1_000_000, 10**6)
+    with pytest.raises(MemoryError, match=r"at least 5\.59 GiB .* the cgroup leaves 1\.00 GiB"):
+        memory.refuse_small_memory(10_000_000)
+    command = f"ulimit -v 1000000; {sys.executable} -m normlift_ns.cli.lift --load-config {__file__}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    for error in (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), MemoryError(),
+                  RuntimeError("can't start new thread")):  # fmt: skip
+        assert describe_error(error)[1] == 1 and "memory is full" in describe_error(error)[0]
+
+
+def test_options_without_effect_are_refused():
+    with pytest.raises(InputError, match="ns-normlift --help"):
+        _parse(["--load-config", "a", "--help"])
+    for protocol in ("masks", "none", "scannet"):
+        words = ["--protocol", protocol, "--margin", "0.5", "--load-config", "a", "--labels", "b"]
+        command = common.parse_flags(NormLiftEval, words, "x")
+        with pytest.raises(InputError, match="--margin is an option of --protocol lerf"):
+            command._check()
