@@ -36,6 +36,7 @@ _UNHURRIED = """
 const [soon, never, waiting] = [requestAnimationFrame, cancelAnimationFrame, new Map()];
 let [names, awake] = [0, 6000];
 window.counts = {frames: 0, sent: 0};
+window.wanted = {};
 const draw = (name) => {
   const picture = waiting.get(name);
   if (picture) picture.frame ??= soon((now) => { waiting.delete(name); counts.frames++; picture.draw(now); });
@@ -59,6 +60,7 @@ window.wake = () => {
 };
 for (const what of ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "input", "resize"])
   addEventListener(what, wake, true);
+addEventListener("click", ({target}) => { wanted.hit ||= wanted.element?.contains(target); }, true);
 addEventListener("scroll", ({target}) => { (target.scrollingElement ?? target).scrollLeft = 0; }, true);
 const heard = (Kind) => class extends Kind {
   constructor(...how) { super(...how); this.addEventListener("message", wake); }
@@ -159,7 +161,17 @@ class Person:
 
     def press(self, name: str) -> None:
         with self.sending():
-            self.button(name).first.click()
+            self.hit(self.button(name).first)
+
+    def hit(self, element: Locator) -> None:
+        """Clicks on an element, and again if the page has moved it away meanwhile, as a message above it does."""
+
+        def clicked() -> bool:
+            element.evaluate("element => { wanted = {element} }")
+            element.click()
+            return self.page.evaluate("wanted.hit ?? false")
+
+        self.until(clicked, "hit")
 
     def field(self, label: str) -> Locator:
         """The input to the right of a label; of a slider, the number."""

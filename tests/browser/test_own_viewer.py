@@ -65,7 +65,7 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, tmp_pa
         page.press("Undo")
     page.selects(lambda count: count == ball, "hides undone")
 
-    page.page.get_by_text("Box", exact=True).click()
+    page.hit(page.page.get_by_text("Box", exact=True))
     page.press("Around")
     page.until(lambda: page.typed("Size") != "1", "the box is around the ball")  # Outside reads it
     page.press("Outside")

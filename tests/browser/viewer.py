@@ -71,12 +71,12 @@ class Tab(Person):
 
     def choose(self, label: str, option: str) -> None:
         if self.typed(label) != option:
-            self.field(label).click()
+            self.hit(self.field(label))
             with self.sending():
-                self.page.get_by_role("option", name=option, exact=True).click()
+                self.hit(self.page.get_by_role("option", name=option, exact=True))
 
     def tab(self, name: str) -> None:
-        self.page.get_by_role("tab", name=name, exact=True).click()
+        self.hit(self.page.get_by_role("tab", name=name, exact=True))
 
     def output(self) -> str:
         """The output that is shown; as after `show`, the tab Search is open afterwards."""
