@@ -372,7 +372,7 @@ def check_path(name: str, value: object) -> Path:
         name: Name of the option.
         value: The string or path.
     Raises:
-        InputError: The value is neither, or contains a NUL character.
+        InputError: The value is neither, or contains a NUL character or one that cannot be encoded.
 
     >>> check_path("data", "fox").name
     'fox'
@@ -383,6 +383,10 @@ def check_path(name: str, value: object) -> Path:
         raise InputError(
             f"{option_name(name)} is not a valid path: it contains a NUL character ({short_repr(os.fspath(value))})"
         )
+    try:
+        os.fsencode(value)
+    except UnicodeEncodeError:
+        raise InputError(f"{option_name(name)} is not a valid path: {os.fspath(value)!a} cannot be encoded") from None
     return Path(value)
 
 

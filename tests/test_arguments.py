@@ -263,6 +263,38 @@ def test_arrays_of_every_library_give_the_same(unchecked):
     assert torch.equal(FIELD.query(FEATURES.tolist()), FIELD.query(FEATURES.numpy()))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [torch.Tensor.to_sparse, lambda x: x.to("meta"), lambda x: torch.nested.nested_tensor([x]),
+     lambda x: x.to(torch.float8_e4m3fn)],
+)  # fmt: skip
+def test_tensors_that_are_no_arrays_are_refused(change: Callable[[torch.Tensor], torch.Tensor], unchecked) -> None:
+    calls = {
+        "reliability": lambda: nl.unsupported(NEAR, change(ONES)),
+        "text_vectors": lambda: FIELD.query(change(FEATURES)),
+        "positive": lambda: nl.relevancy(change(UNIT), change(UNIT), rule="lerf"),
+        "K": lambda: nl.Camera(change(K), POSE, 16, 16),
+        "means": lambda: nl.GaussianScene(change(MEANS), torch.ones(N, 4), torch.ones(N, 3), ONES),
+        "features": lambda: nl.lift(EVIDENCE, change(FEATURES)),
+    }
+    for name, call in calls.items():
+        with pytest.raises(nl.InputError, match=name):
+            call()
+
+
+def test_numbers_of_gaussians_are_checked() -> None:
+    for wrong in ([-1], [N], [-99]):
+        with pytest.raises(nl.InputError, match="gaussians"):
+            EVIDENCE.select_gaussians(torch.tensor(wrong))
+    for count in (-5, 10**30):
+        with pytest.raises(nl.InputError, match="num_gaussians"):
+            nl.Evidence.from_entries([], count)
+    with pytest.raises(nl.InputError, match="size"):
+        nl.Camera(K, POSE, 10**30, 16)
+    with pytest.raises(nl.InputError, match="encoded"):
+        EVIDENCE.save("a\ud800.safetensors")
+
+
 def test_the_table_has_every_public_name():
     made = {"Answer", "Finding", "Histogram", "Why", "Coverage", "Consensus", "Scalars", "Evidence", "LiftedRun"}
     named = {getattr(function, "__name__", "") for function, _ in TABLE}

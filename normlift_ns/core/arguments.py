@@ -87,7 +87,7 @@ class _Names(dict[str, Any]):
 
 
 def _error(name: str, expected: str, value: Any) -> ArgumentError:
-    shown = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "dtype") and hasattr(value, "shape") else None
+    shown = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "dtype") and _is_dense(value) else None
     return ArgumentError(f"{name} must be {expected}, got {shown or short_repr(value)}")
 
 
@@ -225,7 +225,9 @@ def _array_check(hint: Any) -> _Check:
             array = _as_tensor(name, value, expected)
             if listed and kind == "Float" and not array.is_floating_point() and _kind_of(array) == "Int":
                 array = array.float()
-            value = array.detach().cpu().numpy() if to_numpy else array
+            if to_numpy and _kind_of(array) in _KINDS:
+                array = (array.float() if str(array.dtype) == "torch.bfloat16" else array).detach().cpu().numpy()
+            value = array
         shape = tuple(value.shape)
         if _kind_of(value) not in (kind, "Int" if kind == "UInt" and "8" not in hint.__name__ else kind) or (
             len(shape) < len(fixed) if wide else len(shape) != len(fixed)
@@ -245,15 +247,30 @@ _KINDS = {"Float": "floating-point numbers", "Int": "whole numbers", "UInt": "by
 
 
 def _kind_of(array: Any) -> str:
-    name = str(array.dtype).removeprefix("torch.")
+    name = str(array.dtype).removeprefix("torch.").replace("float8", "8-bit float")
     return next((kind for kind in ("Float", "Int", "Bool") if name.startswith(kind.lower())),
                 "Float" if name == "bfloat16" else "UInt" if name.startswith("uint") else name)  # fmt: skip
+
+
+def _is_dense(value: Any) -> bool:
+    """Return whether an array is neither sparse nor nested nor without values."""
+    return isinstance(value, np.ndarray) or _layout(value) == ""
+
+
+def _layout(tensor: Any) -> str:
+    """Return what keeps a tensor from being used as an array; "": nothing."""
+    if getattr(tensor, "is_nested", False):
+        return "nested"
+    layout, device = str(getattr(tensor, "layout", "torch.strided")), getattr(tensor, "device", None)
+    return "meta" if getattr(device, "type", "") == "meta" else layout.removeprefix("torch.").replace("strided", "")
 
 
 def _as_tensor(name: str, value: Any, expected: str) -> Any:
     """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, torch.Tensor):
+        if not _is_dense(value):
+            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {_layout(value)} tensor")
         return value
     if not isinstance(value, np.ndarray | list | tuple):
         raise _error(name, expected, value)

@@ -113,7 +113,13 @@ class Evidence(TensorRecord):
     def from_entries(
         parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
-        """Join the entries of all views, in their order."""
+        """Join the entries of all views, in their order.
+
+        Raises:
+            ValueError: the number of Gaussians is negative, or does not fit into 31 bits.
+        """
+        if not 0 <= num_gaussians < 2**31:
+            raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
         rows, unlabeled = (_join_by_sorting if device.type == "cuda" else _join)(parts, num_gaussians, device)
@@ -173,7 +179,15 @@ class Evidence(TensorRecord):
 
     @check_arguments
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
-        """Return the evidence of some Gaussians, in the given order."""
+        """Return the evidence of some Gaussians, in the given order.
+
+        Raises:
+            ValueError: a number is not one of a Gaussian.
+        """
+        low, high = (int(x) for x in gaussians.aminmax()) if gaussians.numel() > 0 else (0, -1)
+        if low < 0 or high >= self.num_gaussians:
+            wrong = low if low < 0 else high
+            raise InputError(f"gaussians must be in 0..{self.num_gaussians - 1}, got {wrong}")
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 

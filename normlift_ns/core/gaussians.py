@@ -146,8 +146,9 @@ class Camera:
                 "Camera.world_to_camera must be a rotation and a translation (no scale, no mirror), got "
                 f"{self.world_to_camera.tolist()}"
             )
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")
+        if not (1 <= self.width <= 2**20 and 1 <= self.height <= 2**20):
+            size = f"width {self.width}, height {self.height}"
+            raise InputError(f"Camera size must be at least 1x1 pixel and at most 1048576x1048576, got {size}")
 
     def camera_to_world(self) -> Float64[Tensor, "4 4"]:
         """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
