@@ -28,7 +28,7 @@ def write_run(run: Path, seed: int = 0) -> Path:
     write_text_embeddings(run / "normlift" / "texts.npz", {"fox": torch.arange(1.0 + seed, 5.0 + seed)})
     beside = [*run.glob("*.json"), *run.glob("*/*.ckpt"), *run.glob("*/*.npz"), run / "absent.json", run.parent / "x"]
     (run.parent / "x").write_text("elsewhere")
-    example("float16").save(run / "normlift", beside=run_dir.run_file_digests(run / "normlift", beside))
+    example("float16").save(run / "normlift", beside=run_dir.run_file_digests(run / "normlift", beside), own=True)
     return run
 
 
