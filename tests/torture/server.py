@@ -102,6 +102,7 @@ def start(job: Job, count: mmap.mmap) -> int:
         os.dup2(log, 1)
         os.dup2(log, 2)
         random.seed()
+        torch.set_num_threads(1)  # after a fork, torch replaces its thread pool at the first call, without a lock
         watch(job, count)
         code = work(job.words)
         sys.stdout.flush()
