@@ -455,13 +455,17 @@ def _sigterm_raises() -> Iterator[None]:
             hook(ignored)
         else:  # raised while an object was deleted, where Python prints exceptions and continues
             signal.signal(signal.SIGTERM, terminate)
-            threading.Timer(0.01, signal.raise_signal, (number,)).start()
+            timers.append(threading.Timer(0.01, signal.raise_signal, (number,)))
+            timers[-1].start()
 
+    timers: list[threading.Timer] = []
     hook, sys.unraisablehook = sys.unraisablehook, report
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
+        for timer in timers:  # after the end, the signal would hit the caller
+            timer.cancel()
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
         sys.unraisablehook = hook
 

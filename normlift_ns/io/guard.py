@@ -24,18 +24,24 @@ def open_regular(path: str | Path, *, max_bytes: int | None = None) -> BufferedR
         FileNotFoundError: the file does not exist.
         ValueError: it is a folder, a pipe or a device, or has more than `max_bytes` bytes.
     """
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    descriptor = os.open(path, flags)
     try:
-        status = os.fstat(descriptor)
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115 (the caller closes it)
+    except IsADirectoryError:
+        raise InputError(f"{path} is not a regular file; replace it with the file that belongs there") from None
+    try:
+        status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path} is not a regular file; replace it with the file that belongs there")
         if max_bytes is not None and status.st_size > max_bytes:
             raise InputError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
-        return os.fdopen(descriptor, "rb")
     except BaseException:
-        os.close(descriptor)
+        file.close()
         raise
+    return file
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
