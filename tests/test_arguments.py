@@ -283,8 +283,8 @@ def test_tensors_that_are_no_arrays_are_refused(change: Callable[[torch.Tensor],
 
 
 def test_numbers_of_gaussians_are_checked() -> None:
-    for wrong in ([-1], [N], [-99]):
-        with pytest.raises(nl.InputError, match="gaussians"):
+    for wrong in ([-1], [0, N], [-99]):
+        with pytest.raises(nl.InputError, match=f"gaussians .* got {wrong[-1]}"):
             EVIDENCE.select_gaussians(torch.tensor(wrong))
     for count in (-5, 10**30):
         with pytest.raises(nl.InputError, match="num_gaussians"):

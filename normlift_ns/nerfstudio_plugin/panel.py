@@ -407,10 +407,7 @@ class SearchPanel(Controller):
     def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:
         if not bool(mask.any()):
             raise InputError("Nothing is selected; there is nothing to download.")
-        splat = self._host.splat_parameters()
-        if not bool((mask & visible_mask(splat.parameters["opacities"])).any()):
-            raise InputError("All selected Gaussians are invisible (opacity below 1/255): nothing to download.")
-        file_name, content, count = splat_bytes(splat, self.history.now, mask, name)
+        file_name, content, count = splat_bytes(self._host.splat_parameters(), self.history.now, mask, name)
         client.send_file_download(file_name, content)
         self.show_message(f"Sent {file_name} with {count:,} Gaussians to the browser's downloads.")
 

@@ -74,7 +74,7 @@ def test_a_name_must_stand_out_from_those_that_are_best_by_chance() -> None:
 
 @pytest.fixture(scope="module")
 def inventory(lifted: Path) -> Inventory:
-    return open_run(lifted).inventory(["red", "yellow", "black"])
+    return open_run(lifted).inventory(["black", "yellow", "red"])
 
 
 def test_things_of_a_room_are_listed_with_boxes_and_names(inventory: Inventory, lifted: Path) -> None:
@@ -92,7 +92,7 @@ def test_command_writes_a_list_and_a_picture(
     inventory: Inventory, lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     words, picture, table = tmp_path / "words.txt", tmp_path / "room.png", tmp_path / "room.json"
-    words.write_text("red\n\n yellow \nblack\n", encoding="utf8")
+    words.write_text("black\n\n yellow \nred\n", encoding="utf8")
     flags = ("--load-config", lifted, "--inventory", "--vocabulary", words, "--image", picture, "--output-json", table)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     listed = json.loads(table.read_text())["objects"]

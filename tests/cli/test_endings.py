@@ -2,6 +2,7 @@
 
 import gc
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -112,7 +113,7 @@ def system(root: Path, cgroup: str, files: dict[str, object]) -> Path:
     return root
 
 
-def test_limits_of_cgroups_are_read(tmp_path):
+def test_limits_of_cgroups_and_shells_are_read(tmp_path, monkeypatch):
     v2 = {"sys/fs/cgroup/a/memory.max": 5000, "sys/fs/cgroup/a/memory.current": 1000,
           "sys/fs/cgroup/a/b/memory.max": "max", "sys/fs/cgroup/a/b/memory.current": 10}  # fmt: skip
     assert memory.free_memory(system(tmp_path / "2", "0::/a/b\n", v2))["the cgroup"] == 4000
@@ -120,7 +121,9 @@ def test_limits_of_cgroups_are_read(tmp_path):
     v1 = {f"{base}limit_in_bytes": 900, f"{base}usage_in_bytes": 100}
     assert memory.free_memory(system(tmp_path / "1", "4:memory:/docker/x\n0::/\n", v1))["the cgroup"] == 800
     assert memory.free_memory(tmp_path / "none").keys() <= {"ulimit -v"}
-    assert memory.free_memory(system(tmp_path / "0", "nonsense", {}))["the machine"] == 2**33
+    monkeypatch.setattr("resource.getrlimit", lambda kind: (2**20, -1))
+    free = memory.free_memory(system(tmp_path / "0", "nonsense", {"proc/self/statm": "5 1"}))
+    assert free == {"the machine": 2**33, "ulimit -v": 2**20 - 5 * resource.getpagesize()}
 
 
 def test_a_lift_that_cannot_fit_is_refused_with_the_estimate(monkeypatch):

@@ -51,7 +51,9 @@ def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: Demo
 
 def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None:
     run = open_run(lifted)
-    few = run.catalogue(run.ask("red"))
+    red = run.ask("red")
+    few = run.catalogue(red)
+    assert few.num_in_small_components == int(red["red"].mask.sum()) - sum(item.gaussians for item in few.objects)
     many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
     print_catalog(replace(few, objects=many))
     shown = said(capsys)

@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from types import SimpleNamespace
 from typing import Any
 
@@ -190,3 +191,12 @@ def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pyt
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     with pytest.raises(InputError, match="GPU"), launch.distributed_context("auto", print):
         pass
+
+
+def test_waiting_for_other_processes_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(launch, "_JOIN_TIMEOUT", timedelta(seconds=0.15))
+    monkeypatch.setattr(launch, "_QUIET_WAIT", 0.05)
+    with pytest.raises(TimeoutError, match="process 0"):
+        launch._wait(lambda: False, "process 0", said.append)
+    assert len(said) == 1

@@ -84,6 +84,13 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     refused(lambda: encoder_kind("same"), "'same'", "claimed", "plug", "two", "uninstall")
 
 
+def test_of_two_copies_of_a_package_the_first_on_the_path_counts(tmp_path, monkeypatch):
+    for name in ("b", "a"):
+        install(tmp_path / name, "twice", f"[normlift_ns.encoders]\n{name} = twice:ENCODER\n")
+        monkeypatch.syspath_prepend(tmp_path / name)
+    assert {"a", "b"} & set(ENCODERS.names()) == {"a"}
+
+
 def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
     for number, (value, code, parts) in enumerate((
         ("nowhere:KIND", "", ["cannot be loaded", "ModuleNotFoundError"]),
