@@ -61,6 +61,6 @@ def test_stock_nerfstudio_loads_them(config: Path) -> None:
     assert stored is not None
     assert stored.texts == STORED[config.parent.name]
     assert pipeline.model.field is not None
-    assert pipeline.model.normlift.answer.selected.equal(stored.selected)
+    assert pipeline.model.normlift.answer.selected.cpu().equal(stored.selected)
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     assert {"overlay", "relevancy_0"} <= set(pipeline.model.get_outputs_for_camera(camera))

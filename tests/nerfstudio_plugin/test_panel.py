@@ -491,7 +491,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     clicked, threshold = chosen(pipeline), panel.answer.question.threshold
     asked = field.query(panel.state.query.embeddings)[:, 0]
     assert torch.equal(clicked, (asked > threshold) & field.valid()) and clicked.any()
-    assert asked[met] == pytest.approx(1, abs=1e-3)
+    assert asked[met].item() == pytest.approx(1, abs=1e-3)
     panel.act(Action("Save prompts in run"))
     assert "one prompt" in said(panel)
     ask(panel, "left")
