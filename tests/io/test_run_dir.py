@@ -126,7 +126,7 @@ def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
 
 
 def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="experiment name .* string"):
+    with pytest.raises(InputError, match=r"experiment name .* string"):
         run_dir.run_directory(tmp_path, 5)  # pyright: ignore[reportArgumentType] (from a config.yml)
     run = write_run(tmp_path / "run")
     run_dir.refuse_existing_run(run, overwrite=True)
