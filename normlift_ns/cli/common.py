@@ -455,15 +455,20 @@ def _sigterm_raises() -> Iterator[None]:
             hook(ignored)
         else:  # raised while an object was deleted, where Python prints exceptions and continues
             signal.signal(signal.SIGTERM, terminate)
-            threading.Timer(0.01, signal.raise_signal, (number,)).start()
+            again.append(threading.Timer(0.01, signal.raise_signal, (number,)))
+            again[-1].start()
 
-    hook, sys.unraisablehook = sys.unraisablehook, report
+    again, hook, sys.unraisablehook = list[threading.Timer](), sys.unraisablehook, report
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
-        sys.unraisablehook = hook
+        try:
+            for timer in again:  # whose signal must not come after this context
+                timer.join()
+        finally:
+            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+            sys.unraisablehook = hook
 
 
 @contextmanager

@@ -32,7 +32,7 @@ _MAX_KERNEL_NEIGHBORS = 63
 @check_arguments
 def refine(
     means: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
+    directions: Float[Tensor, "n d"] | Callable[[Int64[Tensor, " m"]], Float[Tensor, "m d"]],
     reliability: Float[Tensor, " n"],
     config: RefineConfig | None = None,
     *,
