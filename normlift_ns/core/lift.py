@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32
@@ -205,8 +204,7 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
-    check_tensors(features=features)
-    if features.ndim != 2 or features.shape[0] != evidence.num_regions or not features.dtype.is_floating_point:
+    if features.shape[0] != evidence.num_regions:
         raise InputError(
             f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
             f"{features.dtype} {tuple(features.shape)}"
@@ -267,23 +265,6 @@ def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
 # Checks of tensor arguments: invalid input raises an error instead of producing a wrong result.
 
 
-def check_tensors(**arguments: Any) -> None:
-    """Raise if an argument is not a tensor.
-
-    Raises:
-        ValueError: if one is not; the message names it.
-
-    >>> try:
-    ...     check_tensors(means=[[0.0, 0.0, 0.0]])
-    ... except ValueError as error:
-    ...     print(error)
-    means must be a torch tensor, got list; torch.as_tensor makes one
-    """
-    for name, value in arguments.items():
-        if not isinstance(value, Tensor):
-            raise InputError(f"{name} must be a torch tensor, got {type(value).__name__}; torch.as_tensor makes one")
-
-
 def check_unit_rows(
     rows: Float[Tensor, "m d"], name: str, advice: str, *, allow_zeros: bool = False
 ) -> Float64[Tensor, " m"]:
@@ -307,20 +288,3 @@ def check_unit_rows(
         examples = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
         raise InputError(f"{bad.numel():,} of {len(rows):,} {name} are not unit vectors ({examples}); {advice}")
     return length
-
-
-def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise if a value is negative or not finite.
-
-    Raises:
-        ValueError: if there are such values; the message counts them and shows the first.
-
-    >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
-    """
-    bad = (~((values >= 0) & values.isfinite())).nonzero()
-    if len(bad) > 0:
-        first = int(bad[0, 0])
-        raise InputError(
-            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite: {name}[{first}] is "
-            f"{float(values[first]):g}"
-        )
