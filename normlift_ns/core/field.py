@@ -226,6 +226,8 @@ class SemanticField(TensorRecord):
             OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder} is not a folder; give another one")
         if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
