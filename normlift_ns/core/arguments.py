@@ -227,7 +227,7 @@ def _function_check(parts: Sequence[Any]) -> _Check:
         try:
             inspect.signature(value).bind(*arguments)
         except TypeError:
-            raise _error(name, f"a function of {len(arguments)} arguments", value) from None
+            raise _error(name, f"a function of {len(arguments)} values", value) from None
         except ValueError:  # from some built-in functions, which have no signature
             pass
 

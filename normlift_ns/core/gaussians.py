@@ -33,11 +33,13 @@ or silently the identity."""
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
-    A Gaussian with parameters that are not finite or out of range keeps its row, but is never drawn (see `drawable`).
+    Parameters may be NaN or infinite, as training can leave them. Such a Gaussian, or one whose parameters are out of
+    range, keeps its row but is never drawn (see `drawable`); `Evidence.num_excluded` counts it. So it has no evidence,
+    no direction and a reliability of 0, and exports leave it out.
 
     Raises:
         ValueError: if a shape is wrong, a tensor is not floating-point, devices differ, a scale is negative, or an
-            opacity is outside 0..1. NaN is accepted.
+            opacity is outside 0..1, such as infinity.
 
     >>> import torch
     >>> from normlift_ns import GaussianScene

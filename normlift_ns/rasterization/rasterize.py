@@ -329,8 +329,8 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
         raise InputError(f"labels of view {index} contain region {high}, but num_regions is {count}")
     count = max(high, UNLABELED) + 1 if count is None else count
     if not 0 <= count <= MAX_REGIONS:
-        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {short_repr(count)}; number the "
-                         "regions of a view 0, 1, …")  # fmt: skip
+        found = f"{short_repr(count)}; number the regions of a view 0, 1, …"
+        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {found}")
     return count
 
 
