@@ -199,7 +199,7 @@ class LiftedRun:
                 for a file of a run, or there is no answer that `object_max_gap` and `object_min_gaussians` apply to.
         """
         path = check_path("path", path)
-        if path.name == "":
+        if path.name in ("", ".."):
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
         refuse_inputs(exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer

@@ -381,21 +381,23 @@ def check_path(name: str, value: object) -> Path:
     >>> check_path("data", "fox").name
     'fox'
     """
-    if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
-        raise _error(name, "a path", value)
-    if "\0" in os.fspath(value):
-        raise InputError(
-            f"{option_name(name)} is not a valid path: it contains a NUL character ({short_repr(os.fspath(value))})"
-        )
     try:
-        os.stat(value)
+        path = os.fspath(cast(Any, value))
+    except TypeError:
+        path = b""
+    if not isinstance(path, str):
+        raise _error(name, "a path", value)
+    wrong = f"{option_name(name)} is not a valid path:"
+    if "\0" in path:
+        raise InputError(f"{wrong} it contains a NUL character ({short_repr(path)})")
+    try:
+        os.stat(path)
     except UnicodeEncodeError:
-        raise InputError(f"{option_name(name)} is not a valid path: {os.fspath(value)!a} cannot be encoded") from None
+        raise InputError(f"{wrong} {short_repr(path)} cannot be encoded") from None
     except OSError as error:
         if error.errno in _IMPOSSIBLE:
-            text = f"{short_repr(os.fspath(value))} ({error.strerror})"
-            raise PathError(f"{option_name(name)} is not a valid path: {text}; give another") from None
-    return Path(value)
+            raise PathError(f"{wrong} {short_repr(path)} ({error.strerror}); give another") from None
+    return Path(path)
 
 
 # User options as plain dataclasses. Imports no heavy package, to keep --help fast.

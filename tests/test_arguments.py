@@ -232,20 +232,41 @@ def test_arrays_of_every_library_give_the_same(unchecked):
     assert torch.equal(one.rows.weight, two.rows.weight)
     with pytest.raises(nl.InputError, match="reliability must"):
         nl.unsupported(NEAR, np.float32(1) * np.ones(()))
-    with pytest.raises(nl.InputError, match="reliability has 1 rows"):
+    with pytest.raises(nl.InputError, match=r"neighbors.index must be in -1\.\.0"):
         nl.unsupported(NEAR, [1.0])
     assert torch.equal(FIELD.query(FEATURES.tolist()), FIELD.query(FEATURES.numpy()))
 
 
-def test_numbers_of_gaussians_are_checked() -> None:
+def test_numbers_out_of_range_are_refused_by_name(tmp_path) -> None:
+
+    def near(rows: torch.Tensor) -> nl.Neighbors:  # in which -1 stands for none
+        return NEAR._replace(index=(rows - (rows < 0).int()).int().expand(N, 2))
+
     for wrong in ([-1], [N], [-99]):
-        with pytest.raises(nl.InputError, match="gaussians"):
-            EVIDENCE.select_gaussians(torch.tensor(wrong))
-    for count in (-5, 10**30):
-        with pytest.raises(nl.InputError, match="num_gaussians"):
-            nl.Evidence.from_entries([], count)
-    with pytest.raises(nl.InputError, match="size"):
-        nl.Camera(K, POSE, 10**30, 16)
+        rows = torch.tensor(wrong)
+        for name, call in {
+            "gaussians": EVIDENCE.select_gaussians, "^gaussians": LIFTED.directions, "^gaussians ": FIELD.directions,
+            "of": lambda x: nl.nearest_neighbors(MEANS, 2, of=x), "neighbors": lambda x: nl.unsupported(near(x), ONES),
+            "source": lambda x: nl.SemanticField.build(LIFTED, MEANS, source=x.expand(N)),
+            "index": lambda x: nl.refine(MEANS, UNIT, ONES, nl.RefineConfig("paper", k=2), neighbors=near(x)),
+        }.items():  # fmt: skip
+            with pytest.raises(nl.InputError, match=name):
+                call(rows)
+    for name, call in {
+        "num_gaussians": lambda x: nl.Evidence.from_entries([], x), "size": lambda x: nl.Camera(K, POSE, x, 16),
+        "factor": CAMERA.downscaled, "sample": lambda x: nl.consensus(EVIDENCE, FEATURES, sample=x),
+        "num_regions": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP - 1], num_regions=[x]),
+        "weight_power": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP], weight_power=x),
+        "dtype": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP], dtype=torch.float16 if x < 0 else torch.bool),
+        "dtype must be": lambda x: LIFTED.directions(dtype=torch.int8),
+        "JSON": lambda x: nl.SemanticField.build(LIFTED, MEANS, provenance={"a": {x}}).save(tmp_path / "a"),
+        "encoded": lambda x: EVIDENCE.save(tmp_path / "a", remarks={"a": "\ud800"}),
+    }.items():  # fmt: skip
+        for count in (-5, 10**30) if name != "factor" else (-5, -math.inf, 0):
+            with pytest.raises(nl.InputError, match=name):
+                call(count)
+    assert list(tmp_path.iterdir()) == []
+    assert nl.nearest_neighbors(MEANS.double() * 1e200, 2).index.tolist() == [[-1, -1]] * N
     for part, more, name in (
         (([0], [2], [1.0], (1,)), {}, "column"), (([0], [-1], [1.0], (1,)), {}, "column"),
         (([N], [1], [1.0], (1,)), {}, "gaussian"), (([-1], [1], [1.0], (1,)), {}, "gaussian"),
@@ -257,9 +278,6 @@ def test_numbers_of_gaussians_are_checked() -> None:
     ):  # fmt: skip
         with pytest.raises(nl.InputError, match=name):
             nl.Evidence.from_entries([Entries(*part)], N, **more)
-    for options in ({"weight_power": -3}, {"num_regions": [-1]}, {"num_regions": [2**31]}, {"num_regions": [10**30]}):
-        with pytest.raises(nl.InputError, match=next(iter(options))):
-            nl.rasterize_evidence(SCENE, [CAMERA], [MAP - 1], **options)
 
 
 def test_the_table_has_every_public_name():

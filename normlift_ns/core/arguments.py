@@ -79,6 +79,18 @@ def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[s
     return lambda: chain(ordered, repeat(more)), named
 
 
+def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
+    """Raise InputError if an array of whole numbers names a row that does not exist.
+
+    Args:
+        size: number of rows.
+        low: smallest number; -1 if it stands for no row.
+    """
+    first, last = map(int, rows.aminmax()) if rows.numel() > 0 else (low, low)
+    if first < low or max(last, 0) >= max(size, 1):
+        raise InputError(f"{name} must be in {low}..{size - 1}, got {first if first < low else last}")
+
+
 class _Names(dict[str, Any]):
     """Names that annotations may use; those imported for type checkers only stand for anything."""
 
@@ -225,7 +237,7 @@ def _function_check(parts: Sequence[Any]) -> _Check:
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
         try:
-            inspect.signature(value).bind(*arguments)
+            inspect.signature(value if callable(value) else lambda: 0).bind(*arguments)
         except TypeError:
             raise _error(name, f"a function of {len(arguments)} values", value) from None
         except ValueError:  # from some built-in functions, which have no signature
@@ -249,17 +261,16 @@ class _ArrayCheck:
         self.kind, axes = hint.__name__.partition("[")[0].rstrip("0123456789"), hint.dim_str.split()
         self.kinds = {self.kind, "Int"} if self.kind == "UInt" and "8" not in hint.__name__ else {self.kind}
         self.expected = f"an array of {_KINDS.get(self.kind, self.kind)} of shape [{', '.join(axes)}]"
-        self.axes = [axis for axis in axes if not axis.startswith("*")]  # a first axis *n stands for any number
-        self.wide = len(self.axes) < len(axes)
+        self.axes, self.wide = axes, axes[:1] != [] and axes[0].startswith("*")  # a first axis *n is any number of axes
         self.to_numpy, self.numpy = hint.array_type is np.ndarray, hint.array_type in (np.ndarray, Any)
 
     def __call__(self, name: str, value: Any, sizes: _Sizes) -> Any:
         """Return the array as a tensor, or as NumPy's if the annotation says so."""
         value = value if self.numpy and isinstance(value, np.ndarray) else self._convert(name, value)
-        shape, count = tuple(value.shape), len(self.axes)
-        if _kind_of(value.dtype) not in self.kinds or not (len(shape) == count or (self.wide and len(shape) > count)):
+        shape, more = tuple(value.shape), len(value.shape) - len(self.axes)
+        if _kind_of(value.dtype) not in self.kinds or (more < -1 if self.wide else more != 0):
             raise _error(name, self.expected, value)
-        for axis, length in zip(self.axes, shape[len(shape) - count :]):
+        for axis, length in zip(self.axes, (shape[: more + 1], *shape[more + 1 :]) if self.wide else shape):
             if length != (int(axis) if axis.isdigit() else sizes.setdefault(axis, length)):
                 known = "" if axis.isdigit() else f" with {axis} = {sizes[axis]}"
                 raise _error(name, self.expected + known, value)
@@ -304,7 +315,7 @@ def _as_tensor(name: str, value: Any, expected: str) -> Any:
             raise _error(name, expected, value)
         if _layout(value) != "":
             raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {_layout(value)} tensor")
-        return value
+        return value.resolve_neg()
     import torch  # noqa: PLC0415 (a command-line query does not need it)
 
     try:

@@ -141,8 +141,8 @@ def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) ->
 def _check_numbers(power: float, sample: int, least: float) -> None:
     if not 0 <= power < float("inf"):
         raise InputError(f"power must be a number >= 0, got {power!r}")
-    if sample < 1:
-        raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
+    if not 1 <= sample < 2**31:
+        raise InputError(f"sample must be a whole number in 1..2147483647, got {sample!r}")
     if not 0 <= least <= 1:
         raise InputError(f"least must be a number in 0..1, got {least!r}")
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
@@ -200,10 +200,7 @@ class Evidence(TensorRecord):
         Raises:
             ValueError: a number is not one of a Gaussian.
         """
-        low, high = (int(x) for x in gaussians.aminmax()) if gaussians.numel() > 0 else (0, -1)
-        if low < 0 or high >= self.num_gaussians:
-            wrong = low if low < 0 else high
-            raise InputError(f"gaussians must be in 0..{self.num_gaussians - 1}, got {wrong}")
+        check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 
@@ -341,12 +338,8 @@ def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:
     counts = part.num_regions
     if not all(0 <= count < 2**31 for count in counts) or sum(counts) + len(counts) >= 2**31:
         raise InputError(f"{name}.num_regions must be counts that fit into 31 bits, got {short_repr(counts)}")
-    for field, values, size in (
-        ("gaussian", part.gaussian, num_gaussians), ("column", part.column, sum(counts) + len(counts)),
-    ):  # fmt: skip
-        if values.numel() > 0 and not 0 <= int(values.min()) <= int(values.max()) < size:
-            found = f"{int(values.min())}..{int(values.max())}"
-            raise InputError(f"{name}.{field} must be in 0..{size - 1}, found {found}")
+    check_rows(f"{name}.gaussian", part.gaussian, num_gaussians)
+    check_rows(f"{name}.column", part.column, sum(counts) + len(counts))
     order = part.gaussian.long() * 2**31 + part.column
     if bool((order.diff() <= 0).any()):
         raise InputError(f"{name} must be distinct entries, sorted by gaussian and column")

@@ -166,6 +166,8 @@ class Camera:
         >>> small.width, small.height, small.K[0].tolist()
         (40, 30, [25.0, 0.0, 20.0])
         """
+        if factor <= 0:
+            raise InputError(f"factor must be positive, got {factor}")
         width, height = (max(1, round(min(1.0, factor) * side)) for side in (self.width, self.height))
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)

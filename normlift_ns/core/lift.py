@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
@@ -110,8 +110,11 @@ class Lifted:
             dtype: type of the result; half precision also halves the peak memory.
         """
         dtype = dtype or self.features.dtype
+        if not dtype.is_floating_point:
+            raise InputError(f"dtype must be a floating-point type, got {dtype}")
         n, device = self.evidence.num_gaussians, self.features.device
         gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
+        check_rows("gaussians", gaussians, n)
         if _has_kernel(self.features):
             return self._directions(gaussians, dtype)
         result = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)

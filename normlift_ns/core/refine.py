@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import can_use_triton, retry_in_halves
 from normlift_ns.core.evidence import check_not_negative
 from normlift_ns.core.lift import check_unit_rows
@@ -89,6 +89,7 @@ def refine(
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (len(means), config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(len(means), config.k)}")
+    check_rows("neighbors.index", neighbors.index, len(means), low=-1)
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
     if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
         directions = directions.__getitem__  # in blocks, because the kernel needs as much memory again
@@ -308,10 +309,7 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
-    if neighbors.index.numel() > 0 and int(neighbors.index.max()) >= len(reliability):
-        raise InputError(
-            f"reliability has {len(reliability)} rows, but neighbors name row {int(neighbors.index.max())}"
-        )
+    check_rows("neighbors.index", neighbors.index, len(reliability), low=-1)
     return (reliability[: len(neighbors.index)] <= 0) & ~_any_reliable(neighbors, reliability)
 
 

@@ -281,8 +281,9 @@ def _job(
 ) -> RasterJob:
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
-    antialiased = rasterize_mode == "antialiased"
-    return RasterJob(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
+    if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; a scene of {dtype} needs one")
+    return RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
 
 
 def _batches(
