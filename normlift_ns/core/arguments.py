@@ -100,13 +100,8 @@ class _Names(dict[str, Any]):
         return Any
 
 
-def _is_array(value: Any) -> bool:
-    torch = sys.modules.get("torch")
-    return isinstance(value, np.ndarray) or (torch is not None and isinstance(value, torch.Tensor))
-
-
 def _error(name: str, expected: str, value: Any) -> ArgumentError:
-    shown = f"{value.dtype} {tuple(value.shape)}" if _is_array(value) and _layout(value) == "" else short_repr(value)
+    shown = f"{value.dtype} {tuple(value.shape)}" if _layout(value) == "" else short_repr(value)
     return ArgumentError(f"{name} must be {expected}, got {shown}")
 
 
@@ -299,22 +294,22 @@ def _kind_of(dtype: Any) -> str:
     return next((kind for kind in _KINDS if name.startswith(kind.lower())), name)
 
 
-def _layout(array: Any) -> str:
-    """Return what keeps an array from being used: sparse_coo, nested, meta, …; "": nothing."""
-    if getattr(array, "is_nested", False):
-        return "nested"
-    if getattr(getattr(array, "device", None), "type", "") == "meta":
-        return "meta"
-    return str(getattr(array, "layout", "")).removeprefix("torch.").removeprefix("strided")
+def _layout(value: Any) -> str | None:
+    """Return what keeps an array from being used, such as sparse_coo or meta; "": nothing, None: not an array."""
+    torch = sys.modules.get("torch")
+    if torch is None or not isinstance(value, torch.Tensor):
+        return "" if isinstance(value, np.ndarray) else None
+    layout = "nested" if value.is_nested else "meta" if value.is_meta else str(value.layout)
+    return layout.removeprefix("torch.").removeprefix("strided")
 
 
 def _as_tensor(name: str, value: Any, expected: str) -> Any:
     """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
     if not isinstance(value, np.ndarray | list | tuple):
-        if not _is_array(value):
+        if (layout := _layout(value)) is None:
             raise _error(name, expected, value)
-        if _layout(value) != "":
-            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {_layout(value)} tensor")
+        if layout != "":
+            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {layout} tensor")
         return value.resolve_neg()
     import torch  # noqa: PLC0415 (a command-line query does not need it)
 
