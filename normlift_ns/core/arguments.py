@@ -132,7 +132,7 @@ def _plain_check(hint: Any) -> _Check:
     if hint in (Any, object) or not isinstance(hint, type) or is_typeddict(hint):
         return _anything
     if (hint.__module__, hint.__name__) == ("torch", "Tensor"):
-        return lambda name, value, _: _as_tensor(name, value, "an array")
+        return lambda name, value, _: as_tensor(name, value, "an array")
     kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, f"of type {hint.__name__}")
     return _instance_check(lambda value: isinstance(value, hint), kind)
 
@@ -272,7 +272,7 @@ class _ArrayCheck:
         return value
 
     def _convert(self, name: str, value: Any) -> Any:
-        array = _as_tensor(name, value, self.expected)
+        array = as_tensor(name, value, self.expected)
         if self.kind == "Float" and isinstance(value, list | tuple) and _kind_of(array.dtype) == "Int":
             array = array.float()
         if not self.to_numpy or _kind_of(array.dtype) not in _KINDS:
@@ -303,7 +303,7 @@ def _layout(value: Any) -> str | None:
     return layout.removeprefix("torch.").removeprefix("strided")
 
 
-def _as_tensor(name: str, value: Any, expected: str) -> Any:
+def as_tensor(name: str, value: Any, expected: str) -> Any:
     """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
     if not isinstance(value, np.ndarray | list | tuple):
         if (layout := _layout(value)) is None:

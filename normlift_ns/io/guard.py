@@ -122,9 +122,9 @@ def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callabl
             return f"the {kind} {parent}"
     if exists and ".cache" in Path(folder).parts:
         return f"the cache {folder}"
-    statuses = (os.stat(place) for place in (path, *map(str, Path(path).parents)) if exists)
-    found = (inputs().get((status.st_dev, status.st_ino)) for status in statuses)
-    return next((f"the input {name}" for name in found if name is not None), None)
+    statuses = map(os.stat, (path, *Path(path).parents) if exists else ())
+    name = next(filter(None, (inputs().get((status.st_dev, status.st_ino)) for status in statuses)), None)
+    return None if name is None else f"the input {name}"
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
