@@ -76,10 +76,7 @@ class Evidence(TensorRecord):
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
     def __post_init__(self) -> None:
-        if self.weight_power not in WEIGHT_POWERS:
-            raise InputError(f"weight_power must be 0, 1 or 2, got {self.weight_power}")
-        if not 0 <= self.num_excluded <= self.num_gaussians:
-            raise InputError(f"num_excluded must be in 0..{self.num_gaussians}, got {self.num_excluded}")
+        _check_counts(self)
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
             raise InputError(
@@ -332,6 +329,13 @@ def check_not_negative(name: str, values: Tensor) -> None:
             f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite: {name}[{first}] is "
             f"{float(values[first]):g}"
         )
+
+
+def _check_counts(evidence: Evidence) -> None:
+    if evidence.weight_power not in WEIGHT_POWERS:
+        raise InputError(f"weight_power must be 0, 1 or 2, got {evidence.weight_power}")
+    if not 0 <= evidence.num_excluded <= evidence.num_gaussians:
+        raise InputError(f"num_excluded must be in 0..{evidence.num_gaussians}, got {evidence.num_excluded}")
 
 
 def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:

@@ -229,12 +229,7 @@ class SemanticField(TensorRecord):
             OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
-        try:
-            json.dumps({**self.manifest, "digests": dict(beside)}).encode("utf8")
-        except (TypeError, ValueError, RecursionError) as error:
-            raise InputError(f"provenance or beside cannot be encoded as JSON: {error}") from None
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder} is not a folder; give another one")
+        _check_target(folder, {**self.manifest, "digests": dict(beside)})
         if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
@@ -344,3 +339,13 @@ def _check_belongs(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
             f"number, other means); {LIFT_AGAIN}"
         )
+
+
+def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Raise InputError if a field cannot be written, before anything is."""
+    try:
+        json.dumps(facts).encode("utf8")
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"provenance or beside cannot be encoded as JSON: {error}") from None
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give another one")

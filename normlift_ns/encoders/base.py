@@ -512,9 +512,8 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     vector."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
-    for what, value in zip(("labels", "vectors"), pair):
-        if isinstance(value, Tensor):
-            as_tensor(f"{what} of {name}", value, "an array")
+    _check_dense(f"labels of {name}", pair[0])
+    _check_dense(f"vectors of {name}", pair[1])
     try:
         labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
     except ValueError as error:  # rows of different lengths
@@ -531,6 +530,12 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
             f"{tuple(labels.shape)} with values in {low}..{high}"
         )
     return labels, vectors
+
+
+def _check_dense(name: str, value: Any) -> None:
+    """Raise InputError for a sparse or nested tensor, or one without values."""
+    if isinstance(value, Tensor):
+        as_tensor(name, value, "an array")
 
 
 def _convert_text(text: str, values: Any) -> Tensor:
