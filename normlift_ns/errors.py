@@ -33,6 +33,10 @@ class ArgumentError(InputError, TypeError):
     """InputError for an argument of the wrong kind, which Python's own functions report as a TypeError."""
 
 
+class PathError(InputError, OSError):
+    """InputError for a path that no file can have, which Python's own functions report as an OSError."""
+
+
 class MissingImageError(InputError, KeyError, IndexError):
     """InputError for a training image that does not exist."""
 

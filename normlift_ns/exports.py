@@ -44,6 +44,10 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
 
     Ids are unsigned because splat converters turn -1 into 4294967295.
     """
+    if answer is not None and len(answer.relevancy) != len(field):
+        raise InputError(
+            f"answer has {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; ask this run"
+        )
     scores = {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
     if answer is not None:
         scores |= {f"relevancy_{q}": answer.relevancy[:, q] for q in range(len(answer.texts))}

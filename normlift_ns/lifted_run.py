@@ -195,18 +195,24 @@ class LiftedRun:
             The row indices of the written Gaussians.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: no Gaussian of `part` is ever drawn, the mask has another type or length, or the name is
-                reserved for a file of a run.
+            ValueError: no Gaussian of `part` is ever drawn, the mask has another type or length, the name is reserved
+                for a file of a run, or there is no answer that `object_max_gap` and `object_min_gaussians` apply to.
         """
         path = check_path("path", path)
-        if path.name == "":
+        if path.name in ("", ".."):
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
         refuse_inputs(exports.export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
+        limits = (
+            check_number("object_max_gap", object_max_gap),
+            check_number("object_min_gaussians", object_min_gaussians, int),
+        )
+        if answer is None and limits != (OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS):
+            raise InputError("object_max_gap and object_min_gaussians have no effect without an answer; give one")
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        instances = None if answer is None else exports.answer_instances(answer, object_max_gap, object_min_gaussians)
+        instances = None if answer is None else exports.answer_instances(answer, *limits)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return exports.write_splat_ply(
             path,

@@ -8,6 +8,7 @@ anything is loaded, in the commands, in `ns-train normlift` and in Python.
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -23,7 +24,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, PathError
 from normlift_ns.registry import installed_names
 
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
@@ -34,6 +35,8 @@ MAX_PROMPT_LENGTH = 10_000
 """Largest number of characters in a prompt. CLIP reads about 70 words of it."""
 _INVALID = re.compile("[\0\ud800-\udfff]")
 """Characters that files and encoders cannot hold: NUL, and surrogates, which have no UTF-8."""
+_IMPOSSIBLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
+"""Errors of paths with a name that is too long, links in a loop, or a file in place of a folder."""
 _hints = cache(get_type_hints)
 _MAX_SHOWN = 60
 """Largest number of characters of a value in a message."""
@@ -373,21 +376,28 @@ def check_path(name: str, value: object) -> Path:
         value: The string or path.
     Raises:
         InputError: The value is neither, or contains a NUL character or one that cannot be encoded.
+        PathError: A name is too long, the path leads through a file, or its links form a loop.
 
     >>> check_path("data", "fox").name
     'fox'
     """
-    if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
-        raise _error(name, "a path", value)
-    if "\0" in os.fspath(value):
-        raise InputError(
-            f"{option_name(name)} is not a valid path: it contains a NUL character ({short_repr(os.fspath(value))})"
-        )
     try:
-        os.fsencode(value)
+        path = os.fspath(cast(Any, value))
+    except TypeError:
+        path = b""
+    if not isinstance(path, str):
+        raise _error(name, "a path", value)
+    wrong = f"{option_name(name)} is not a valid path:"
+    if "\0" in path:
+        raise InputError(f"{wrong} it contains a NUL character ({short_repr(path)})")
+    try:
+        os.stat(path)
     except UnicodeEncodeError:
-        raise InputError(f"{option_name(name)} is not a valid path: {os.fspath(value)!a} cannot be encoded") from None
-    return Path(value)
+        raise InputError(f"{wrong} {short_repr(path)} cannot be encoded") from None
+    except OSError as error:
+        if error.errno in _IMPOSSIBLE:
+            raise PathError(f"{wrong} {short_repr(path)} ({error.strerror}); give another") from None
+    return Path(path)
 
 
 # User options as plain dataclasses. Imports no heavy package, to keep --help fast.

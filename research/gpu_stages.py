@@ -20,7 +20,7 @@ STAGES = (
     ("sums", triton, "region_sums"),
     ("merging", triton, "sum_equal_keys"),
     ("places", triton, "places"),
-    ("assembly", Evidence, "from_entries"),
+    ("assembly", Evidence, "join"),
 )
 
 

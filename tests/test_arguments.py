@@ -27,136 +27,94 @@ FEATURES, UNIT, ONES = unit_rows(2, 4, 0).float(), unit_rows(N, 4, 1).float(), t
 LIFTED, NEAR = nl.lift(EVIDENCE, FEATURES), nl.nearest_neighbors(MEANS, 2)
 FIELD = nl.SemanticField.build(LIFTED, MEANS)
 GRAY, NO = torch.zeros(16, 16, 3, dtype=torch.uint8), torch.zeros(N, dtype=torch.bool)
-MANY = torch.arange(N)
+MANY, MAP = torch.arange(N), torch.zeros(16, 16).int()
 OPTIONS = {nl.LiftOptions, nl.RefineConfig, nl.SourceOptions, nl.SplatOptions}
-Row = tuple[Callable[..., Any], dict[str, tuple[str, Any]]]
-PART = {"part": ("bool n", NO)}
-METHODS: list[Row] = [
-    (
-        nl.LiftedRun.ask,
-        {
-            "negatives": ("texts|None", None),
-            "relevancy": ("word", "auto"),
-            "threshold": ("number|word|None", None),
-            "min_reliability": ("number", 0.0),
-            "refined": ("bool", True),
-        },
-    ),
-    (nl.LiftedRun.save, {"question": ("Answer", None)}),
-    (
-        nl.LiftedRun.export,
-        {
-            "path": ("path", "a.ply"),
-            "part": ("bool n|None", None),
-            "answer": ("Answer|None", None),
-            "objects": ("dictionary|None", None),
-            "object_max_gap": ("number", 2.0),
-            "object_min_gaussians": ("whole", 5),
-            "overwrite": ("bool", False),
-        },
-    ),
-    (nl.LiftedRun.masks, {"folder": ("path", "a"), **PART, "rest": ("bool", False), "overwrite": ("bool", False)}),
-    (
-        nl.LiftedRun.transfer,
-        {
-            "cloud": ("path", "a.ply"),
-            "path": ("path", "b.ply"),
-            "part": ("Answer", object.__new__(nl.Answer)),
-            "transfer_distance": ("number", 1.0),
-            "coordinates": ("word", "scene"),
-            "overwrite": ("bool", False),
-        },
-    ),
-    (nl.LiftedRun.why, PART),
-    (nl.LiftedRun.catalogue, {**PART, "meters_per_unit": ("number|None", None)}),
-    (nl.LiftedRun.inventory, {"vocabulary": ("texts|None", None), "meters_per_unit": ("number|None", None)}),
-    (nl.LiftedRun.floaters, {"limit": ("number", 1.0)}),
-    (nl.LiftedRun.camera, {"view": ("path|whole", 0)}),
-    (nl.LiftedRun.render, {"view": ("path|whole|Camera", 0), "found": ("Answer|None", None)}),
-    (nl.Coverage.save, {"path": ("path", "a.json"), "overwrite": ("bool", False)}),
-    (nl.Evidence.select_views, {"views": ("wholes|whole m", [0])}),
-    (nl.Evidence.columns_of, {"views": ("wholes|whole m", [0])}),
-    (nl.Evidence.select_gaussians, {"gaussians": ("whole m", MANY)}),
-    (nl.Evidence.regroup, {"columns": ("whole levels s", MANY[None]), "region_view": ("whole m", MANY.int())}),
-    (nl.Evidence.save, {"path": ("path", "a"), "key": ("text", ""), "remarks": ("dictionary|None", None)}),
-    (nl.SemanticField.save, {"folder": ("path", "a"), "overwrite": ("bool", False), "beside": ("dictionary", {})}),
-]
+Row = tuple[Callable[..., Any], dict[str, str], tuple[Any, ...]]
+
+
+def row(function: Callable[..., Any], kinds: str, *needed: Any) -> Row:
+    """A function with the kinds of its arguments, of which the first ones are needed."""
+    return function, dict(kind.strip().split(" ", 1) for kind in kinds.split(";")), needed  # type: ignore[misc]
+
+
+PART, ANSWER, FIELDS = "part bool n", object.__new__(nl.Answer), "backend word; rasterize_mode word; settings None"
+METHODS = [
+    row(nl.LiftedRun.ask, "negatives texts|None; relevancy word; threshold number|None; min_reliability number; "
+        "refined bool"),
+    row(nl.LiftedRun.save, "question Answer"),
+    row(nl.LiftedRun.export, "path path; part bool n|None; answer None; objects dictionary|None; "
+        "object_max_gap number; object_min_gaussians whole; overwrite bool", "a.ply"),
+    row(nl.LiftedRun.masks, f"folder path; {PART}; rest bool; overwrite bool", "a", NO),
+    row(nl.LiftedRun.transfer, "cloud path; path path; part Answer; transfer_distance number; coordinates word; "
+        "overwrite bool", "a.ply", "b.ply", ANSWER),
+    row(nl.LiftedRun.why, PART),
+    row(nl.LiftedRun.catalogue, f"{PART}; meters_per_unit number|None", NO),
+    row(nl.LiftedRun.inventory, "vocabulary texts|None; meters_per_unit number|None"),
+    row(nl.LiftedRun.floaters, "limit number"),
+    row(nl.LiftedRun.camera, "view path|whole"),
+    row(nl.LiftedRun.render, "view path|whole|Camera; found None", 0),
+    row(nl.Coverage.save, "path path; overwrite bool", "a.json"),
+    row(nl.Evidence.select_views, "views wholes|whole m"),
+    row(nl.Evidence.columns_of, "views wholes|whole m"),
+    row(nl.Evidence.select_gaussians, "gaussians whole m"),
+    row(nl.Evidence.regroup, "columns whole levels s; region_view whole m", MANY[None], MANY.int()),
+    row(nl.Evidence.save, "path path; key text; remarks dictionary|None", "a"),
+    row(nl.SemanticField.save, "folder path; overwrite bool; beside dictionary", "a"),
+]  # fmt: skip
 """Methods, called without their object: wrong arguments are refused before it is used."""
-TABLE: list[Row] = [
-    (nl.GaussianScene, {"means": ("float n 3", MEANS), "quats": ("float n 4", torch.ones(N, 4)),
-                        "scales": ("float n 3", torch.ones(N, 3)), "opacities": ("float n", ONES)}),
-    (nl.Camera, {"K": ("float 3 3", K), "world_to_camera": ("float 4 4", POSE), "width": ("whole", 16),
-                 "height": ("whole", 16)}),
-    (CAMERA.downscaled, {"factor": ("number", 0.5)}),
-    (CAMERA.project, {"points": ("float n 3", MEANS)}),
-    (nl.View, {"camera": ("Camera", CAMERA), "image": ("uint8 h w 3", GRAY), "mask": ("bool h w|None", None),
-               "name": ("text", "a"), "original": ("pair|None", None)}),
-    (nl.rasterize_evidence, {"scene": ("GaussianScene", SCENE), "cameras": ("Cameras", [CAMERA]),
-                             "labels": ("maps", [torch.zeros(16, 16).int()]), "num_regions": ("wholes|None", None),
-                             "backend": ("word", "torch"), "rasterize_mode": ("word", "classic"),
-                             "progress": ("function|None", None), "weight_power": ("whole", 1),
-                             "settings": ("RasterSettings|None", None), "dtype": ("dtype|None", None)}),
-    (nl.render, {"scene": ("GaussianScene", SCENE), "camera": ("Camera", CAMERA),
-                 "values": ("float n c", ONES[:, None]),
-                 "backend": ("word", "torch"), "rasterize_mode": ("word", "classic"),
-                 "settings": ("RasterSettings|None", None), "dtype": ("dtype|None", None)}),
-    (nl.contributors, {"scene": ("GaussianScene", SCENE), "camera": ("Camera", CAMERA),
-                       "pixels": ("whole p 2", torch.tensor([[3, 4]])), "backend": ("word", "torch"),
-                       "rasterize_mode": ("word", "classic"), "settings": ("RasterSettings|None", None)}),
-    (nl.lift, {"evidence": ("Evidence", EVIDENCE), "features": ("float s d", FEATURES), "beta": ("number", 1.0),
-               "unlabeled": ("word", "ignore")}),
-    (nl.consensus, {"evidence": ("Evidence", EVIDENCE), "features": ("float s d", FEATURES), "power": ("number", 1.0),
-                    "level": ("whole s|None", None), "sample": ("whole", 50), "least": ("number", 0.4)}),
-    (nl.nearest_neighbors, {"means": ("float n 3", MEANS), "k": ("whole", 2), "of": ("whole m|None", None),
-                            "progress": ("function|None", None)}),
-    (nl.refine, {"means": ("float n 3", MEANS), "directions": ("float n d|function", UNIT),
-                 "reliability": ("float n", ONES), "config": ("RefineConfig|None", nl.RefineConfig(k=2)),
-                 "own": ("float n", ONES), "neighbors": ("Neighbors|None", None),
-                 "progress": ("function|None", None)}),
-    (nl.refine_variant, {"variant": ("word", "none"), "means": ("float n 3", MEANS), "lifted": ("Lifted", LIFTED),
-                         "config": ("RefineConfig|None", None), "beta": ("number", 1.0)}),
-    (nl.unsupported, {"neighbors": ("Neighbors", NEAR), "reliability": ("float n", ONES)}),
-    (nl.relevancy, {"positive": ("float *", UNIT), "negative": ("float *|None", None), "rule": ("word", "cosine"),
-                    "temperature": ("number", 10.0)}),
-    (nl.SemanticField.build, {"lifted": ("Lifted", LIFTED), "means": ("float n 3", MEANS),
-                              "source": ("whole n|None", None),
-                              "tolerance": ("number", 1e-3), "storage": ("word", "auto"),
-                              "provenance": ("dictionary|None", None)}),
-    (FIELD.query, {"text_vectors": ("float q d", FEATURES), "refined": ("bool", True)}),
-    (FIELD.relevancy, {"text_vectors": ("float q d", FEATURES), "negatives": ("float b d|None", None),
-                       "rule": ("word", "cosine"), "refined": ("bool", True)}),
-    (FIELD.directions, {"gaussians": ("whole m|None", None), "refined": ("bool", True)}),
-    (FIELD.valid, {"refined": ("bool", True)}),
-    (nl.SemanticField.load, {"folder": ("path", "/nowhere"), "means": ("float n 3|None", None)}),
-    (nl.Neighbors, {"index": ("whole m k", NEAR.index), "distance": ("float m k", NEAR.distance),
-                    "spacing": ("float m", NEAR.spacing)}),
-    (nl.Contributors, {"offsets": ("whole p", MANY), "gaussian": ("whole m", MANY), "weight": ("float m", ONES)}),
-    (nl.Floaters, {"score": ("float n", ONES), "mask": ("bool n", NO)}),
-    (nl.Evidence.load, {"path": ("path", "/nowhere"), "key": ("text", "")}),
-    (nl.Evidence.from_entries, {"parts": ("maps", []), "num_gaussians": ("whole", N), "weight_power": ("whole", 1),
-                                "num_excluded": ("whole", 0)}),
-    (nl.Lifted, {"scalars": ("Scalars", LIFTED.scalars), "evidence": ("Evidence", EVIDENCE),
-                 "features": ("float s d", FEATURES)}),
-    (LIFTED.directions, {"gaussians": ("whole m|None", None), "dtype": ("dtype|None", None)}),
-    (nl.RasterSettings, {"near_plane": ("number", 0.01), "far_plane": ("number", 1e10), "eps2d": ("number", 0.3),
-                         "per_axis": ("bool", False), "tile_size": ("whole", 16), "max_alpha": ("number", 0.99)}),
-    (nl.RasterSettings.of_gsplat, {"version": ("text", "1.5")}),
-    (nl.RasterSettings.recorded, {"manifest": ("dictionary", {})}),
-    (nl.open_scene, {"load_config": ("path", "/nowhere"), "data": ("path|None", None),
-                     "load_step": ("whole|None", None)}),
-    (nl.open_splat, {"path": ("path", "/nowhere"),
-                     "options": ("SplatOptions", nl.SplatOptions(colmap=Path("/nowhere")))}),
-    (nl.open_run, {"load_config": ("path", "/nowhere"), "data": ("path|None", None), "device": ("word", "cpu"),
-                   "text_embeddings": ("path|None", None), "prompt_template": ("text|None", None)}),
-    (nl.coverage, {"run": ("LiftedRun", None)}),
-    (partial(nl.coverage, object.__new__(nl.LiftedRun)), {"min_reliability": ("number", 0.5),
-                                                          "device": ("text|None", None)}),
-    *((partial(method, None), arguments) for method, arguments in METHODS),
-    (nl.lift_run, {"config_or_scene": ("path", "/nowhere"), "lift": ("LiftOptions|None", None),
-                   "texts": ("none|None", None),
-                   "queries": ("texts", ()), "load_step": ("whole|None", None), "overwrite": ("bool", False),
-                   "output_dir": ("path|None", None), "device": ("word", "cpu"), "report": ("function", print)}),
-    *((options, {field.name: ("option", None) for field in fields(options)}) for options in OPTIONS),
+TABLE = [
+    row(nl.GaussianScene, "means float n 3; quats float n 4; scales float n 3; opacities float n",
+        MEANS, torch.ones(N, 4), torch.ones(N, 3), ONES),
+    row(nl.Camera, "K float 3 3; world_to_camera float 4 4; width whole; height whole", K, POSE, 16, 16),
+    row(CAMERA.downscaled, "factor number"),
+    row(CAMERA.project, "points float n 3"),
+    row(nl.View, "camera Camera; image uint8 h w 3; mask bool h w|None; name text; original pair|None",
+        CAMERA, GRAY, None, "a"),
+    row(nl.rasterize_evidence, f"scene GaussianScene; cameras Cameras; labels maps; num_regions wholes|None; "
+        f"progress function 2|None; weight_power whole; dtype None; {FIELDS}", SCENE, [CAMERA], [MAP]),
+    row(nl.render, f"scene GaussianScene; camera Camera; values float n c; dtype None; {FIELDS}",
+        SCENE, CAMERA, ONES[:, None]),
+    row(nl.contributors, f"scene GaussianScene; camera Camera; pixels whole p 2; {FIELDS}",
+        SCENE, CAMERA, torch.tensor([[3, 4]])),
+    row(nl.lift, "evidence Evidence; features float s d; beta number; unlabeled word", EVIDENCE, FEATURES),
+    row(nl.consensus, "evidence Evidence; features float s d; power number; level whole s|None; sample whole; "
+        "least number", EVIDENCE, FEATURES),
+    row(nl.nearest_neighbors, "means float n 3; k whole; of whole m|None; progress function 2|None", MEANS, 2),
+    row(nl.refine, "means float n 3; directions float n d|function 1; reliability float n; config None; "
+        "own float n|None; neighbors None; progress function 2|None", MEANS, UNIT, ONES),
+    row(nl.refine_variant, "variant word; means float n 3; lifted Lifted; config None; beta number",
+        "none", MEANS, LIFTED),
+    row(nl.unsupported, "neighbors Neighbors; reliability float n", NEAR, ONES),
+    row(nl.relevancy, "positive float *; negative float *|None; rule word; temperature number", UNIT),
+    row(nl.SemanticField.build, "lifted Lifted; means float n 3; source whole n|None; tolerance number; storage word; "
+        "provenance dictionary|None", LIFTED, MEANS),
+    row(FIELD.query, "text_vectors float q d; refined bool", FEATURES),
+    row(FIELD.relevancy, "text_vectors float q d; negatives float b d|None; rule word; refined bool", FEATURES),
+    row(FIELD.directions, "gaussians whole m|None; refined bool"),
+    row(FIELD.valid, "refined bool"),
+    row(nl.SemanticField.load, "folder path; means float n 3|None", "/nowhere"),
+    row(nl.Neighbors, "index whole m k; distance float m k; spacing float m", *NEAR),
+    row(nl.Contributors, "offsets whole p; gaussian whole m; weight float m", MANY, MANY, ONES),
+    row(nl.Floaters, "score float n; mask bool n", ONES, NO),
+    row(Entries, "gaussian whole n; column whole n; weight float n; num_regions wholes", MANY, MANY, ONES, (1,)),
+    row(nl.Evidence.load, "path path; key text", "/nowhere"),
+    row(nl.Evidence.from_entries, "parts maps; num_gaussians whole; weight_power whole; num_excluded whole", [], N),
+    row(nl.Lifted, "scalars Scalars; evidence Evidence; features float s d", LIFTED.scalars, EVIDENCE, FEATURES),
+    row(LIFTED.directions, "gaussians whole m|None; dtype None"),
+    row(nl.RasterSettings, "near_plane number; far_plane number; eps2d number; per_axis bool; tile_size whole; "
+        "max_alpha number"),
+    row(nl.RasterSettings.of_gsplat, "version text"),
+    row(nl.RasterSettings.recorded, "manifest dictionary"),
+    row(nl.open_scene, "load_config path; data path|None; load_step whole|None", "/nowhere"),
+    row(nl.open_splat, "path path; options SplatOptions", "/nowhere", nl.SplatOptions(colmap=Path("/nowhere"))),
+    row(nl.open_run, "load_config path; data path|None; device word; text_embeddings path|None; "
+        "prompt_template text|None", "/nowhere"),
+    row(nl.coverage, "run LiftedRun"),
+    row(partial(nl.coverage, object.__new__(nl.LiftedRun)), "min_reliability number; device text|None"),
+    *((partial(method, None), kinds, needed) for method, kinds, needed in METHODS),
+    row(nl.lift_run, "config_or_scene path; lift None; texts None; queries texts; load_step whole|None; "
+        "overwrite bool; output_dir path|None; device word; report function 3; say function 1", "/nowhere"),
+    *((options, {field.name: "option" for field in fields(options)}, ()) for options in OPTIONS),
 ]  # fmt: skip
 
 
@@ -177,27 +135,18 @@ def is_array(kinds: str, axes: list[str], value: Any) -> bool:
 def is_kind(kind: str, value: Any) -> bool:
     """Whether a value is of a kind of the table."""
     word, *axes = kind.split()
-    if word == "None":
-        return value is None
+    if word in ("None", "function"):
+        return value is {"None": None, "function": print}[word]
     if len(axes) > 0:
         return is_array({"float": "f", "whole": "iu", "bool": "b", "uint8": "u"}[word], axes, value)
-    if word == "function":
-        return callable(value)
-    return {
-        "whole": isinstance(value, int) and not isinstance(value, bool),
-        "number": isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and not (isinstance(value, float) and math.isnan(value)),
-        "bool": isinstance(value, bool),
-        "text": isinstance(value, str),
-        "path": isinstance(value, str | Path),
-        "dictionary": isinstance(value, Mapping),
-        "texts": isinstance(value, list | tuple) and all(isinstance(item, str) for item in value),
-        "wholes": isinstance(value, list | tuple | range),
-        "Cameras": isinstance(value, list | tuple) and len(value) == 0,
-        "maps": isinstance(value, list | tuple),
-        "option": not isinstance(value, Nothing) and not callable(value),
-    }.get(word, False)
+    if word in ("texts", "Cameras"):
+        return isinstance(value, list | tuple) and all(isinstance(item, str) and word == "texts" for item in value)
+    if word == "option":
+        return not isinstance(value, Nothing) and not callable(value)
+    kinds = {"bool": bool, "text": str, "path": str | Path, "dictionary": Mapping, "maps": list | tuple,
+             "wholes": list | tuple | range, "whole": int, "number": int | float}  # fmt: skip
+    nan = isinstance(value, float) and math.isnan(value)
+    return isinstance(value, kinds.get(word, ())) and not nan and (word == "bool" or value is not True)
 
 
 class Nothing:
@@ -218,30 +167,55 @@ WRONG = st.one_of(
 
 
 def call_with_a_wrong_value(data: st.DataObject) -> None:
-    function, arguments = data.draw(st.sampled_from(TABLE))
-    name = data.draw(st.sampled_from(sorted(arguments)))
+    function, kinds, needed = data.draw(st.sampled_from(TABLE))
+    name = data.draw(st.sampled_from(sorted(kinds)))
     value = data.draw(WRONG)
-    assume(not any(is_kind(kind, value) for kind in arguments[name][0].split("|")))
-    good = {} if function in OPTIONS else {key: one for key, (_, one) in arguments.items()}
+    assume(not any(is_kind(kind, value) for kind in kinds[name].split("|")))
     with pytest.raises(nl.InputError) as caught:
-        function(**{**good, name: value})
+        function(**{**dict(zip(kinds, needed)), name: value})
     assert name in str(caught.value) or name.replace("_", "-") in str(caught.value) or "row" in str(caught.value)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
-@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
-@given(st.data())
-def test_wrong_kinds_are_refused_by_name(data):
-    call_with_a_wrong_value(data)
+@pytest.mark.parametrize(
+    "count", [pytest.param(400, marks=pytest.mark.slow), pytest.param(10_000, marks=pytest.mark.extra)]
+)
+def test_wrong_kinds_are_refused_by_name(count, unchecked):
+    many = settings(max_examples=count, deadline=None, suppress_health_check=list(HealthCheck))
+    many(given(st.data())(call_with_a_wrong_value))()
 
 
-@pytest.mark.extra
-@pytest.mark.usefixtures("unchecked")
-@settings(max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
-@given(st.data())
-def test_wrong_kinds_are_refused_by_name_in_10_000_calls(data):
-    call_with_a_wrong_value(data)
+def test_paths_of_no_file_and_tensors_that_are_no_arrays_are_refused_by_name(tmp_path, unchecked):
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    paths = ("x" * 300, "y" * 300 + "/a", "z/" * 3000, tmp_path / "file" / "a", tmp_path / "loop", "a\ud800")
+    tensors = (ONES.to_sparse(), ONES.to("meta"), torch.nested.nested_tensor([ONES]), ONES.to(torch.float8_e4m3fn))
+    others = [row(nl.SplatOptions, "colmap path"), row(nl.SourceOptions, "regions_dir path")]
+    for function, kinds, needed in (*TABLE, *others):
+        for name, kind in kinds.items():
+            for wrong in {"path": paths, "float": tensors, "whole": tensors[: 4 * (" " in kind)]}.get(
+                kind.partition("|")[0].split()[0], ()
+            ):
+                with pytest.raises(nl.InputError, match=name):
+                    function(**{**dict(zip(kinds, needed)), name: wrong})
+    for write, wrong in ((FIELD.save, tmp_path / "file"), (EVIDENCE.save, tmp_path)):
+        with pytest.raises(nl.InputError, match=str(wrong)):
+            write(wrong)
+
+
+def test_functions_that_are_given_return_what_they_should(unchecked):
+    config, needed = nl.RefineConfig(k=2), {"reliability": ONES, "own": ONES}
+    expected = nl.refine(MEANS, UNIT, config=config, **needed)
+    for right in (lambda m: UNIT[m], lambda m: UNIT[m].numpy(), lambda m: UNIT[m].tolist(), UNIT.__getitem__):
+        assert torch.equal(nl.refine(MEANS, right, config=config, **needed), expected)
+    for wrong in (
+        lambda m: None, lambda m: UNIT[m, 0], lambda m: UNIT[m][1:], lambda m: UNIT[m].int(), lambda m, n: UNIT[m],
+        lambda: UNIT, lambda m: UNIT[m].to("meta"),
+    ):  # fmt: skip
+        with pytest.raises(nl.InputError, match="directions"):
+            nl.refine(MEANS, wrong, config=config, **needed)
+    for failing in ({"directions": lambda m: UNIT[7]}, {"directions": UNIT, "progress": lambda *_: UNIT[7]}):
+        with pytest.raises(IndexError, match="index 7"):
+            nl.refine(MEANS, config=config, **needed, **failing)
 
 
 def test_arrays_of_every_library_give_the_same(unchecked):
@@ -258,46 +232,59 @@ def test_arrays_of_every_library_give_the_same(unchecked):
     assert torch.equal(one.rows.weight, two.rows.weight)
     with pytest.raises(nl.InputError, match="reliability must"):
         nl.unsupported(NEAR, np.float32(1) * np.ones(()))
-    with pytest.raises(nl.InputError, match="reliability has 1 rows"):
+    with pytest.raises(nl.InputError, match=r"neighbors.index must be in -1\.\.0"):
         nl.unsupported(NEAR, [1.0])
     assert torch.equal(FIELD.query(FEATURES.tolist()), FIELD.query(FEATURES.numpy()))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [torch.Tensor.to_sparse, lambda x: x.to("meta"), lambda x: torch.nested.nested_tensor([x]),
-     lambda x: x.to(torch.float8_e4m3fn)],
-)  # fmt: skip
-def test_tensors_that_are_no_arrays_are_refused(change: Callable[[torch.Tensor], torch.Tensor], unchecked) -> None:
-    calls = {
-        "reliability": lambda: nl.unsupported(NEAR, change(ONES)),
-        "text_vectors": lambda: FIELD.query(change(FEATURES)),
-        "positive": lambda: nl.relevancy(change(UNIT), change(UNIT), rule="lerf"),
-        "K": lambda: nl.Camera(change(K), POSE, 16, 16),
-        "means": lambda: nl.GaussianScene(change(MEANS), torch.ones(N, 4), torch.ones(N, 3), ONES),
-        "features": lambda: nl.lift(EVIDENCE, change(FEATURES)),
-    }
-    for name, call in calls.items():
+def test_numbers_out_of_range_are_refused_by_name(tmp_path) -> None:
+
+    def near(rows: torch.Tensor) -> nl.Neighbors:  # in which -1 stands for none
+        return NEAR._replace(index=(rows - (rows < 0).int()).int().expand(N, 2))
+
+    for wrong in ([-1], [N], [-99]):
+        rows = torch.tensor(wrong)
+        for name, call in {
+            "gaussians": EVIDENCE.select_gaussians, "^gaussians": LIFTED.directions, "^gaussians ": FIELD.directions,
+            "of": lambda x: nl.nearest_neighbors(MEANS, 2, of=x), "neighbors": lambda x: nl.unsupported(near(x), ONES),
+            "source": lambda x: nl.SemanticField.build(LIFTED, MEANS, source=x.expand(N)),
+            "index": lambda x: nl.refine(MEANS, UNIT, ONES, nl.RefineConfig("paper", k=2), neighbors=near(x)),
+        }.items():  # fmt: skip
+            with pytest.raises(nl.InputError, match=name):
+                call(rows)
+    with pytest.raises(nl.InputError, match=f"got {N}"):
+        EVIDENCE.select_gaussians(torch.tensor([0, N]))
+    for name, call in {
+        "num_gaussians": lambda x: nl.Evidence.from_entries([], x), "size": lambda x: nl.Camera(K, POSE, x, 16),
+        "factor": CAMERA.downscaled, "sample": lambda x: nl.consensus(EVIDENCE, FEATURES, sample=x),
+        "num_regions": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP - 1], num_regions=[x]),
+        "weight_power": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP], weight_power=x),
+        "dtype": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP], dtype=torch.float16 if x < 0 else torch.bool),
+        "dtype must be": lambda x: LIFTED.directions(dtype=torch.int8),
+        "JSON": lambda x: nl.SemanticField.build(LIFTED, MEANS, provenance={"a": {x}}).save(tmp_path / "a"),
+        "encoded": lambda x: EVIDENCE.save(tmp_path / "a", remarks={"a": "\ud800"}),
+    }.items():  # fmt: skip
+        for count in (-5, 10**30) if name != "factor" else (-5, -math.inf, 0):
+            with pytest.raises(nl.InputError, match=name):
+                call(count)
+    assert list(tmp_path.iterdir()) == []
+    assert nl.nearest_neighbors(MEANS.double() * 1e200, 2).index.tolist() == [[-1, -1]] * N
+    for part, more, name in (
+        (([0], [2], [1.0], (1,)), {}, "column"), (([0], [-1], [1.0], (1,)), {}, "column"),
+        (([N], [1], [1.0], (1,)), {}, "gaussian"), (([-1], [1], [1.0], (1,)), {}, "gaussian"),
+        *((([0], [1], [value], (1,)), {}, "weight") for value in (math.nan, math.inf, -1.0)),
+        (([1, 0], [1, 1], [1.0, 1.0], (1,)), {}, "sorted"), (([0, 0], [1, 1], [1.0, 1.0], (1,)), {}, "distinct"),
+        *((([0], [1], [1.0], (1, count)), {}, "num_regions") for count in (-1, 2**31, 10**30)),
+        *((([0], [1], [1.0], (1,)), {"weight_power": power}, "weight_power") for power in (-3, 3)),
+        *((([0], [1], [1.0], (1,)), {"num_excluded": count}, "num_excluded") for count in (-1, N + 1)),
+    ):  # fmt: skip
         with pytest.raises(nl.InputError, match=name):
-            call()
-
-
-def test_numbers_of_gaussians_are_checked() -> None:
-    for wrong in ([-1], [0, N], [-99]):
-        with pytest.raises(nl.InputError, match=f"gaussians .* got {wrong[-1]}"):
-            EVIDENCE.select_gaussians(torch.tensor(wrong))
-    for count in (-5, 10**30):
-        with pytest.raises(nl.InputError, match="num_gaussians"):
-            nl.Evidence.from_entries([], count)
-    with pytest.raises(nl.InputError, match="size"):
-        nl.Camera(K, POSE, 10**30, 16)
-    with pytest.raises(nl.InputError, match="encoded"):
-        EVIDENCE.save("a\ud800.safetensors")
+            nl.Evidence.from_entries([Entries(*part)], N, **more)
 
 
 def test_the_table_has_every_public_name():
     made = {"Answer", "Finding", "Histogram", "Why", "Coverage", "Consensus", "Scalars", "Evidence", "LiftedRun"}
-    named = {getattr(function, "__name__", "") for function, _ in TABLE}
+    named = {getattr(function, "__name__", "") for function, *_ in TABLE}
     rest = {name for name in nl.__all__ if callable(getattr(nl, name))} - made - {"Scene", "InputError"}
     assert rest - named - {"SemanticField"} == set()
     assert all(is_dataclass(getattr(nl, name)) or name == "Consensus" for name in made)

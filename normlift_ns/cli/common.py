@@ -455,19 +455,20 @@ def _sigterm_raises() -> Iterator[None]:
             hook(ignored)
         else:  # raised while an object was deleted, where Python prints exceptions and continues
             signal.signal(signal.SIGTERM, terminate)
-            timers.append(threading.Timer(0.01, signal.raise_signal, (number,)))
-            timers[-1].start()
+            again.append(threading.Timer(0.01, signal.raise_signal, (number,)))
+            again[-1].start()
 
-    timers: list[threading.Timer] = []
-    hook, sys.unraisablehook = sys.unraisablehook, report
+    again, hook, sys.unraisablehook = list[threading.Timer](), sys.unraisablehook, report
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:
-        for timer in timers:  # after the end, the signal would hit the caller
-            timer.cancel()
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
-        sys.unraisablehook = hook
+        try:
+            for timer in again:  # whose signal must not come after this context
+                timer.join()
+        finally:
+            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+            sys.unraisablehook = hook
 
 
 @contextmanager

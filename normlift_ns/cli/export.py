@@ -137,9 +137,9 @@ class NormLiftExport(options.CheckedOptions):
 
     def _outputs(self) -> dict[str, Path]:
         """Return the path of every output by its exporter."""
-        name = Path(self.output_filename).name
-        if name == "":
-            raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
+        name = self.output_filename
+        if name in ("", "..") or Path(name).name != name:
+            raise InputError(f"--output-filename {name!r} is not a file name; give one without folders, as splat.ply")
         target = self.output_dir / name
         cloud = None if self.transfer is None else self.output_dir / f"{self.transfer.stem}_labels.ply"
         paths = {"ply": target, "masks": self.masks_dir, "arrays": self.arrays_dir, "cloud": cloud}
@@ -157,6 +157,10 @@ class NormLiftExport(options.CheckedOptions):
         files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
         cloud = outputs.get("cloud")
         self._check_answer()
+        if self.select != "clean":
+            preflight.refuse_unused(self, ("floater_threshold",), "--select clean")
+        if self.transfer is None:
+            preflight.refuse_unused(self, ("transfer_distance", "transfer_coordinates"), "--transfer FILE")
         preflight.check_readable_file(self.transfer, "--transfer")
         if self.masks_dir is not None and self.select == "clean":
             raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --select clean")
@@ -171,7 +175,9 @@ class NormLiftExport(options.CheckedOptions):
             preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
-        """Raise if an output needs prompts, and there are none."""
+        """Raise if an output or an option needs prompts, and there are none."""
+        if len(self.text) == 0:
+            preflight.refuse_unused(self.ask, vars(self.ask), "--text")
         stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"
         if len(self.text) > 0 or stored.exists():
             return
@@ -185,6 +191,7 @@ class NormLiftExport(options.CheckedOptions):
             flags.insert(0, f"--select {self.select}")
         if len(flags) > 0:
             raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
+        preflight.refuse_unused(self, ("object_max_gap", "object_min_gaussians"), "--text")
 
 
 def _objects_table(queries: list[dict[str, Any]]) -> Table:

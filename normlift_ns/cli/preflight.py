@@ -6,13 +6,22 @@ import os
 import stat
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.guard import protect_inputs
 from normlift_ns.io.run_dir import field_folder, read_manifest, text_cache_folder
-from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
+from normlift_ns.options import (
+    AskOptions,
+    LiftOptions,
+    SourceOptions,
+    SplatOptions,
+    check_prompt_list,
+    option_name,
+    short_repr,
+)
 
 
 def check_readable_file(path: Path | None, flag: str) -> None:
@@ -169,14 +178,20 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
     check_readable_file(splat.world_transform, "--world-transform")
 
 
+def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
+    """Raise InputError if an option that has no effect without the flag `needed` is not at its default."""
+    for name in names:
+        if getattr(options, name) != getattr(type(options), name):
+            raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave it out")
+
+
 def check_unused_options(lift: LiftOptions) -> None:
     """Raise InputError for options that have no effect because their step is off."""
-    default = LiftOptions()
-    for name in ("consensus_power", "consensus_sample", "consensus_min_agreement"):
-        if not lift.consensus and getattr(lift, name) != getattr(default, name):
-            raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
-    if lift.vote.vote != "posterior" and lift.vote.prior != default.vote.prior:
-        raise InputError("--vote-prior is for --vote posterior. Set that, or leave it out.")
+    if not lift.consensus:
+        names = ("consensus_power", "consensus_sample", "consensus_min_agreement")
+        refuse_unused(lift, names, "--consensus True")
+    if lift.vote.vote != "posterior":
+        refuse_unused(lift.vote, ("prior",), "--vote posterior")
 
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:

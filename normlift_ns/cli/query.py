@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from rich.table import Table
 
 from normlift_ns.cli import common
-from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder
+from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder, refuse_unused
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.guard import read_text
@@ -332,18 +332,16 @@ class NormLiftQuery(CheckedOptions):
         check_prompt_list("text", self.text)
 
     def _check_dependent_options(self) -> None:
-        for name, needed, flag in (
-            ("render_views", self.render_dir, "--render-dir FOLDER"),
-            ("explain_dir", self.explain, "--explain True"),
-            ("segment_model", self.segment, "--segment sam3"),
-            ("segment_views", self.segment, "--segment sam3"),
-            ("objects_dir", self.objects or self.inventory, "--objects True"),
-            ("meters_per_unit", self.objects or self.inventory, "--objects True"),
-            ("vocabulary", self.inventory, "--inventory True"),
-            ("image", self.inventory, "--inventory True"),
+        for names, needed, flag in (
+            (("render_views",), self.render_dir, "--render-dir FOLDER"),
+            (("explain_dir",), self.explain, "--explain True"),
+            (("segment_model", "segment_views"), self.segment, "--segment sam3"),
+            (("objects_dir", "meters_per_unit"), self.objects or self.inventory, "--objects True"),
+            (("vocabulary", "image"), self.inventory, "--inventory True"),
+            (("history",), self.interactive, "--interactive True"),
         ):
-            if not needed and getattr(self, name) != getattr(type(self), name):
-                raise InputError(f"--{name.replace('_', '-')} has no effect without {flag}; add that flag")
+            if not needed:
+                refuse_unused(self, names, flag)
 
     def _existing_renders(self) -> list[Path]:
         """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""

@@ -13,7 +13,7 @@ import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from itertools import chain, repeat
 from numbers import Integral, Real
 from pathlib import Path
@@ -43,29 +43,15 @@ def check_arguments(target: _T) -> _T:
     normlift_ns.errors.ArgumentError: number must be a whole number, got 1.5
     """
     owner, made = cast(Any, target), isinstance(target, type)
-    name = "__new__" if made and issubclass(owner, tuple) else "__init__"
+    name = "__new__" if issubclass(owner if made else int, tuple) else "__init__"
     function = getattr(owner, name) if made else owner
-    parameters = list(inspect.signature(function).parameters.values())
-
-    @cache
-    def checks() -> tuple[list[tuple[str, _Check]], tuple[str, _Check] | None, dict[str, _Check]]:
-        hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
-        named = {p.name: _check_of(hints.get(p.name, Any)) for p in parameters}
-        ordered = [
-            (p.name, named[p.name]) for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-        ]
-        more = next(((f"each of *{p.name}", named[p.name]) for p in parameters if p.kind == p.VAR_POSITIONAL), None)
-        for p in parameters:
-            if p.kind == p.VAR_KEYWORD and p.name in hints:  # Unpack[a TypedDict]
-                named |= {key: _check_of(hint) for key, hint in get_type_hints(get_args(hints[p.name])[0]).items()}
-        return ordered, more, named
+    checks = cache(partial(_checks_of, owner, function))
 
     @wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        ordered, more, named = checks()
+        positions, named = checks()
         sizes: _Sizes = {}
-        places = chain(ordered, repeat(more or ("", _anything)))
-        args = tuple([check(name, value, sizes) for (name, check), value in zip(places, args)])
+        args = tuple([check(name, value, sizes) for (name, check), value in zip(positions(), args)])
         for name, value in kwargs.items():
             if name in named:
                 kwargs[name] = named[name](name, value, sizes)
@@ -75,6 +61,34 @@ def check_arguments(target: _T) -> _T:
         return cast(_T, checked)
     setattr(owner, name, checked)
     return target
+
+
+def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[str, _Check]]], dict[str, _Check]]:
+    """Return an iterable of the names and checks of positional arguments, and the checks of keywords."""
+    hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
+    named, ordered, more = dict[str, _Check](), list[tuple[str, _Check]](), ("", _anything)
+    for p in inspect.signature(function).parameters.values():
+        if p.kind == p.VAR_KEYWORD and p.name in hints:  # Unpack[a TypedDict]
+            named |= {key: _check_of(hint) for key, hint in get_type_hints(get_args(hints[p.name])[0]).items()}
+            continue
+        named[p.name] = _check_of(hints.get(p.name, Any))
+        if p.kind == p.VAR_POSITIONAL:
+            more = (f"each of *{p.name}", named[p.name])
+        elif p.kind < p.VAR_POSITIONAL:
+            ordered.append((p.name, named[p.name]))
+    return lambda: chain(ordered, repeat(more)), named
+
+
+def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
+    """Raise InputError if an array of whole numbers names a row that does not exist.
+
+    Args:
+        size: number of rows.
+        low: smallest number; -1 if it stands for no row.
+    """
+    first, last = map(int, rows.aminmax()) if rows.numel() > 0 else (low, low)
+    if first < low or max(last, 0) >= max(size, 1):
+        raise InputError(f"{name} must be in {low}..{size - 1}, got {first if first < low else last}")
 
 
 class _Names(dict[str, Any]):
@@ -87,8 +101,8 @@ class _Names(dict[str, Any]):
 
 
 def _error(name: str, expected: str, value: Any) -> ArgumentError:
-    shown = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "dtype") and _is_dense(value) else None
-    return ArgumentError(f"{name} must be {expected}, got {shown or short_repr(value)}")
+    shown = f"{value.dtype} {tuple(value.shape)}" if _layout(value) == "" else short_repr(value)
+    return ArgumentError(f"{name} must be {expected}, got {shown}")
 
 
 def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
@@ -97,24 +111,14 @@ def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
 
 def _check_of(hint: Any) -> _Check:
     """Return the check of an annotation; annotations without a rule here accept anything."""
-    if hasattr(hint, "dim_str"):
-        return _array_check(hint)
-    return _plain_check(hint) if get_origin(hint) is None else _generic_check(get_origin(hint), get_args(hint))
-
-
-def _generic_check(origin: Any, parts: Sequence[Any]) -> _Check:
-    if origin in (Union, types.UnionType):
-        return _union_check(parts)
-    if origin is Literal:
-        words = ", ".join(map(str, parts))
-        return _instance_check(lambda x: any(type(x) is type(p) and x == p for p in parts), f"one of {words}")
-    if origin is Callable:
-        return _instance_check(callable, "a function")
-    if isinstance(origin, type) and issubclass(origin, Mapping):
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is None:
+        return _ArrayCheck(hint) if hasattr(hint, "dim_str") else _plain_check(hint)
+    if origin in _GENERIC:
+        return _GENERIC[origin](parts)
+    if issubclass(origin, Mapping):
         return _mapping_check(_check_of(parts[1]))
-    if isinstance(origin, type) and issubclass(origin, Iterable):
-        return _items_check(origin, parts if origin is tuple else (*parts[:1], ...))
-    return _anything
+    return _list_check(origin, parts[0]) if issubclass(origin, Iterable) else _anything
 
 
 def _plain_check(hint: Any) -> _Check:
@@ -123,16 +127,19 @@ def _plain_check(hint: Any) -> _Check:
     if hint is Path:
         return lambda name, value, _: check_path(name, value)
     if getattr(hint, "_is_protocol", False):
-        members = [m for m in dir(hint) if not m.startswith("_")]
-        return _instance_check(
-            lambda x: all(hasattr(type(x), m) or m in getattr(x, "__dict__", ()) for m in members), f"a {hint.__name__}"
-        )
+        members = {m for m in dir(hint) if not m.startswith("_")}
+        return _instance_check(lambda x: members <= {*dir(type(x)), *getattr(x, "__dict__", ())}, f"a {hint.__name__}")
     if hint in (Any, object) or not isinstance(hint, type) or is_typeddict(hint):
         return _anything
     if (hint.__module__, hint.__name__) == ("torch", "Tensor"):
-        return lambda name, value, _: _as_tensor(name, value, "an array")
+        return lambda name, value, _: as_tensor(name, value, "an array")
     kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, f"of type {hint.__name__}")
     return _instance_check(lambda value: isinstance(value, hint), kind)
+
+
+def _literal_check(words: Sequence[Any]) -> _Check:
+    typed = [(type(word), word) for word in words]
+    return _instance_check(lambda value: (type(value), value) in typed, f"one of {', '.join(map(str, words))}")
 
 
 def _instance_check(accepts: Callable[[Any], bool], expected: str) -> _Check:
@@ -159,46 +166,53 @@ def _number_check(kind: type) -> _Check:
 
 
 def _union_check(parts: Sequence[Any]) -> _Check:
-    words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
+    words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
     others = [part for part in parts if get_origin(part) is not Literal and part is not type(None)]
-    checks = [_check_of(part) for part in others if not (part is str and Path in parts)]
-    checks += [_generic_check(Literal, words)] if len(words) > 0 else []
-    optional = type(None) in parts
+    checks = [_check_of(part) for part in others if part is not str or Path not in parts]
+    checks += [_literal_check(words)] * (len(words) > 0)
+    return partial(_check_any, checks, type(None) in parts)
 
-    def check(name: str, value: Any, sizes: _Sizes) -> Any:
-        if value is None and optional:
-            return None
-        errors: list[InputError] = []
-        for one in checks:
-            try:
-                return one(name, value, sizes)
-            except InputError as error:
-                errors.append(error)
-        start = f"{name} must be "
-        for error in errors:  # of an item
-            if len(errors) == 1 or not str(error).startswith(start):
-                raise error
-        raise _error(name, " or ".join(str(e).removeprefix(start).rpartition(", got ")[0] for e in errors), value)
+
+def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, sizes: _Sizes) -> Any:
+    if value is None and optional:
+        return None
+    expected, start = list[str](), f"{name} must be "
+    for check in checks:
+        try:
+            return check(name, value, sizes)
+        except InputError as error:
+            if len(checks) == 1 or not str(error).startswith(start):  # of an item
+                raise
+            expected.append(str(error).removeprefix(start).rpartition(", got ")[0])
+    raise _error(name, " or ".join(expected), value)
+
+
+def _list_check(origin: type, hint: Any) -> _Check:
+    """Return the check of a sequence or an iterable, whose items are converted as they come."""
+    item = _check_of(hint)
+
+    def check(name: str, value: Any, _: _Sizes) -> Any:
+        accepted = isinstance(value, origin | list | tuple) and not isinstance(value, str | bytes | Mapping)
+        if not accepted or getattr(value, "ndim", 1) == 0:
+            such = f" such as [{short_repr(value)}]" if isinstance(value, str) else ""
+            raise _error(name, "a list" + such, value)
+        items = (item(f"{name}[{i}]", one, {}) for i, one in enumerate(value))
+        if isinstance(value, list | tuple | range):
+            return tuple(items) if isinstance(value, tuple) or origin is tuple else list(items)
+        return value if origin is Sequence else items
 
     return check
 
 
-def _items_check(origin: type, parts: Sequence[Any]) -> _Check:
-    """Return the check of a tuple, a sequence or an iterable, whose items are converted as they come."""
-    every, checks = parts[1:] == (...,), [_check_of(part) for part in parts if part is not ...]
-    expected = "a list" if every else f"a tuple of {len(parts)}"
+def _tuple_check(parts: Sequence[Any]) -> _Check:
+    if parts[1:] == (...,):
+        return _list_check(tuple, parts[0])
+    checks = [_check_of(part) for part in parts]
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
-        listed = isinstance(value, list | tuple)
-        accepted = listed or (every and isinstance(value, origin) and not isinstance(value, str | bytes | Mapping))
-        if not accepted or getattr(value, "ndim", 1) == 0 or (not every and len(value) != len(parts)):
-            hint = f" such as [{short_repr(value)}]" if every and isinstance(value, str) else ""
-            raise _error(name, expected + hint, value)
-        rows = zip(repeat(checks[0]) if every else checks, value)
-        items = (one(f"{name}[{i}]", item, sizes if not every else {}) for i, (one, item) in enumerate(rows))
-        if type(value) in (list, tuple, range):
-            return tuple(items) if type(value) is tuple else list(items)
-        return value if origin is Sequence else items
+        if not isinstance(value, list | tuple) or len(value) != len(checks):
+            raise _error(name, f"a tuple of {len(checks)}", value)
+        return tuple(one(f"{name}[{i}]", item, sizes) for i, (one, item) in enumerate(zip(checks, value)))
 
     return check
 
@@ -212,68 +226,91 @@ def _mapping_check(item: _Check) -> _Check:
     return check
 
 
-def _array_check(hint: Any) -> _Check:
-    """Return the check of a jaxtyping annotation: kind of numbers, number of axes, and their lengths."""
-    kind = hint.__name__.partition("[")[0].rstrip("0123456789")
-    axes, to_numpy, generic = hint.dim_str.split(), hint.array_type is np.ndarray, hint.array_type is Any
-    expected = f"an array of {_KINDS.get(kind, kind)} of shape [{', '.join(axes)}]"
-    fixed, wide = [axis for axis in axes if not axis.startswith("*")], any(axis.startswith("*") for axis in axes)
+def _function_check(parts: Sequence[Any]) -> _Check:
+    """Return the check of a function and of the arrays that it returns."""
+    arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
-        if not (isinstance(value, np.ndarray) and (to_numpy or generic)):
-            listed = isinstance(value, list | tuple)
-            array = _as_tensor(name, value, expected)
-            if listed and kind == "Float" and not array.is_floating_point() and _kind_of(array) == "Int":
-                array = array.float()
-            if to_numpy and _kind_of(array) in _KINDS:
-                array = (array.float() if str(array.dtype) == "torch.bfloat16" else array).detach().cpu().numpy()
-            value = array
-        shape = tuple(value.shape)
-        if _kind_of(value) not in (kind, "Int" if kind == "UInt" and "8" not in hint.__name__ else kind) or (
-            len(shape) < len(fixed) if wide else len(shape) != len(fixed)
-        ):
-            raise _error(name, expected, value)
-        ends = len(shape) - len(fixed)
-        for axis, length in zip(axes, (shape[:ends], *shape[ends:]) if wide else shape):
-            if length != (int(axis) if axis.isdigit() else sizes.setdefault(axis, length)):
-                known = "" if axis.isdigit() else f" with {axis} = {sizes[axis]}"
-                raise _error(name, expected + known, value)
-        return value
+        try:
+            inspect.signature(value if callable(value) else lambda: 0).bind(*arguments)
+        except TypeError:
+            raise _error(name, f"a function of {len(arguments)} values", value) from None
+        except ValueError:  # from some built-in functions, which have no signature
+            pass
+
+        def call(*args: Any) -> Any:
+            known = dict(sizes)
+            for one, arg in zip(arguments, args):
+                one(name, arg, known)
+            return result(f"the result of {name}", value(*args), known)
+
+        return call if isinstance(result, _ArrayCheck) else value
 
     return check
 
 
+class _ArrayCheck:
+    """Check of a jaxtyping annotation: kind of numbers, number of axes, and their lengths."""
+
+    def __init__(self, hint: Any) -> None:
+        self.kind, axes = hint.__name__.partition("[")[0].rstrip("0123456789"), hint.dim_str.split()
+        self.kinds = {self.kind, "Int"} if self.kind == "UInt" and "8" not in hint.__name__ else {self.kind}
+        self.expected = f"an array of {_KINDS.get(self.kind, self.kind)} of shape [{', '.join(axes)}]"
+        self.axes, self.wide = axes, axes[:1] != [] and axes[0].startswith("*")  # a first axis *n is any number of axes
+        self.to_numpy, self.numpy = hint.array_type is np.ndarray, hint.array_type in (np.ndarray, Any)
+
+    def __call__(self, name: str, value: Any, sizes: _Sizes) -> Any:
+        """Return the array as a tensor, or as NumPy's if the annotation says so."""
+        value = value if self.numpy and isinstance(value, np.ndarray) else self._convert(name, value)
+        shape, more = tuple(value.shape), len(value.shape) - len(self.axes)
+        if _kind_of(value.dtype) not in self.kinds or (more < -1 if self.wide else more != 0):
+            raise _error(name, self.expected, value)
+        for axis, length in zip(self.axes, (shape[: more + 1], *shape[more + 1 :]) if self.wide else shape):
+            if length != (int(axis) if axis.isdigit() else sizes.setdefault(axis, length)):
+                known = "" if axis.isdigit() else f" with {axis} = {sizes[axis]}"
+                raise _error(name, self.expected + known, value)
+        return value
+
+    def _convert(self, name: str, value: Any) -> Any:
+        array = as_tensor(name, value, self.expected)
+        if self.kind == "Float" and isinstance(value, list | tuple) and _kind_of(array.dtype) == "Int":
+            array = array.float()
+        if not self.to_numpy or _kind_of(array.dtype) not in _KINDS:
+            return array
+        return (array.float() if str(array.dtype) == "torch.bfloat16" else array).detach().cpu().numpy()
+
+
+_GENERIC: dict[Any, Callable[[Sequence[Any]], _Check]] = {
+    Union: _union_check, types.UnionType: _union_check, Literal: _literal_check, tuple: _tuple_check,
+    Callable: _function_check,
+}  # fmt: skip
 _KINDS = {"Float": "floating-point numbers", "Int": "whole numbers", "UInt": "bytes", "Bool": "True and False"}
 
 
-def _kind_of(array: Any) -> str:
-    name = str(array.dtype).removeprefix("torch.").replace("float8", "8-bit float")
-    return next((kind for kind in ("Float", "Int", "Bool") if name.startswith(kind.lower())),
-                "Float" if name == "bfloat16" else "UInt" if name.startswith("uint") else name)  # fmt: skip
+@cache
+def _kind_of(dtype: Any) -> str:
+    """Return Float, Int, UInt or Bool; other dtypes have names of their own."""
+    name = str(dtype).removeprefix("torch.").replace("bfloat", "float").replace("float8", "8-bit float")
+    return next((kind for kind in _KINDS if name.startswith(kind.lower())), name)
 
 
-def _is_dense(value: Any) -> bool:
-    """Return whether an array is neither sparse nor nested nor without values."""
-    return isinstance(value, np.ndarray) or _layout(value) == ""
-
-
-def _layout(tensor: Any) -> str:
-    """Return what keeps a tensor from being used as an array; "": nothing."""
-    if getattr(tensor, "is_nested", False):
-        return "nested"
-    layout, device = str(getattr(tensor, "layout", "torch.strided")), getattr(tensor, "device", None)
-    return "meta" if getattr(device, "type", "") == "meta" else layout.removeprefix("torch.").replace("strided", "")
-
-
-def _as_tensor(name: str, value: Any, expected: str) -> Any:
-    """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
+def _layout(value: Any) -> str | None:
+    """Return what keeps an array from being used, such as sparse_coo or meta; "": nothing, None: not an array."""
     torch = sys.modules.get("torch")
-    if torch is not None and isinstance(value, torch.Tensor):
-        if not _is_dense(value):
-            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {_layout(value)} tensor")
-        return value
+    if torch is None or not isinstance(value, torch.Tensor):
+        return "" if isinstance(value, np.ndarray) else None
+    layout = "nested" if value.is_nested else "meta" if value.is_meta else str(value.layout)
+    return layout.removeprefix("torch.").removeprefix("strided")
+
+
+def as_tensor(name: str, value: Any, expected: str) -> Any:
+    """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
     if not isinstance(value, np.ndarray | list | tuple):
-        raise _error(name, expected, value)
+        if (layout := _layout(value)) is None:
+            raise _error(name, expected, value)
+        if layout != "":
+            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {layout} tensor")
+        return value.resolve_neg()
     import torch  # noqa: PLC0415 (a command-line query does not need it)
 
     try:

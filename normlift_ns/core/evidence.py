@@ -15,18 +15,22 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
 from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
+from normlift_ns.options import short_repr
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""
+WEIGHT_POWERS = (0, 1, 2)
+"""Exponents of the weights A_ij in evidence; 0 counts pixels."""
 
 
+@check_arguments
 class Entries(NamedTuple):
     """Nonzero weights that a rasterizer returns for one or more views: distinct and sorted by (gaussian, column)."""
 
@@ -67,11 +71,12 @@ class Evidence(TensorRecord):
     num_views: int
     """Number of views, including those without regions."""
     weight_power: int = 1
-    """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code)."""
+    """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code). 0: E counts pixels."""
     num_excluded: int = 0
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
     def __post_init__(self) -> None:
+        _check_counts(self)
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
             raise InputError(
@@ -116,10 +121,18 @@ class Evidence(TensorRecord):
         """Join the entries of all views, in their order.
 
         Raises:
-            ValueError: the number of Gaussians is negative, or does not fit into 31 bits.
+            ValueError: the number of Gaussians is negative, or does not fit into 31 bits; or the entries of a part are
+                not sorted, refer to other Gaussians or columns, or have weights that are negative or not finite.
         """
         if not 0 <= num_gaussians < 2**31:
             raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
+        for i, part in enumerate(parts):
+            _check_entries(f"parts[{i}]", part, num_gaussians)
+        return Evidence.join(parts, num_gaussians, weight_power=weight_power, num_excluded=num_excluded)
+
+    @staticmethod
+    def join(parts: Sequence[Entries], num_gaussians: int, *, weight_power: int, num_excluded: int) -> Evidence:
+        """Run `from_entries` for entries of a rasterizer, which are not checked."""
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
         rows, unlabeled = (_join_by_sorting if device.type == "cuda" else _join)(parts, num_gaussians, device)
@@ -184,10 +197,7 @@ class Evidence(TensorRecord):
         Raises:
             ValueError: a number is not one of a Gaussian.
         """
-        low, high = (int(x) for x in gaussians.aminmax()) if gaussians.numel() > 0 else (0, -1)
-        if low < 0 or high >= self.num_gaussians:
-            wrong = low if low < 0 else high
-            raise InputError(f"gaussians must be in 0..{self.num_gaussians - 1}, got {wrong}")
+        check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 
@@ -302,6 +312,42 @@ class Evidence(TensorRecord):
         """Wrap the arrays of a file without copying them."""
         rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (arrays.rows, arrays.unlabeled))
         return Evidence(rows, torch.from_numpy(arrays.region_view), unlabeled, *arrays.counts)
+
+
+def check_not_negative(name: str, values: Tensor) -> None:
+    """Raise if a value is negative or not finite.
+
+    Raises:
+        ValueError: if there are such values; the message counts them and shows the first.
+
+    >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
+    """
+    bad = (~((values >= 0) & values.isfinite())).nonzero()
+    if len(bad) > 0:
+        first = int(bad[0, 0])
+        raise InputError(
+            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite: {name}[{first}] is "
+            f"{float(values[first]):g}"
+        )
+
+
+def _check_counts(evidence: Evidence) -> None:
+    if evidence.weight_power not in WEIGHT_POWERS:
+        raise InputError(f"weight_power must be 0, 1 or 2, got {evidence.weight_power}")
+    if not 0 <= evidence.num_excluded <= evidence.num_gaussians:
+        raise InputError(f"num_excluded must be in 0..{evidence.num_gaussians}, got {evidence.num_excluded}")
+
+
+def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:
+    counts = part.num_regions
+    if not all(0 <= count < 2**31 for count in counts) or sum(counts) + len(counts) >= 2**31:
+        raise InputError(f"{name}.num_regions must be counts that fit into 31 bits, got {short_repr(counts)}")
+    check_rows(f"{name}.gaussian", part.gaussian, num_gaussians)
+    check_rows(f"{name}.column", part.column, sum(counts) + len(counts))
+    order = part.gaussian.long() * 2**31 + part.column
+    if bool((order.diff() <= 0).any()):
+        raise InputError(f"{name} must be distinct entries, sorted by gaussian and column")
+    check_not_negative(f"{name}.weight", part.weight)
 
 
 def _join(parts: Sequence[Entries], num_gaussians: int, device: torch.device) -> tuple[SparseRows, SparseRows]:

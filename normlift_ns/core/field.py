@@ -6,6 +6,7 @@ By default, a field uses the smallest storage that meets the requested tolerance
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
@@ -108,6 +109,7 @@ class SemanticField(TensorRecord):
         else:
             store = store_directions(lifted, basis, spatial_order(means))
         source = torch.arange(n, device=means.device) if source is None else source
+        check_rows("source", source, n)
         return SemanticField.assemble(lifted.scalars, source, store, means, provenance=provenance or {}, facts=facts)
 
     @staticmethod
@@ -201,6 +203,7 @@ class SemanticField(TensorRecord):
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
+        check_rows("gaussians", rows, len(self))
         rows = self.source.long()[rows] if refined else rows
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
 
@@ -226,6 +229,7 @@ class SemanticField(TensorRecord):
             OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
+        _check_target(folder, {**self.manifest, "digests": dict(beside)})
         if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
@@ -335,3 +339,13 @@ def _check_belongs(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
             f"number, other means); {LIFT_AGAIN}"
         )
+
+
+def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Raise InputError if a field cannot be written, before anything is."""
+    try:
+        json.dumps(facts).encode("utf8")
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"provenance or beside cannot be encoded as JSON: {error}") from None
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give another one")

@@ -33,11 +33,13 @@ or silently the identity."""
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
-    A Gaussian with parameters that are not finite or out of range keeps its row, but is never drawn (see `drawable`).
+    Parameters may be NaN or infinite, as training can leave them. Such a Gaussian, or one whose parameters are out of
+    range, keeps its row but is never drawn (see `drawable`); `Evidence.num_excluded` counts it. So it has no evidence,
+    no direction and a reliability of 0, and exports leave it out.
 
     Raises:
         ValueError: if a shape is wrong, a tensor is not floating-point, devices differ, a scale is negative, or an
-            opacity is outside 0..1. NaN is accepted.
+            opacity is outside 0..1, such as infinity.
 
     >>> import torch
     >>> from normlift_ns import GaussianScene
@@ -164,6 +166,8 @@ class Camera:
         >>> small.width, small.height, small.K[0].tolist()
         (40, 30, [25.0, 0.0, 20.0])
         """
+        if factor <= 0:
+            raise InputError(f"factor must be positive, got {factor}")
         width, height = (max(1, round(min(1.0, factor) * side)) for side in (self.width, self.height))
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.K * scale, self.world_to_camera, width, height)

@@ -16,13 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
@@ -111,8 +110,11 @@ class Lifted:
             dtype: type of the result; half precision also halves the peak memory.
         """
         dtype = dtype or self.features.dtype
+        if not dtype.is_floating_point:
+            raise InputError(f"dtype must be a floating-point type, got {dtype}")
         n, device = self.evidence.num_gaussians, self.features.device
         gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
+        check_rows("gaussians", gaussians, n)
         if _has_kernel(self.features):
             return self._directions(gaussians, dtype)
         result = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
@@ -205,8 +207,7 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
-    check_tensors(features=features)
-    if features.ndim != 2 or features.shape[0] != evidence.num_regions or not features.dtype.is_floating_point:
+    if features.shape[0] != evidence.num_regions:
         raise InputError(
             f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
             f"{features.dtype} {tuple(features.shape)}"
@@ -267,23 +268,6 @@ def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
 # Checks of tensor arguments: invalid input raises an error instead of producing a wrong result.
 
 
-def check_tensors(**arguments: Any) -> None:
-    """Raise if an argument is not a tensor.
-
-    Raises:
-        ValueError: if one is not; the message names it.
-
-    >>> try:
-    ...     check_tensors(means=[[0.0, 0.0, 0.0]])
-    ... except ValueError as error:
-    ...     print(error)
-    means must be a torch tensor, got list; torch.as_tensor makes one
-    """
-    for name, value in arguments.items():
-        if not isinstance(value, Tensor):
-            raise InputError(f"{name} must be a torch tensor, got {type(value).__name__}; torch.as_tensor makes one")
-
-
 def check_unit_rows(
     rows: Float[Tensor, "m d"], name: str, advice: str, *, allow_zeros: bool = False
 ) -> Float64[Tensor, " m"]:
@@ -307,20 +291,3 @@ def check_unit_rows(
         examples = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
         raise InputError(f"{bad.numel():,} of {len(rows):,} {name} are not unit vectors ({examples}); {advice}")
     return length
-
-
-def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise if a value is negative or not finite.
-
-    Raises:
-        ValueError: if there are such values; the message counts them and shows the first.
-
-    >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
-    """
-    bad = (~((values >= 0) & values.isfinite())).nonzero()
-    if len(bad) > 0:
-        first = int(bad[0, 0])
-        raise InputError(
-            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite: {name}[{first}] is "
-            f"{float(values[first]):g}"
-        )

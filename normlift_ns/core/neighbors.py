@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.partition import Communicator
 from normlift_ns.errors import InputError
@@ -81,6 +81,8 @@ def nearest_neighbors(
     """
     if check_number("k", k, int) > MAX_NEIGHBORS:
         raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}: all neighbors are held in memory")
+    if of is not None:
+        check_rows("of", of, len(means))
     neighbors = _on_gpu(means.detach(), k, of, progress, team) if can_use_triton(means) else None
     neighbors = _on_cpu(means, k, of, progress) if neighbors is None else neighbors
     if progress is not None:
@@ -187,7 +189,8 @@ def _members(position_of: np.ndarray, limit: int) -> np.ndarray:
     count = np.bincount(position_of)
     first = np.cumsum(count) - count
     slot = np.arange(min(limit, count.max()))
-    return np.where(slot < count[:, None], by_position[np.minimum(first[:, None] + slot, len(position_of) - 1)], -1)
+    member = np.where(slot < count[:, None], by_position[np.minimum(first[:, None] + slot, len(position_of) - 1)], -1)
+    return np.pad(member, ((0, 1), (0, 0)), constant_values=-1)  # the tree returns one more if distances overflow
 
 
 def _rank_gaussians(
@@ -219,7 +222,7 @@ def _rank_gaussians(
     blocks = [rank(near[i : i + step], reach[i : i + step]) for i in range(0, len(near), step)]
     ranked, distance = (np.concatenate(parts) for parts in zip(*blocks))
     if near.shape[1] > count:  # the tree returns arbitrary ones of the positions that tie at the end
-        for row in np.flatnonzero(reach[:, count - 1] == reach[:, count]):
+        for row in np.flatnonzero((reach[:, count - 1] == reach[:, count]) & np.isfinite(reach[:, count])):
             position = tree.data[queries[row]]
             around = np.array(tree.query_ball_point(position, reach[row, count] * (1 + 1e-12)))
             radius = np.linalg.norm(tree.data[around] - position, axis=1)

@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import can_use_triton, retry_in_halves
-from normlift_ns.core.lift import check_not_negative, check_tensors, check_unit_rows
+from normlift_ns.core.evidence import check_not_negative
+from normlift_ns.core.lift import check_unit_rows
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
 from normlift_ns.errors import InputError
@@ -32,7 +33,7 @@ _MAX_KERNEL_NEIGHBORS = 63
 @check_arguments
 def refine(
     means: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
+    directions: Float[Tensor, "n d"] | Callable[[Int64[Tensor, " m"]], Float[Tensor, "m d"]],
     reliability: Float[Tensor, " n"],
     config: RefineConfig | None = None,
     *,
@@ -82,12 +83,13 @@ def refine(
     [0, 0, 2]
     """
     config = config or RefineConfig(vote="paper" if own is None else "posterior")
-    _check_inputs(means, directions, reliability, own, posterior=config.vote != "paper")
+    _check_inputs(directions, reliability, own, posterior=config.vote != "paper")
     own = None if config.vote == "paper" else own
     config = config if neighbors is not None else clamp_k(config, len(means))
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (len(means), config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(len(means), config.k)}")
+    check_rows("neighbors.index", neighbors.index, len(means), low=-1)
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
     if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
         directions = directions.__getitem__  # in blocks, because the kernel needs as much memory again
@@ -96,34 +98,17 @@ def refine(
 
 
 def _check_inputs(
-    means: Tensor,
-    directions: Tensor | Callable[[Tensor], Tensor],
-    reliability: Tensor,
-    own: Tensor | None,
-    *,
-    posterior: bool,
+    directions: Tensor | Callable[[Tensor], Tensor], reliability: Tensor, own: Tensor | None, *, posterior: bool
 ) -> None:
     """Raise ValueError if the inputs of a vote are inconsistent."""
-    tensors = {"means": means, "reliability": reliability}
-    tensors |= {} if callable(directions) else {"directions": directions}
-    tensors |= {} if own is None else {"own": own}
-    check_tensors(**tensors)
-    n, table = means.shape[0], directions if isinstance(directions, Tensor) else None
-    shape = (n, 0) if table is None else tuple(table.shape)
-    if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
-        raise InputError(
-            f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
-        )
-    if posterior and (own is None or tuple(own.shape) != (n,)):
-        got = "none" if own is None else f"shape {tuple(own.shape)}"
-        raise InputError(f"a posterior vote needs own, the scalars.own_evidence of a lift, of shape {(n,)}; got {got}")
+    if posterior and own is None:
+        raise InputError("a posterior vote needs own, the scalars.own_evidence of a lift; got none")
     check_not_negative("reliability", reliability)
     if posterior and own is not None:
         check_not_negative("own", own)
-    if table is not None:
-        check_unit_rows(
-            table, "rows of directions", "normalize them, or set those without a direction to 0", allow_zeros=True
-        )
+    if isinstance(directions, Tensor):
+        advice = "normalize them, or set those without a direction to 0"
+        check_unit_rows(directions, "rows of directions", advice, allow_zeros=True)
 
 
 @dataclass(frozen=True)
@@ -324,10 +309,7 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
-    if neighbors.index.numel() > 0 and int(neighbors.index.max()) >= len(reliability):
-        raise InputError(
-            f"reliability has {len(reliability)} rows, but neighbors name row {int(neighbors.index.max())}"
-        )
+    check_rows("neighbors.index", neighbors.index, len(reliability), low=-1)
     return (reliability[: len(neighbors.index)] <= 0) & ~_any_reliable(neighbors, reliability)
 
 

@@ -166,7 +166,7 @@ class SparseRows(TensorRecord):
             arrays = (x.numpy() for x in (self.weight, self.column, offsets))
             from scipy.sparse import csr_array  # noqa: PLC0415 (not needed on a GPU)
 
-            product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.numpy()
+            product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.detach().numpy()
             return torch.from_numpy(product).to(table.dtype)
         # An embedding bag computes exactly this product: it gathers rows, scales and adds them. It is threaded on the
         # CPU, deterministic on the GPU, and does not need MKL.

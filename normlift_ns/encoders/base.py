@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ import torch
 from jaxtyping import Float, Float32, Int, Int32, Int64, UInt8
 from torch import Tensor
 
+from normlift_ns.core.arguments import as_tensor
 from normlift_ns.core.device import AdaptiveBatches, prefetch_map
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder, check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
@@ -510,6 +512,8 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     vector."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
+    _check_dense(f"labels of {name}", pair[0])
+    _check_dense(f"vectors of {name}", pair[1])
     try:
         labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
     except ValueError as error:  # rows of different lengths
@@ -517,7 +521,7 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     if labels.dtype.kind not in "iub":
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
-    if vectors.ndim != 2 or not bool(vectors.isfinite().all()):
+    if vectors.ndim != 2 or vectors.shape[1] == 0 or not bool(vectors.isfinite().all()):
         raise InputError(f"vectors of {name} must be [regions, D] and finite; got {vectors.shape}")
     low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
     if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
@@ -528,13 +532,19 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     return labels, vectors
 
 
+def _check_dense(name: str, value: Any) -> None:
+    """Raise InputError for a sparse or nested tensor, or one without values."""
+    if isinstance(value, Tensor):
+        as_tensor(name, value, "an array")
+
+
 def _convert_text(text: str, values: Any) -> Tensor:
     """Return the vector of a text; raise InputError unless the text can be stored and its vector has a direction."""
     vector = _to_floats(values)
     if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
         raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
-    if text.strip() == "" or text.endswith(".npy") or "\0" in text:
-        raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains NUL characters")
+    if text.strip() == "" or text.endswith(".npy") or re.search("[\0\ud800-\udfff]", text):
+        raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains invalid characters")
     return vector
 
 

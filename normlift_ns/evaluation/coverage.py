@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 
 from normlift_ns.analysis.objects import connected_components
 from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
 from normlift_ns.core.lift import Scalars, reliability
@@ -765,7 +766,8 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
     >>> all(region.reliability < 0.6 for region in result.regions)
     True
     """
-    return coverage_of(run.scene, run.field, min_reliability=min_reliability, device=device or run.device)
+    device = choose_device(device or run.device)
+    return coverage_of(run.scene, run.field, min_reliability=min_reliability, device=device)
 
 
 def coverage_of(

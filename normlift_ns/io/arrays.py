@@ -11,6 +11,7 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -86,7 +87,10 @@ def save_arrays(
         overwrite: replace an existing file.
     Raises:
         FileExistsError, OSError: as in `atomic_files`.
+        ValueError: the metadata cannot be encoded.
     """
+    if invalid := next((text for text in (facts or {}).values() if re.search("[\ud800-\udfff]", text)), ""):
+        raise InputError(f"the metadata of {path} cannot be encoded: {invalid!a}")
     if all(isinstance(array, np.ndarray) for array in arrays.values()):
         from safetensors.numpy import save_file  # noqa: PLC0415 (one of the two)
 

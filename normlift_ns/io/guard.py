@@ -7,9 +7,11 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 from normlift_ns.errors import InputError
 
@@ -108,28 +110,27 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
 
     >>> refuse_inputs([Path("answers.json")], instead="--output-json")
     """
-    inputs: dict[tuple[int, int], str] | None = None
-    entries: dict[str, list[tuple[str, str, re.Pattern[str]]]] = {}
+    owners, inputs = cache(lambda folder: list(_owners(folder))), cache(_input_files)
     for path in paths:
-        resolved, owner = os.path.realpath(path), None
-        exists, folder = os.path.exists(resolved), os.path.dirname(resolved)
-        if folder not in entries:
-            entries[folder] = list(_owners(folder))
-        for kind, parent, names in entries[folder]:
-            if names.fullmatch(Path(resolved).relative_to(parent).parts[0]) and (exists or kind == "run"):
-                owner = f"the {kind} {parent}"
-        if exists and ".cache" in Path(folder).parts:
-            owner = f"the cache {folder}"
-        if exists and owner is None:
-            inputs = _input_files() if inputs is None else inputs
-            statuses = (os.stat(place) for place in (resolved, *map(str, Path(resolved).parents)))
-            found = (inputs.get((status.st_dev, status.st_ino)) for status in statuses)
-            owner = next((f"the input {name}" for name in found if name is not None), None)
+        owner = _owner_of(os.path.realpath(path), owners, inputs)
         if owner is not None:
             raise InputError(
                 f"{path} is part of {owner}, and replacing it would destroy that; give another {instead} "
                 "(--overwrite True does not allow this)"
             )
+
+
+def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
+    """Return what a path without links is part of; None if an output may be written there."""
+    exists, folder = os.path.exists(path), os.path.dirname(path)
+    for kind, parent, names in owners(folder):
+        if (exists or kind == "run") and names.fullmatch(Path(path).relative_to(parent).parts[0]):
+            return f"the {kind} {parent}"
+    if exists and ".cache" in Path(folder).parts:
+        return f"the cache {folder}"
+    statuses = map(os.stat, (path, *Path(path).parents) if exists else ())
+    name = next(filter(None, (inputs().get((status.st_dev, status.st_ino)) for status in statuses)), None)
+    return None if name is None else f"the input {name}"
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:

@@ -21,7 +21,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
-from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
+from normlift_ns.query.text_encoder import DefaultRule, HasManifest, default_rule, encoder_digest
 
 
 def as_numpy(array: Any) -> np.ndarray:
@@ -94,20 +94,13 @@ def make_query(
         ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
     _check_rules(negatives, relevancy, threshold)
-    threshold = threshold if threshold is None or isinstance(threshold, str) else check_number("threshold", threshold)
     min_reliability = check_number("min_reliability", min_reliability)
     check_bool("refined", refined)
     default = default_rule(field)
     if relevancy == "auto":
         relevancy = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
-    gated = threshold is None or threshold == "auto"
-    if threshold is None:
-        general = RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
-        threshold = default.threshold if relevancy == default.rule else general
-    needed = CANONICAL_NEGATIVES if RELEVANCY_RULES[relevancy].needs_negatives else ()
-    if needed and negatives is not None and len(negatives) == 0:
-        raise InputError(f"relevancy {relevancy} compares with negatives, and negatives is empty; name some")
-    negatives = tuple((default.negatives or needed) if negatives is None else negatives)
+    gated, threshold = threshold in (None, "auto"), _resolve_threshold(default, relevancy, threshold)
+    negatives = _resolve_negatives(default, relevancy, negatives)
     return Query(
         texts=tuple(texts),
         embeddings=encode(texts),
@@ -121,6 +114,29 @@ def make_query(
         refined=refined,
         encoder=encoder_digest(field.manifest),
     )
+
+
+def _resolve_threshold(
+    default: DefaultRule, relevancy: RelevancyRule, threshold: float | str | None
+) -> float | Literal["auto"]:
+    if threshold == "auto":
+        return "auto"
+    if threshold is not None:
+        return check_number("threshold", threshold)
+    if relevancy == default.rule:
+        return default.threshold
+    return RELEVANCY_RULES[relevancy].threshold if RELEVANCY_RULES[relevancy].needs_negatives else "auto"
+
+
+def _resolve_negatives(
+    default: DefaultRule, relevancy: RelevancyRule, negatives: Sequence[str] | None
+) -> tuple[str, ...]:
+    needed = CANONICAL_NEGATIVES if RELEVANCY_RULES[relevancy].needs_negatives else ()
+    if negatives is None:
+        return tuple(default.negatives or needed)
+    if needed and len(negatives) == 0:
+        raise InputError(f"relevancy {relevancy} compares with negatives, and negatives is empty; name some")
+    return tuple(negatives)
 
 
 def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:

@@ -15,12 +15,12 @@ from typing_extensions import Unpack
 
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import has_triton, retry_in_halves
-from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
+from normlift_ns.core.evidence import MASKED, UNLABELED, WEIGHT_POWERS, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.errors import InputError
-from normlift_ns.options import BackendName, RasterizeMode
+from normlift_ns.options import BackendName, RasterizeMode, short_repr
 from normlift_ns.rasterization.backend import Backend, RasterBatch, RasterJob, TileBackend
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -84,6 +84,8 @@ def _fastest(job: RasterJob) -> str:
 
 
 ViewProgress = Callable[[int, int | None], None]
+MAX_REGIONS = 2**24
+"""Largest number of regions of a view; memory grows with it, whether or not regions have pixels."""
 _ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
 
 
@@ -148,7 +150,7 @@ def rasterize_evidence(
     ([0.5, 0.25], [0.5, 0.25])
     """
     weight_power = options.get("weight_power", 1)
-    if weight_power not in (0, 1, 2):
+    if weight_power not in WEIGHT_POWERS:
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, **options)
     _, chosen = choose_backend(backend, job)
@@ -184,7 +186,7 @@ def rasterize_evidence(
                 done += 1
                 if progress is not None:
                     progress(done, total)
-    return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
+    return Evidence.join(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
 def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpack[RasterOptions]) -> BackendName:
@@ -279,8 +281,9 @@ def _job(
 ) -> RasterJob:
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
-    antialiased = rasterize_mode == "antialiased"
-    return RasterJob(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
+    if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; a scene of {dtype} needs one")
+    return RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
 
 
 def _batches(
@@ -325,7 +328,11 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
         raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabeled, -2 masked")
     if count is not None and high >= count:
         raise InputError(f"labels of view {index} contain region {high}, but num_regions is {count}")
-    return max(high, UNLABELED) + 1 if count is None else count
+    count = max(high, UNLABELED) + 1 if count is None else count
+    if not 0 <= count <= MAX_REGIONS:
+        found = f"{short_repr(count)}; number the regions of a view 0, 1, …"
+        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {found}")
+    return count
 
 
 @check_arguments

@@ -120,13 +120,17 @@ def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_p
     for flags, fact in (
         (("red", "--threshold", "1.5", "--select", "selection"), "no Gaussian"),
         (("oragne",), "orange"),
+        *(
+            (("red", "--output-filename", name), "--output-filename")
+            for name in ("../a.ply", tmp_path / "a", "..", "b/a")
+        ),
+        (("red", "--transfer-distance", 3), "--transfer FILE"),
+        (("red", "--floater-threshold", 2), "--select clean"),
+        (("--threshold", 0.5), "--text"),
     ):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
-        assert not list((tmp_path / "x").glob("*"))
-    flags = ("--load-config", lifted, "--output-dir", tmp_path / "a" / "b", "--output-filename", "../../evil.ply")
-    assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
-    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.ply")] == ["a/b/evil.ply"]
+        assert list(tmp_path.rglob("*.*")) == []
 
 
 def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_path: Path, monkeypatch) -> None:

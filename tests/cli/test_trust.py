@@ -1,8 +1,6 @@
 """Outputs that hit a file of somebody, and input that only looks impossible: a message, and nothing has changed."""
 
 import hashlib
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -79,15 +77,6 @@ def test_a_log_is_added_to_logs_of_ours_only(ended, tmp_path: Path) -> None:
         assert log.read_text().startswith(text) and (log.read_text() == text) == (code == 1)
     log.write_text("")
     assert ended(lambda _: None, "--word", str(log), "--log-file", str(log))[0] == 1 and log.read_text() == ""
-
-
-@pytest.mark.parametrize("module", ["query", "export", "lift", "check", "evaluate", "batch", "weights"])
-def test_a_command_without_standard_error_ends_as_with_it(module: str, tmp_path: Path) -> None:
-    code = f"import sys; sys.argv[1:] = ['--nonsense']; from normlift_ns.cli import start; start.{module}()"
-    done = subprocess.run(
-        ["sh", "-c", f'"{sys.executable}" -c "{code}" 2>&-'], capture_output=True, cwd=tmp_path, check=False
-    )
-    assert (done.returncode, done.stdout) == (1, b"")
 
 
 def test_no_cell_of_a_table_is_a_formula() -> None:

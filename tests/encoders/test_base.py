@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from normlift_ns.encoders.base import PatchFeatures, RegionFeatures, ViewFeatures
+from normlift_ns.encoders.base import PatchFeatures, RegionFeatures, ViewFeatures, precomputed_features
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.plugins import PluginEncoder
@@ -29,6 +29,15 @@ def test_view_features_accept_what_fits_and_refuse_the_rest():
     view = ViewFeatures(torch.tensor([[-1, 0], [0, 0]], dtype=torch.int32), UNIT)
     assert view.features.shape == (2, 3)
     ViewFeatures(torch.full((4, 5), -1, dtype=torch.int32), torch.zeros(0, 3))
+
+
+def test_own_features_of_no_use_are_refused_by_name():
+    labels = torch.zeros(2, 2).long()
+    for pair, texts, name in (
+        ((labels.to("meta"), UNIT), None, "labels of a"), ((labels, UNIT.to_sparse()), None, "vectors of a"),
+        ((labels, UNIT[:, :0]), None, "vectors of a"), ((labels, UNIT), {"\ud800": UNIT[0]}, "not a valid text"),
+    ):  # fmt: skip
+        refused(lambda given=(pair, texts): precomputed_features([given[0]], given[1], ["a"]), name)
 
 
 def test_regions_of_cells_must_have_features():
