@@ -122,14 +122,14 @@ export class Splats {
   /**
    * Changes the colors of the next frame.
    * @param {Uint8Array} codes One per Gaussian.
-   * @param {number[][]} palette Rows of red, green, blue, share and gray, all in 0..1.
+   * @param {number[][]} palette Rows of red, green and blue in 0..255, and of share and gray in 0..1.
    */
   paint(codes, palette) {
     this.codes.image.data.set(codes.subarray(0, this.count));
     this.codes.needsUpdate = true;
     const data = this.palette.image.data;
     palette.forEach(([red, green, blue, share, gray], i) => {
-      data.set([red, green, blue, share], 4 * i);
+      data.set([red / 255, green / 255, blue / 255, share], 4 * i);
       data[4 * (256 + i)] = gray;
     });
     this.palette.needsUpdate = true;
