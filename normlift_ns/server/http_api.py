@@ -1,0 +1,5 @@
+"""HTTP API."""
+
+
+def api_routes(server):
+    return []
