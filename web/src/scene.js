@@ -260,9 +260,10 @@ export class SceneRenderer extends EventTarget {
 
   /** Draws one frame, coarser if a fine one would come too late, and the fine one once nothing changes any more. */
   async draw() {
-    if (this.busy || !this.splats) return;
-    this.busy = true;
+    if (this.busy) return;
     this.waiting = false;
+    if (!this.splats) return;
+    this.busy = true;
     const still = performance.now() - this.changed.when > REST || this.changed.what !== "camera";
     const full = !this.slow || (still && (this.costs.full < VERY_SLOW || this.coarse));
     const milliseconds = await this.render(full);
