@@ -11,6 +11,8 @@ const SLOW = 120;
 const VERY_SLOW = 700;
 /** Milliseconds without a change after which the finest frame is drawn. */
 const REST = 200;
+/** Milliseconds of rest after which a slow renderer adds the outline. */
+const LONG_REST = 800;
 /** Degrees of the vertical field of view at the start. */
 const FOV = 55;
 
@@ -181,7 +183,7 @@ export class SceneRenderer extends EventTarget {
     super();
     this.canvas = canvas;
     this.view = view;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: false });
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.scene = new THREE.Scene();
     this.spark = new SparkRenderer({
       renderer: this.renderer, enableLod: false, sortRadial: false, minAlpha: 1 / 255,
@@ -195,7 +197,7 @@ export class SceneRenderer extends EventTarget {
     this.costs = { full: 0, coarse: 0 };
     this.coarseRatio = 0.5;
     this.changed = { what: "order", when: 0 };
-    this.busy = this.waiting = this.coarse = false;
+    this.busy = this.waiting = this.coarse = this.plain = false;
     this.timer = 0;
     this.frames = 0;
     canvas.addEventListener("webglcontextlost", () => this.dispatchEvent(new Event("lost")));
@@ -272,6 +274,18 @@ export class SceneRenderer extends EventTarget {
     this.dispatchEvent(Object.assign(new Event("frame"), { full, milliseconds }));
     if (this.waiting) requestAnimationFrame(() => this.draw());
     else if (!full) this.timer = setTimeout(() => this.finish(), this.changed.what === "camera" ? REST : 0);
+    else if (this.plain) this.timer = setTimeout(() => this.addOutline(), LONG_REST);
+  }
+
+  /** Adds the outline to a fine frame of a slow renderer, which would otherwise come later. */
+  async addOutline() {
+    if (this.busy || this.waiting || !this.splats) return;
+    this.busy = true;
+    this.plain = false;
+    this.outline.draw(this.renderer, this.scene, this.view.camera, this.splats);
+    await drawn(this.renderer);
+    this.busy = false;
+    if (this.waiting) requestAnimationFrame(() => this.draw());
   }
 
   /** Draws the fine frame after a coarse one. */
@@ -290,6 +304,7 @@ export class SceneRenderer extends EventTarget {
     const size = renderer.getSize(new THREE.Vector2());
     if (size.x !== view.width || size.y !== view.height) renderer.setSize(view.width, view.height, false);
     renderer.render(this.scene, view.camera);
+    this.plain = full && this.outlined && this.slow;
     if (full && this.outlined && !this.slow && this.splats) {
       this.outline.draw(renderer, this.scene, view.camera, this.splats);
     }

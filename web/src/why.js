@@ -14,7 +14,7 @@ export function showExplanation(message, closed) {
   $("why").replaceChildren(
     h("div.row.spread", {}, h("p", {}, h("b", {}, "Why? "), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
       button("Close", "clear", "Close", "Escape", close, { bare: true })),
-    h("div.row", { style: "align-items: start; gap: 24px; flex-wrap: wrap" },
+    h("div.groups", {},
       ...[group("Strongest support", message.support ?? [], "agreement"), group("Most disagreement", message.disagreement ?? [], "disagreement")].filter(Boolean)),
   );
   $("why").hidden = false;
