@@ -24,7 +24,7 @@ from normlift_ns.server import schema
 from normlift_ns.server.coloring import make_codes
 from normlift_ns.server.protocol import decode
 from normlift_ns.server.runs import ServedRun
-from normlift_ns.server.session import explanation_of, view_camera
+from normlift_ns.server.session import explanation_of
 from normlift_ns.session.state import State
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ class Endpoint:
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
     """Answer a question."""
-    result = schema.answer(served, request)
-    content = schema.query_result(result)
+    result, content = schema.answered(served, request)
     if request.arrays == "none":
         return content
     arrays = {"relevancy": result.relevancy.float().cpu().contiguous(), "selected": result.selected.cpu().contiguous()}
@@ -117,7 +116,7 @@ def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
     if request.page_view is not None:
         if not request.page_view.is_valid:
             raise InputError("page_view must look at another point than its position, and not along up.")
-        return view_camera(request.page_view, request.max_size)
+        return request.page_view.camera(request.max_size)
     camera = served.run.camera(request.view) if request.camera is None else request.camera.camera()
     return camera.downscaled(request.max_size / max(camera.width, camera.height))
 
@@ -149,7 +148,9 @@ def features(served: ServedRun, query: Any) -> Content:
             f"start and stop must be 0 <= start < stop <= {count:,} with at most {MAX_FEATURES:,} rows between them, got "
             f"{start:,} and {stop:,}."
         )
-    return npy(served.space.field.directions(torch.arange(start, stop), refined=query.get("refined") != "false").float())
+    return npy(
+        served.space.field.directions(torch.arange(start, stop), refined=query.get("refined") != "false").float()
+    )
 
 
 def inventory(served: ServedRun, query: Any) -> dict[str, Any]:
@@ -253,13 +254,18 @@ def openapi(endpoints: Sequence[Endpoint]) -> dict[str, Any]:
     by_type = {repr(kind): schema_of for kind, schema_of in zip(types, schemas)}
     run = {"name": "run", "in": "path", "required": True, "schema": {"type": "string"}}
     error = {"description": "The request is not valid; `error` says why.", "content": _body({"type": "object"})}
-    paths: dict[str, Any] = {"/api/runs": {"get": {"summary": "List the runs.", "responses": {"200": {"description": "Runs"}}}}}
+    paths: dict[str, Any] = {
+        "/api/runs": {"get": {"summary": "List the runs.", "responses": {"200": {"description": "Runs"}}}}
+    }
     for endpoint in endpoints:
         answer = {_BINARY: {}} if endpoint.answer is None else _body(by_type[repr(endpoint.answer)])
         operation: dict[str, Any] = {
             "summary": endpoint.summary,
             "operationId": endpoint.path,
-            "parameters": [run, *({"name": n, "in": "query", "schema": {"type": "string"}} for n in endpoint.parameters)],
+            "parameters": [
+                run,
+                *({"name": n, "in": "query", "schema": {"type": "string"}} for n in endpoint.parameters),
+            ],
             "responses": {"200": {"description": "Answer", "content": answer}, "400": error},
         }
         if endpoint.request is not None:

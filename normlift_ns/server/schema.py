@@ -222,6 +222,16 @@ def answer(served: ServedRun, question: Question) -> Answer:
     return served.space.answer(make_query(served, question)[1])
 
 
+def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
+    """Return the answer to a question, as arrays and as JSON types; the latest ones are cached."""
+    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question))
+
+
+def _answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
+    result = answer(served, question)
+    return result, query_result(result)
+
+
 def query_result(result: Answer) -> QueryResult:
     """Return an answer as JSON types."""
     rows = [{**finding.to_json(), "count": int(finding.mask.sum())} for finding in result]
@@ -312,5 +322,3 @@ def select_result(served: ServedRun, state: State) -> SelectResult:
 def isolated(state: State) -> State:
     """Return a state that draws its selection alone, in its own colors."""
     return replace(actions.show_only(state), color_mode="rgb")
-
-
