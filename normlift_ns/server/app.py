@@ -8,14 +8,13 @@ import secrets
 import socket
 import threading
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
-import msgspec
 import uvicorn
 from anyio import CapacityLimiter
 from starlette.applications import Starlette
@@ -79,10 +78,13 @@ class ServerOptions:
         except ValueError:
             return False
 
+    def knows(self, access: str) -> bool:
+        """Return whether a text is the access token."""
+        return secrets.compare_digest(access.encode(), self.access_token.encode())
+
     def may_write(self, access: str) -> bool:
         """Return whether a request with this access token may write."""
-        known = secrets.compare_digest(access.encode(), self.access_token.encode())
-        return not self.read_only and (self.is_local or known)
+        return not self.read_only and (self.is_local or self.knows(access))
 
 
 class Guard:
@@ -357,7 +359,3 @@ async def _failed(request: Request, error: Exception) -> Response:
     """Return the message of an error without paths of this machine."""
     message, code = describe_error(error)
     return JSONResponse({"error": without_paths(message)}, 400 if code == 1 else 500)
-
-
-Handler = Callable[[Request], Awaitable[Response]]
-_ = msgspec

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
 import numpy as np
+import torch
 
+from normlift_ns.core.gaussians import Camera, facing_pose
 from normlift_ns.errors import InputError
 from normlift_ns.session.prompts import join_prompts
 from normlift_ns.session.state import State
@@ -37,6 +40,15 @@ class PageView(msgspec.Struct, frozen=True):
         """True if the camera looks at another point than its own position, and not along its vertical."""
         ahead = np.subtract(self.look_at, self.position)
         return bool(np.linalg.norm(np.cross(ahead, self.up)) > 0)
+
+    def camera(self, max_size: int) -> Camera:
+        """Return this camera with at most `max_size` pixels along its longer side."""
+        scale = min(1.0, max_size / max(self.width, self.height))
+        width, height = (max(1, round(scale * side)) for side in (self.width, self.height))
+        focal = height / 2 / math.tan(self.fov / 2)
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
+        points = (torch.tensor(x, dtype=torch.float64) for x in (self.position, self.look_at, self.up))
+        return Camera(K, facing_pose(*points).float(), width, height)
 
 
 class Link(msgspec.Struct, frozen=True, omit_defaults=True):

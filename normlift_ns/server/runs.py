@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 import torch
 import xxhash
@@ -32,6 +33,7 @@ from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
 from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
+from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
 from normlift_ns.session.prompts import prompts_of_query
 from normlift_ns.session.selection import SelectionContext
@@ -39,6 +41,7 @@ from normlift_ns.session.state import History, State
 
 MAX_MEMORIES = 64
 """Number of pages that are remembered after they were closed."""
+_MAX_RESULTS = 8
 _SAMPLE = 4096
 _NUM_EXAMPLES = 4
 _BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray")
@@ -49,6 +52,9 @@ _MEMORY_SHARE = 0.5
 """Share of the free memory that open runs may take."""
 _render_lock = threading.Lock()
 """Held while an image is rendered, because numba's threads do not support two renders at a time."""
+
+
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -85,6 +91,7 @@ class ServedRun:
     reading: threading.Lock = field(default_factory=threading.Lock)
     """Held while the text encoder or the votes are used, so that they are not loaded twice."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
+    _results: OrderedDict[bytes, Any] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
 
     @cached_property
@@ -231,6 +238,33 @@ class ServedRun:
         note = f" {faint:,} Gaussians are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
         return file, content, f"Downloaded {file} with {int(mask.sum()) - faint:,} Gaussians.{note}"
 
+    def cached(self, key: bytes, compute: Callable[[], T]) -> T:
+        """Return a result of this run by its key; the latest ones are kept."""
+        with self._memory_lock:
+            found = self._results.pop(key, None)
+        found = compute() if found is None else found
+        with self._memory_lock:
+            self._results[key] = found
+            while len(self._results) > _MAX_RESULTS:
+                self._results.popitem(last=False)
+        return found
+
+    def view_of(
+        self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
+    ) -> PageView:
+        """Return a camera that looks at an object or a point, from where nothing occludes it.
+
+        Args:
+            view: current camera; None: that of the first training image.
+            drawn: mask of the Gaussians that are drawn.
+        """
+        view = view or self.first_view
+        if view is None:
+            raise InputError("The camera is not known yet; move it, and try again.")
+        scene = self.run.scene.gaussians
+        position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
+        return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
+
     def image(self, index: int, max_size: int) -> bytes:
         """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
         if not 0 <= index < len(self.run.scene.train):
@@ -274,6 +308,15 @@ class ServedRun:
             for old in [name for name, memory in self._memories.items() if memory.page is None][:-MAX_MEMORIES]:
                 del self._memories[old]
             return found, token
+
+    def warm_up(self) -> None:
+        """Compute what the first page would wait for."""
+        _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
+        view = self.first_view
+        if view is not None:
+            codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
+            self.still(codes, view.camera(64))  # compiles the renderer
+        _ = self.pca
 
     @property
     def in_use(self) -> bool:

@@ -21,22 +21,25 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from normlift_ns.analysis.explain import ViewVote
-from normlift_ns.core.gaussians import Camera, facing_pose
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.query.engine import Finding
-from normlift_ns.query.question import Query
 from normlift_ns.server import protocol
 from normlift_ns.server.coloring import COLOR_MODES, Codes, legend, make_codes, prompt_display_colors
 from normlift_ns.server.permalink import Greeting, PageView, link_of, read_link, write_link
 from normlift_ns.server.runs import PageMemory, ServedRun, to_jpeg, without_paths
 from normlift_ns.session import actions
 from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
-from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects, unoccluded_viewpoint
+from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects
 from normlift_ns.session.prompts import (
-    build_query, click_name, encode_prompts, is_click, join_prompts,
+    build_query,
+    click_name,
+    encode_prompts,
+    is_click,
+    join_prompts,
 )  # fmt: skip
 from normlift_ns.session.region import inside_polygon, near_path, project, visible_gaussians
-from normlift_ns.session.state import RequestToken, RequestTokens, State
+from normlift_ns.session.state import RequestTokens, State
 
 _MAX_PENDING = 256
 """Number of actions of a page that may wait; a page that sends more is closed."""
@@ -423,21 +426,18 @@ class PageSession:
 
     async def _go_to(self, pending: _Pending) -> None:
         """Move the camera to an object or a position: closer, and where nothing occludes it."""
-        value, view = pending.value, self._memory.view or self._run.first_view
+        value = pending.value
         if value.id is None and value.position is None:
             raise InputError("Name an object or a position to go to.")
-        target = (
-            self._object(value.id) if value.id is not None else LookAtTarget(value.position, _SPOT * self._run.frame[2])
-        )
-        if view is None:
-            raise InputError("The camera of the page is not known yet; move it, and try again.")
-        gaussians, drawn = self._run.run.scene.gaussians, self._state.drawn
-        find = partial(unoccluded_viewpoint, target, gaussians, drawn, view.position, view.up, view.fov)
-        position = await self._in_thread(find, self._limits.slow)
-        self._memory.view = msgspec.structs.replace(view, position=position, look_at=target.center)
-        await self._send(
-            type="camera", position=position, look_at=target.center, up=view.up, fov=view.fov, seq=pending.seq
-        )
+        spot = LookAtTarget(value.position or (0.0, 0.0, 0.0), _SPOT * self._run.frame[2])
+        target = spot if value.id is None else self._object(value.id)
+        find = partial(self._run.view_of, target, self._memory.view, self._state.drawn)
+        self._memory.view = await self._in_thread(find, self._limits.slow)
+        await self._send_camera(self._memory.view, pending.seq)
+
+    async def _send_camera(self, view: PageView, seq: int) -> None:
+        place = {"position": view.position, "look_at": view.look_at, "up": view.up, "fov": view.fov}
+        await self._send(type="camera", seq=seq, **place)
 
     # What the page is told.
 
@@ -526,7 +526,7 @@ class PageSession:
                 view = self._memory.view or self._run.first_view
                 if view is None:
                     raise InputError("The camera of the page is not known yet.")
-                camera = view_camera(view, pending.value.max_size)
+                camera = view.camera(pending.value.max_size)
                 draw = partial(self._still, state, camera, pending.value.background)
                 jpeg = await self._in_thread(draw, self._limits.slow)
                 await self._send_binary({"type": "still", "seq": pending.seq, "revision": revision}, jpeg)
@@ -547,16 +547,6 @@ class PageSession:
         head = msgspec.json.encode(header)
         async with self._sending:
             await self._socket.send_bytes(struct.pack("<I", len(head)) + head + payload)
-
-
-def view_camera(view: PageView, max_size: int) -> Camera:
-    """Return the camera of a page, with at most `max_size` pixels along its longer side."""
-    scale = min(1.0, max_size / max(view.width, view.height))
-    width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
-    focal = height / 2 / np.tan(view.fov / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
-    points = (torch.tensor(x, dtype=torch.float64) for x in (view.position, view.look_at, view.up))
-    return Camera(K, facing_pose(*points).float(), width, height)
 
 
 def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:

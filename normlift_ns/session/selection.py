@@ -142,13 +142,13 @@ class SelectionContext:
         """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
         from scipy.sparse import csr_array  # noqa: PLC0415 (as above)
 
-        first, second = self._edges
+        first, second = self.neighbor_pairs
         inside = mask[first] & mask[second]
         pairs = (first[inside], second[inside])
         return csr_array((np.ones(len(pairs[0])), pairs), shape=(len(mask), len(mask)))
 
     @cached_property
-    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+    def neighbor_pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of neighbors: the 8 nearest, within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
         neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
         last = neighbors.distance[:, -1]
