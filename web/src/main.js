@@ -88,14 +88,25 @@ class Page {
     if (seq < 0) toast("Connection lost. Try again in a moment.", { kind: "error", anchor });
     this.anchors.set(seq, anchor);
     this.anchors.delete(seq - 100);
+    if (action === "ask") this.asked = seq;
+    else this.setStale(false);
     return seq;
+  }
+
+  /** Dims the old answer if a new question has none. @param {boolean} stale */
+  setStale(stale) {
+    if (this.stale === stale) return;
+    this.stale = stale;
+    $("answers").classList.toggle("stale", stale);
+    this.scene?.setBlend(stale ? 0.3 : Number($("blend").value));
   }
 
   build() {
     document.title = `${this.run.name} · normlift`;
     if (this.runs.length > 1) {
       const choose = h("select", { "aria-label": "Scene", onchange: () => (location.search = `?run=${encodeURIComponent(choose.value)}`) },
-        ...this.runs.map((one) => h("option", { value: one.id, selected: one.id === this.run.id }, one.name)));
+        ...this.runs.map((one) => h("option", { value: one.id, selected: one.id === this.run.id },
+          this.runs.filter((other) => other.name === one.name).length > 1 ? one.id : one.name)));
       $("name").replaceChildren(choose);
     }
     $("modes").replaceChildren(
@@ -165,6 +176,7 @@ class Page {
     on("busy", ({ text }) => this.search.setBusy(text));
     on("message", ({ text, kind, seq }) => {
       if (kind !== "busy") this.search.setBusy(null);
+      if (kind === "error" && seq === this.asked) this.setStale(true);
       toast(text, { kind, anchor: this.anchors.get(seq) ?? (seq <= this.greeted ? $("ask") : null) });
     });
     on("camera", (view, event) => this.moveCamera(view, event));
@@ -241,6 +253,7 @@ class Page {
 
   /** @param {any} state */
   show(state) {
+    if (state.seq === this.asked && this.state?.revision !== state.revision && state.step !== this.state?.step) this.setStale(false);
     this.state = state;
     this.search.show(state);
     this.panel.show(state);

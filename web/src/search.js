@@ -44,7 +44,6 @@ export class Search {
     $("busy").hidden = !text;
     $("busy").textContent = text ?? "";
     $("cancel").hidden = !text;
-    $("answers").classList.toggle("stale", Boolean(text));
   }
 
   /** @param {boolean} shown */
