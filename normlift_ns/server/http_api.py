@@ -126,7 +126,7 @@ def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
 
 def save(served: ServedRun, request: schema.SaveRequest) -> dict[str, str]:
     """Store a question in the run."""
-    _, asked = schema.make_query(served, request.question)
+    asked = schema.answer(served, request.question).question
     return {"stored": served.save(asked, replaces=request.replace)}
 
 
