@@ -16,7 +16,7 @@ from normlift_ns.cli.view import ServeOptions, open_all, until_stopped
 from normlift_ns.errors import InputError
 
 
-@dataclass(kw_only=True)
+@dataclass
 class NormLiftServe(ServeOptions):
     """Serve lifted runs: an HTTP API (`normlift_ns.connect` speaks it), the page of ns-normlift-view, and tools for
     agents. Runs stay open, so that answers take milliseconds.

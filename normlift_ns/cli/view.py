@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from normlift_ns.server.app import WarmServer
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ServeOptions(CheckedOptions):
     """Options of commands that serve lifted runs."""
 
@@ -76,7 +76,7 @@ class ServeOptions(CheckedOptions):
     text_vectors="text_embeddings",
     text_template="prompt_template",
 )
-@dataclass(kw_only=True)
+@dataclass
 class NormLiftView(ServeOptions):
     """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
     GPU.

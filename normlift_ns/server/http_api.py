@@ -93,8 +93,11 @@ def export(served: ServedRun, request: schema.ExportRequest) -> Content:
     state = schema.select_state(served, request)
     whole = request == schema.ExportRequest(format=request.format)
     mask = ~served.space.empty_mask() if whole else state.selection
-    name, content, _ = served.export(state, mask, "scene" if whole else state.name, request.format)
-    return Content(content, name=name)
+    texts = [] if request.question is None else request.question.texts
+    texts = texts if request.prompt is None else texts[request.prompt : request.prompt + 1]
+    name = "scene" if whole else " ".join([*texts, *([] if request.object is None else [str(request.object)])])
+    file, content, _ = served.export(state, mask, name or "selection", request.format)
+    return Content(content, name=file)
 
 
 def render(served: ServedRun, request: schema.RenderRequest) -> Content:
@@ -123,7 +126,7 @@ def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
 
 def save(served: ServedRun, request: schema.SaveRequest) -> dict[str, str]:
     """Store a question in the run."""
-    _, asked = schema.make_query(served, request.question)
+    asked = schema.answer(served, request.question).question
     return {"stored": served.save(asked, replaces=request.replace)}
 
 
@@ -145,8 +148,8 @@ def features(served: ServedRun, query: Any) -> Content:
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
     if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:
         raise InputError(
-            f"start and stop must be 0 <= start < stop <= {count:,} with at most {MAX_FEATURES:,} rows between them, got "
-            f"{start:,} and {stop:,}."
+            f"start and stop must be 0 <= start < stop <= {count:,} with at most {MAX_FEATURES:,} rows between them, "
+            f"got {start:,} and {stop:,}."
         )
     return npy(
         served.space.field.directions(torch.arange(start, stop), refined=query.get("refined") != "false").float()

@@ -28,6 +28,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
@@ -35,7 +36,7 @@ from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
-from normlift_ns.session.prompts import prompts_of_query
+from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts, prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, State
 
@@ -43,7 +44,7 @@ MAX_MEMORIES = 64
 """Number of pages that are remembered after they were closed."""
 _MAX_RESULTS = 8
 _SAMPLE = 4096
-_NUM_EXAMPLES = 4
+_NUM_EXAMPLES, _NUM_CANDIDATES = 4, 24
 _BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray")
 _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
@@ -165,16 +166,26 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Words of the encoder's own vocabulary that are closest to most of the scene; [] if it has none."""
-        with self.reading:
-            words = _BASIC_COLORS if encoder_name(self.run.field) == "color" else own_words(self.run.field)
-            if len(words) == 0:
-                return []
-            vectors = torch.nn.functional.normalize(torch.from_numpy(np.asarray(self.run.texts.rows(words))).float())
+        """Words of the encoder's own vocabulary that are found in the scene, at different places; [] if it has none."""
+        color = encoder_name(self.run.field) == "color"
+        words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
+        if len(words) == 0:
+            return []
         sample = torch.from_numpy(self.rows[:: 1 + len(self.rows) // _SAMPLE])
-        best = (self.run.field.directions(sample).float().cpu() @ vectors.T).argmax(dim=1)
-        counts = torch.bincount(best, minlength=len(words))
-        return [words[index] for index in counts.argsort(descending=True)[:_NUM_EXAMPLES].tolist() if counts[index] > 0]
+        vectors = torch.nn.functional.normalize(torch.from_numpy(np.asarray(self.read(words))).float())
+        cosine = self.run.field.directions(sample).float().cpu() @ vectors.T
+        null = self.run.field.null_levels().cpu()[sample]
+        lead = cosine - (null if null.shape[1] > 0 else cosine.mean(dim=1, keepdim=True))
+        best = torch.quantile(lead, 0.99, dim=0).argsort(descending=True)[:_NUM_CANDIDATES].tolist()
+        prompts = encode_prompts(join_prompts([words[index] for index in best]), self.read)
+        query = build_query(self.space.field, prompts, self.read)[1]
+        found, taken = [], self.space.empty_mask()
+        for finding in run_query(self.space.field, self.space.means, query):
+            size = int(finding.mask.sum())
+            if finding.verdict == "found" and 2 * int((finding.mask & taken).sum()) < size:
+                found.append(finding.text)
+                taken = taken | finding.mask
+        return found[:_NUM_EXAMPLES]
 
     @cached_property
     def pca(self) -> Float[torch.Tensor, "n 3"]:
@@ -280,9 +291,8 @@ class ServedRun:
         gray = (own @ own.new_tensor(_GRAY_WEIGHTS) * _GRAY_DIMMING)[:, None].expand_as(own)
         color = torch.where(table[:, 4:] > 0, gray, own)
         color = color + table[:, 3:4] * (table[:, :3] / 255 - color)
-        part = self.drawn_scene if bool(kept.all()) else GaussianScene(
-            *(x[kept] for x in (self.drawn_scene.means, self.drawn_scene.quats, self.drawn_scene.scales, self.drawn_scene.opacities))
-        )  # fmt: skip
+        whole = self.drawn_scene
+        part = GaussianScene(*(x[kept] for x in (whole.means, whole.quats, whole.scales, whole.opacities)))
         with _render_lock:
             image, alpha = render(part, camera, color.to(part.means), rasterize_mode=scene.rasterize_mode)
         shown = image + (1 - alpha)[:, :, None] * image.new_tensor(list(background))

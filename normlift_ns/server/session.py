@@ -498,11 +498,11 @@ class PageSession:
             while len(self._objects) > 2 * _MAX_OBJECTS:
                 self._objects.popitem(last=False)
             content["objects"] = [_object_json(state, number, row) for number, row in zip(rows, objects)]
-        rule, negatives = memory.rule, memory.negatives
-        await self._send(
-            type="state", revision=revision, seq=seq, line=memory.line, rule=rule, negatives=negatives, step=history.index,
-            history=[{"text": one.action or "Open"} for one in history.states], busy=self._tokens.busy or None, **content,
-        )  # fmt: skip
+        content |= {
+            "line": memory.line, "rule": memory.rule, "negatives": memory.negatives, "step": history.index,
+            "history": [{"text": one.action or "Open"} for one in history.states], "busy": self._tokens.busy or None,
+        }  # fmt: skip
+        await self._send(type="state", revision=revision, seq=seq, **content)
 
     def _codes(self, state: State) -> Codes:
         return make_codes(state, self._run.rows, self._run.pca if state.color_mode == "pca" else None)
@@ -687,7 +687,6 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
     smoothed = f"{why.copied / why.gaussians:.0%} was smoothed from neighbors"
-    return {
-        "text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), "agreement": why.c_inter, "effective_views": why.n_eff,
-        "problem": problem, **{name: [entry(vote) for vote in group] for name, group in groups.items()},
-    }  # fmt: skip
+    facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
+    votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
+    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}
