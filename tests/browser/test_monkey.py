@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.browser.page import OnPage
 from tests.browser.person import needs_chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
-from tests.browser.page import OnPage
 from tests.browser.viewer import Tab
 from tests.viewer.scenes import until
 

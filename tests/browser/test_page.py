@@ -122,8 +122,7 @@ def test_a_person_selects_by_hand(page: OnPage) -> None:
     page.page.keyboard.press("Escape")
     assert page.page.locator("#tool-select").get_attribute("aria-checked") == "true"
 
-    page.click(middle(red))
-    page.selects(lambda count: count == ball, "the ball")
+    ball = page.changes(lambda: page.click(middle(red)), "the ball")
     page.does("do-layer")
     page.until(lambda: page.page.locator("#layers li").count() == 1, "a layer")
     page.does("do-hide")
