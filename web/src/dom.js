@@ -38,7 +38,7 @@ export function fill(parent, children) {
   if (fresh.innerHTML === parent.innerHTML && fresh.childNodes.length === parent.childNodes.length) return;
   const focused = parent.contains(document.activeElement) ? document.activeElement?.getAttribute("data-key") : null;
   parent.replaceChildren(...fresh.childNodes);
-  if (focused) parent.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
+  if (focused) /** @type {HTMLElement | null} */ (parent.querySelector(`[data-key="${CSS.escape(focused)}"]`))?.focus();
 }
 
 /** @param {Blob} blob @param {string} name */

@@ -3,12 +3,13 @@ import { Connection } from "./connection.js";
 import { $, fixed, h, saveBlob, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 import { button, Panel } from "./panel.js";
-import { hasWebGL, SceneRenderer, View3D } from "./scene.js";
+import { hasWebGL, SceneRenderer } from "./scene.js";
 import { Search } from "./search.js";
 import { startShortcuts } from "./shortcuts.js";
 import { startTooltips, toast } from "./notices.js";
 import { Stills } from "./stills.js";
 import { Tools, TOOLS } from "./tools.js";
+import { View3D } from "./view.js";
 import { showExplanation } from "./why.js";
 
 /** @type {[string, string, string][]} Color mode, label and tooltip. */
@@ -55,9 +56,8 @@ class Page {
     this.greeted = 0;
     this.webgl = hasWebGL();
     this.act = this.act.bind(this);
-    this.view = new View3D($("canvas"));
-    this.view.start(run.up, run.radius);
-    this.view.go({ position: run.center.map((/** @type {number} */ x, /** @type {number} */ i) => x + run.up[i] * run.radius + (i === 0 ? run.radius : 0)), look_at: run.center, up: run.up }, false);
+    this.stale = false;
+    this.view = new View3D($("canvas"), run.up, run.radius);
     this.connection = new Connection(run.id, () => ({ ...this.greeting(), webgl: this.webgl }));
     this.scene = this.webgl ? new SceneRenderer($("canvas"), this.view) : null;
     this.stills = new Stills(this.view, (value) => this.connection.send("still", value), () => this.sendCamera());
@@ -72,7 +72,10 @@ class Page {
     this.open();
   }
 
-  /** Fields of the greeting: the token of this tab, and the question of the address or the last one. */
+  /**
+   * Fields of the greeting: the token of this tab, and the question of the address or the last one.
+   * @returns {{token: string, link: string, access: string}}
+   */
   greeting() {
     const { memory } = this.connection;
     const here = memory.search === location.search;
@@ -81,7 +84,10 @@ class Page {
     return { token: this.connection.memory.token, link: here && memory.link ? memory.link : location.search.slice(1), access };
   }
 
-  /** @param {string} action @param {any} [value] @param {Element | null} [anchor] Element that was pressed. */
+  /**
+   * @param {string} action @param {any} [value] @param {Element | null} [anchor] Element that was pressed.
+   * @returns {number} Number of the action.
+   */
   act(action, value = null, anchor = null) {
     performance.mark("press");
     const seq = this.connection.send(action, value);

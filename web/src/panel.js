@@ -297,5 +297,5 @@ function histogram(row, threshold, low, high) {
   const line = (/** @type {number} */ value, /** @type {string} */ name) => make("line", { x1: x(value), x2: x(value), y1: 0, y2: 40, class: name });
   if (Number.isFinite(row.suggested)) svg.append(line(row.suggested, "suggested"));
   svg.append(line(threshold, "now"));
-  return h("div", {}, h("p.soft.small", {}, row.text, row.warning ? h("span.warn", {}, ` · ${row.warning}`) : ""), svg);
+  return h("div", {}, h("p.soft.small", {}, row.text, row.warning ? h("span.warn", {}, ` · ${row.warning.replace(`${row.text}: `, "")}`) : ""), svg);
 }

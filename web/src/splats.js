@@ -109,13 +109,14 @@ export class Splats {
       ["vRgba = rgba;", COLOR],
       ["vRgba.a = rgba.a;", TIGHT],
     ]);
-    spark.geometry = batchGeometry();
+    const geometry = batchGeometry();
+    spark.geometry = geometry;
     const prepare = spark.onBeforeRender;
     spark.onBeforeRender = (...frame) => {
       prepare.apply(spark, frame);
       this.uniforms.lastSplat.value = spark.activeSplats;
       spark.uniforms.encodeLinear.value = false;
-      spark.geometry.instanceCount = Math.ceil(spark.activeSplats / BATCH);
+      geometry.instanceCount = Math.ceil(spark.activeSplats / BATCH);
     };
   }
 

@@ -7,7 +7,7 @@ const REST = 350;
 
 export class Stills {
   /**
-   * @param {import("./scene.js").View3D} view
+   * @param {import("./view.js").View3D} view
    * @param {(value: any) => number} send Asks for a picture.
    * @param {() => void} place Tells the server the camera.
    */

@@ -1,4 +1,5 @@
 /** Tools of the pointer: pick, rectangle, lasso, brush and measure. */
+import { MOUSE, TOUCH } from "three";
 import { $, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 
@@ -31,7 +32,7 @@ const modeOf = (event) =>
 /** Dispatches `hover` with a ray, or with null. */
 export class Tools extends EventTarget {
   /**
-   * @param {import("./scene.js").View3D} view
+   * @param {import("./view.js").View3D} view
    * @param {(action: string, value?: any) => number} act Sends an action.
    */
   constructor(view, act) {
@@ -72,10 +73,8 @@ export class Tools extends EventTarget {
     for (const [name] of TOOLS) $(`tool-${name}`).setAttribute("aria-checked", String(name === tool));
     $("hint").textContent = TOOLS.find(([name]) => name === tool)?.[4] ?? "";
     const drags = tool === "rectangle" || tool === "lasso" || tool === "brush";
-    if (this.view.controls) {
-      this.view.controls.mouseButtons.LEFT = drags ? -1 : 0;
-      this.view.controls.touches.ONE = drags ? -1 : 0;
-    }
+    this.view.controls.mouseButtons.LEFT = drags ? null : MOUSE.ROTATE;
+    this.view.controls.touches.ONE = drags ? null : TOUCH.ROTATE;
     this.draw();
   }
 
@@ -107,7 +106,7 @@ export class Tools extends EventTarget {
       if (this.drawing && event.pointerId === start.id) {
         if (this.tool === "rectangle") this.points = [this.points[0], this.pointer];
         else this.points.push(this.pointer);
-      } else if (event.buttons === 0 && event.pointerType !== "touch") this.hover(this.view.ray(...this.pointer));
+      } else if (event.buttons === 0 && event.pointerType !== "touch") this.hover(this.view.ray(this.pointer[0], this.pointer[1]));
       if (this.drawing || this.tool === "brush" || this.tool === "measure") this.draw();
     });
     element.addEventListener("pointerup", (event) => {
@@ -149,6 +148,7 @@ export class Tools extends EventTarget {
     const ray = this.view.ray(x, y);
     if (this.tool === "measure") {
       if (this.ends.length > 1) this.ends = [];
+      /** @type {{position: number[]}} */
       const pending = { position: [] };
       this.ends.push(pending);
       this.dispatchEvent(Object.assign(new Event("probe"), { ray, found: (/** @type {number[] | null} */ position) => {
