@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from normlift_ns.rasterization.rasterize import rasterize_evidence as rasterize_evidence
     from normlift_ns.rasterization.rasterize import render as render
     from normlift_ns.rasterization.settings import RasterSettings as RasterSettings
+    from normlift_ns.server.client import RemoteRun as RemoteRun
+    from normlift_ns.server.client import connect as connect
 
 
 __version__ = "0.2.0"
@@ -75,6 +77,7 @@ _HOMES = {
     "query.engine": "Answer Finding Histogram",
     "rasterization.rasterize": "Contributors contributors rasterize_evidence render",
     "rasterization.settings": "RasterSettings",
+    "server.client": "RemoteRun connect",
 }
 """Public names by the module that defines them."""
 _HOME = {name: f"normlift_ns.{module}" for module, names in _HOMES.items() for name in names.split()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,58 @@ from normlift_ns.options import CheckedOptions, check_device, renamed
 from normlift_ns.viewer.host_check import accepted_names
 
 if TYPE_CHECKING:
-    from normlift_ns.viewer.adapter import Door
+    from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.server.app import WarmServer
+
+
+@dataclass(kw_only=True)
+class ServeOptions(CheckedOptions):
+    """Options of commands that serve lifted runs."""
+
+    host: str = "127.0.0.1"
+    """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
+    allowed_hosts: tuple[str, ...] = ()
+    """Further names of this machine in the browser's address bar, such as that of a proxy. Pages at other names get
+    status 403."""
+    port: int = 7008
+    """Port to listen on, in 1..65535; if it is in use, the next free one."""
+    read_only: bool = False
+    """Forbid visitors from storing prompts in the run."""
+    max_gaussians: int = 1_000_000
+    """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
+    need more browser memory."""
+    device: str = "auto"
+    """Device for the text encoder: auto, cpu or cuda."""
+
+    def check(self) -> None:
+        """Raise InputError if the server cannot listen at the address, or an option is not valid."""
+        check_device(self.device)
+        _check_host(self.host)
+        accepted_names(self.host, self.allowed_hosts)
+
+    def make_server(self, *configs: Path) -> WarmServer:
+        """Return the server of some runs, which does not listen yet."""
+        from normlift_ns.server.app import ServerOptions, WarmServer  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.server.runs import RunStore  # noqa: PLC0415
+
+        options = ServerOptions(self.host, self.port, self.allowed_hosts, self.read_only)
+        return WarmServer(RunStore(configs, self.open_run, max_gaussians=self.max_gaussians), options)
+
+    def open_run(self, config: Path) -> LiftedRun:
+        """Open a run."""
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (as above)
+
+        return open_run(config, device=self.device)
+
+    def announce(self, server: WarmServer, port: int, what: str) -> None:
+        """Print the address of a server."""
+        if port != self.port:
+            info(f"Port {self.port} is already in use.")
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        host = f"[{host}]" if ":" in host else host
+        info(f"{what} is at http://{host}:{port} (press Ctrl-C to stop it)")
+        if not server.options.is_local and not self.read_only:
+            info(f"To store prompts from other machines too, add ?access={server.options.access_token} to the address.")
 
 
 @renamed(
@@ -25,77 +77,48 @@ if TYPE_CHECKING:
     text_template="prompt_template",
 )
 @dataclass
-class NormLiftView(CheckedOptions):
+class NormLiftView(ServeOptions):
     """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
     GPU.
-
-    Colors are those of spherical harmonics of degree 0.
     """
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
-    host: str = "127.0.0.1"
-    """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
-    allowed_hosts: tuple[str, ...] = ()
-    """Further names of this machine in the browser's address bar, such as that of a proxy. Pages at other names get
-    status 403."""
-    port: int = 7008
-    """Port to listen on, in 1..65535; if it is in use, the next free one."""
-    read_only: bool = False
-    """Forbid visitors from storing prompts in the run or writing files on this machine; their exports become browser
-    downloads."""
-    max_gaussians: int = 1_000_000
-    """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
-    need more browser memory."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per prompt, used instead of encoding prompts."""
     prompt_template: str | None = None
     """Template of the text that the network encodes, with {} for the prompt. Default: the template of the lift."""
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
-    device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
 
     def main(self) -> None:
         """Serve the viewer until the process is interrupted."""
-        check_device(self.device)
-        _check_host(self.host)
-        accepted_names(self.host, self.allowed_hosts)
+        self.check()
         check_lifted_run(self.load_config, self.data)
         check_readable_file(self.text_embeddings, "--text-embeddings")
-        from normlift_ns.viewer.adapter import Door  # noqa: PLC0415 (--help should not wait for viser)
-
-        door = Door(self.host, self.port, self.allowed_hosts)
-        if door.server.port != self.port:
-            info(f"Port {self.port} is already in use.")
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
-        host = f"[{host}]" if ":" in host else host
-        info(f"The viewer is at http://{host}:{door.server.port} (press Ctrl-C to stop it)")
+        server = self.make_server(self.load_config)
+        self.announce(server, server.start(), "The viewer")
         try:
-            self.open(door)
+            open_all(server)
             until_stopped()
         except (KeyboardInterrupt, TerminatedError):
             info("Stopped.")
+        finally:
+            server.stop()
 
-    def open(self, door: Door) -> None:
-        """Load the run and start to serve pages, including those that are already waiting; return immediately."""
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (pages load while torch is imported)
-        from normlift_ns.session.selection import SelectionContext  # noqa: PLC0415
-        from normlift_ns.viewer.person import People  # noqa: PLC0415
-        from normlift_ns.viewer.shared import Run, make_records  # noqa: PLC0415
+    def open_run(self, config: Path) -> LiftedRun:
+        """Open the run."""
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (as above)
 
-        run = open_run(
-            self.load_config,
-            data=self.data,
-            device=self.device,
-            text_embeddings=self.text_embeddings,
-            prompt_template=self.prompt_template,
-        )
-        space = SelectionContext(run.field, run.scene.gaussians.means.detach())
-        records = make_records(run.scene, self.max_gaussians)
-        shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.read_only, lambda: run.votes)
-        people = People(shared)
-        door.open(f"normlift: {run.scene.name}", people.come, people.go)
+        texts = {"text_embeddings": self.text_embeddings, "prompt_template": self.prompt_template}
+        return open_run(config, data=self.data, device=self.device, **texts)
+
+
+def open_all(server: WarmServer) -> None:
+    """Open the runs of a server, and compute in a thread what the first page would wait for."""
+    runs = [server.runs.get(name) for name in server.runs.ids]
+    for run in runs:
+        threading.Thread(target=run.warm_up, daemon=True).start()
 
 
 def until_stopped() -> NoReturn:

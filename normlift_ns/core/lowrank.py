@@ -93,6 +93,7 @@ def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None =
 
 
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
+_BLOCK_ROWS = 1024
 _CPU_BLOCK, _GPU_BLOCK = 2**21, 2**25
 """Number of elements that a query converts to float32 at a time. Blocks that fit into the CPU cache are four times as
 fast."""
@@ -107,7 +108,8 @@ class StoredEvidence(TensorRecord):
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
         """Return cosines to unit vectors, 0 without evidence: E (F t) / (W_j ||f_j||), computed in float64."""
-        table = self.features.double() @ vectors.double().T
+        transposed = vectors.double().T  # block by block, because each block of float64 fits into the CPU cache
+        table = torch.cat([block.double() @ transposed for block in self.features.split(_BLOCK_ROWS)])
         length = scalars.weight.double() * scalars.norm.double()
         sums = self.evidence.rows.matmul(table)
         return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()

@@ -37,11 +37,12 @@ from normlift_ns.rendering.figures import Display, make_display, output_names
 from normlift_ns.session import actions
 from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
 from normlift_ns.session.objects import ObjectRow, list_objects, unoccluded_viewpoint
+from normlift_ns.session.outputs import splat_bytes, store_query
 from normlift_ns.session.prompts import join_prompts, prompts_of_query, split_prompts
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import KEYS_SCRIPT, handle_in_order, ignore_closed_clients, send_in_order
-from normlift_ns.viewer.controller import NO_FIELD_MESSAGE, Controller, Session, splat_bytes, store_query
+from normlift_ns.viewer.controller import NO_FIELD_MESSAGE, Controller, Session
 from normlift_ns.viewer.widgets import (
     ALL_PROMPTS,
     MAX_OBJECT_ROWS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,10 +15,10 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Finding, Histogram
 from normlift_ns.query.question import Query
-from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
+from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click, join_prompts
 from normlift_ns.session.selection import SelectionBox
-from normlift_ns.session.state import State
+from normlift_ns.session.state import Layer, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +104,9 @@ def _only_clicks(question: Query) -> bool:
 # was.
 
 
-ClickMode = Literal["select", "add", "take away"]
+ClickMode = Literal["select", "add", "remove"]
 """Effect of a click on the object under it."""
+MAX_LAYERS = 32
 MAX_GROW_STEPS = 10
 """Largest number of steps by which a selection can be grown or shrunk."""
 MIN_THRESHOLD, MAX_THRESHOLD = -0.2, 1.0
@@ -123,8 +124,7 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
         ValueError: the vectors differ in length from the field's.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
-    state = State(state.space, tuple(prompts), question, hidden=state.hidden, color_mode=state.color_mode, action=did)
-    return _with_suggested_threshold(state)
+    return _with_suggested_threshold(replace(_unasked(state), prompts=tuple(prompts), query=question, action=did))
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
@@ -141,7 +141,13 @@ def _with_suggested_threshold(state: State) -> State:
 
 def clear(state: State) -> State:
     """Remove the query and the selection. Hidden Gaussians stay hidden."""
-    return State(state.space, hidden=state.hidden, color_mode=state.color_mode, action="Clear")
+    return replace(_unasked(state), action="Clear")
+
+
+def _unasked(state: State) -> State:
+    """Return the state without query and selection."""
+    state = replace(state, prompts=(), query=None, shown=None, prompts_select=True)
+    return replace(state, added=None, removed=None, additions=(), grow_steps=0, box=None)
 
 
 def set_threshold(state: State, value: float) -> State:
@@ -206,17 +212,49 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     return index
 
 
+def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
+    """Return the mask of the object of a Gaussian.
+
+    It is what one step added, if the Gaussian is part of that; else the connected component of what the best prompt
+    selects, so that touching objects of other prompts stay apart; else `SelectionContext.object_at`.
+    """
+    for mask in reversed(state.additions):
+        if bool(mask[gaussian]):
+            return mask
+    selection, answer = state.selection, state.answer
+    if answer is not None and state.prompts_select and bool(selection[gaussian]):
+        relevancy = answer.relevancy[gaussian].where(answer.selected[gaussian], -torch.inf)
+        best = int(relevancy.argmax()) if state.shown is None else state.shown
+        if bool(answer.selected[gaussian, best]):
+            selection = selection & answer.selected[:, best]
+    return state.space.object_at(gaussian, selection, refined=state.refined)
+
+
 def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select") -> State:
-    """Select, add or remove the connected object under a click; see `Space.object_at`.
+    """Select, add or remove the object under a click; see `object_under`.
 
     Args:
         weights: weights of the Gaussians on the ray, for instance from `rasterization.rasterize.ray_weights`.
     """
-    gaussian = pick_gaussian(state, weights)
-    mask = state.space.object_at(gaussian, state.selection, refined=state.refined)
-    if mode == "take away":
-        return remove(state, mask, "Take away an object")
-    return add(state, mask, "Add an object") if mode == "add" else select(state, mask, "Select an object")
+    return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
+
+
+def change_objects(state: State, mask: Bool[Tensor, " n"], mode: ClickMode) -> State:
+    """Select an object, add it or remove it; removing it later takes away exactly what this step added."""
+    before = () if mode == "select" else state.additions
+    new = mask if mode == "select" else mask & ~state.selection
+    changed = change_selection(state, mask, mode, "an object")
+    return changed if mode == "remove" else replace(changed, additions=(*before, new))
+
+
+def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, what: str) -> State:
+    """Select Gaussians, add them to the selection, or remove them from it.
+
+    Args:
+        what: description of the Gaussians.
+    """
+    change = {"select": select, "add": add, "remove": remove}[mode]
+    return change(state, mask, f"{mode.capitalize()} {what}")
 
 
 def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
@@ -231,22 +269,31 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
 
 def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> State:
     """Select these Gaussians and no others."""
-    return replace(state, prompts_select=False, added=chosen, removed=None, grow_steps=0, box=None, action=did)
+    change: dict[str, Any] = {"prompts_select": False, "removed": None, "grow_steps": 0, "box": None}
+    return replace(state, added=chosen, additions=(), action=did, **change)
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
     """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown, shrunk or cut."""
     if state.grow_steps != 0 or state.box is not None:
-        return select(state, state.selection | chosen, did)
+        return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
-    return replace(state, added=chosen if state.added is None else state.added | chosen, removed=removed, action=did)
+    added = chosen if state.added is None else state.added | chosen
+    return replace(state, added=added, removed=removed, action=did)
 
 
-def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") -> State:
+def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
     """Remove Gaussians from the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
+    additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
-        return select(state, state.selection & ~chosen, did)
-    return replace(state, removed=chosen if state.removed is None else state.removed | chosen, action=did)
+        return replace(select(state, state.selection & ~chosen, did), additions=additions)
+    removed = chosen if state.removed is None else state.removed | chosen
+    return replace(state, removed=removed, additions=additions, action=did)
+
+
+def invert(state: State) -> State:
+    """Select all drawn Gaussians that are not selected."""
+    return select(state, state.drawn & ~state.selection, "Invert the selection")
 
 
 def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
@@ -307,3 +354,41 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
 def show_all(state: State) -> State:
     """Show all hidden Gaussians again."""
     return state if state.hidden is None else replace(state, hidden=None, action="Show everything")
+
+
+def add_layer(state: State, name: str) -> State:
+    """Save the selection as a layer, in place of a layer with the same name.
+
+    Raises:
+        ValueError: nothing is selected, the name is empty, or there are too many layers.
+    """
+    name = clip_text(name, 60)
+    layers = tuple(layer for layer in state.layers if layer.name != name)
+    if name == "" or len(layers) >= MAX_LAYERS or not bool(state.selection.any()):
+        raise InputError(f"A layer needs a name and a selection, and there are at most {MAX_LAYERS} layers.")
+    return replace(state, layers=(*layers, Layer(name, state.selection)), action=f"Save layer {name}")
+
+
+def show_layer(state: State, name: str, *, visible: bool) -> State:
+    """Draw the Gaussians of a layer, or do not draw them."""
+    layer = find_layer(state, name)
+    layers = tuple(replace(one, visible=visible) if one is layer else one for one in state.layers)
+    return replace(state, layers=layers, action=f"{'Show' if visible else 'Hide'} layer {name}")
+
+
+def remove_layer(state: State, name: str) -> State:
+    """Remove a layer; its Gaussians are drawn again."""
+    layer = find_layer(state, name)
+    return replace(state, layers=tuple(one for one in state.layers if one is not layer), action=f"Remove layer {name}")
+
+
+def find_layer(state: State, name: str) -> Layer:
+    """Return the layer of a name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    layer = next((layer for layer in state.layers if layer.name == name), None)
+    if layer is None:
+        raise InputError(f"There is no layer {clip_text(name, 60)!r}.")
+    return layer

@@ -113,7 +113,10 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 Position = tuple[float, float, float]
 """x, y, z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Opacity in front of the object up to which the view counts as clear."""
+"""Mean opacity in front of the object up to which the view counts as clear."""
+_FILL = 0.8
+"""Share of the height of the image that the extent of an object takes."""
+_SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
 """Degrees around the vertical and above the current height."""
 
@@ -138,7 +141,7 @@ def unoccluded_viewpoint(
     """Return the first camera position with a clear view of an object, or the one with the least occlusion.
 
     Candidates start from the current side of the camera: turned around the vertical, first at its height, then from
-    above.
+    above. Of an object, several Gaussians must be visible; its own Gaussians do not count as occluders.
 
     Args:
         target: object or point to look at.
@@ -154,10 +157,16 @@ def unoccluded_viewpoint(
     means = scene.means.detach().double().cpu()
     near = (means - center).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < distance
     near = near if drawn is None else near & drawn.cpu()
+    points, margin = center[None], target.extent / 2
+    if isinstance(target, ObjectRow):
+        near &= ~target.mask.cpu()
+        own = means[target.mask.cpu()]
+        points, margin = torch.cat([points, own[:: 1 + len(own) // _SIGHT_POINTS]]), target.extent / 4
     parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
     occluders, best, least = GaussianScene(*parts), first, np.inf
     for position in _candidates(np.asarray(first), np.asarray(target.center), np.asarray(up, float)):
-        occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
+        start = torch.from_numpy(position)
+        occlusion = float(np.mean([_occlusion(occluders, start, point, margin) for point in points]))
         if occlusion < least:
             best, least = _as_position(position), occlusion
         if least <= _MAX_OCCLUSION:
@@ -168,7 +177,7 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return the camera position on the current side of an object from which it fills half of the image.
+    """Return the camera position on the current side of an object from which it fills most of the image.
 
     Args:
         target: object or point to look at.
@@ -179,7 +188,7 @@ def viewpoint(
     offset = np.asarray(camera_position, float) - center
     length = float(np.linalg.norm(offset))
     offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])
-    distance = max(target.extent, 1e-6) / np.tan(field_of_view / 2)
+    distance = max(target.extent, 1e-6) / (2 * _FILL * np.tan(field_of_view / 2))
     return _as_position(center + offset * distance)
 
 

@@ -93,9 +93,9 @@ class SelectionContext:
     def grow_or_shrink(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
-        Growing adds Gaussians that are connected to the selection and similar to its mean direction. Their cosine is at
-        least 0.95 at the first step, and 0.05 less at each further step. Shrinking keeps the middle of each connected
-        component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
+        Growing adds Gaussians within as many steps on the graph, and those that are connected to the selection and
+        similar to its mean direction. Their cosine is at least 0.95 at the first step, and 0.05 less at each further
+        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
         the first step, and 1/11 less at each further step. The results are nested: more steps of growth never remove
         a Gaussian, and more steps of shrinking never add one.
         """
@@ -106,18 +106,20 @@ class SelectionContext:
     def _grown(self, selected: Bool[Tensor, " n"], steps: int, refined: bool) -> Bool[Tensor, " n"]:
         from scipy.sparse import csgraph  # noqa: PLC0415 (a lift does not need it)
 
+        grown = seeds = selected.cpu().numpy()
+        first, second = self.neighbor_pairs
+        for _ in range(steps):
+            grown = grown.copy()
+            grown[second[grown[first]]] = True
         rows = (selected & self.field.valid(refined=refined)).nonzero().squeeze(1)
-        if len(rows) == 0:
-            return selected
-        mean = self.field.directions(rows[:: 1 + len(rows) // _MAX_SAMPLES], refined=refined).mean(dim=0)
-        if not bool(mean.any()):
-            return selected
-        seeds = selected.cpu().numpy()
-        candidates = seeds | self.similar_to(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
-        _, labels = csgraph.connected_components(self._graph(candidates), directed=False)
-        reached = np.zeros(labels.max() + 1, bool)
-        reached[labels[seeds]] = True
-        return torch.from_numpy(reached[labels] & candidates).to(selected.device)
+        mean = self.field.directions(rows[:: 1 + len(rows) // _MAX_SAMPLES], refined=refined).sum(dim=0)
+        if bool(mean.any()):
+            similar = seeds | self.similar_to(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
+            _, labels = csgraph.connected_components(self._graph(similar), directed=False)
+            reached = np.zeros(labels.max() + 1, bool)
+            reached[labels[seeds]] = True
+            grown = grown | (reached[labels] & similar)
+        return torch.from_numpy(grown).to(selected.device)
 
     def _shrunk(self, selected: Bool[Tensor, " n"], steps: int) -> Bool[Tensor, " n"]:
         from scipy.sparse import csgraph  # noqa: PLC0415 (as above)
@@ -142,13 +144,13 @@ class SelectionContext:
         """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
         from scipy.sparse import csr_array  # noqa: PLC0415 (as above)
 
-        first, second = self._edges
+        first, second = self.neighbor_pairs
         inside = mask[first] & mask[second]
         pairs = (first[inside], second[inside])
         return csr_array((np.ones(len(pairs[0])), pairs), shape=(len(mask), len(mask)))
 
     @cached_property
-    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+    def neighbor_pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of neighbors: the 8 nearest, within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
         neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
         last = neighbors.distance[:, -1]

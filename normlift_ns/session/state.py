@@ -16,8 +16,19 @@ from torch import Tensor
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query
+from normlift_ns.rendering.colors import Colormap
 from normlift_ns.session.prompts import Prompt, join_prompts
 from normlift_ns.session.selection import SelectionBox, SelectionContext
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A saved selection."""
+
+    name: str
+    mask: Bool[Tensor, " n"]
+    visible: bool = True
+    """False: its Gaussians are not drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +50,18 @@ class State:
     """True if the prompts select; False: the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
+    additions: tuple[Bool[Tensor, " n"], ...] = ()
+    """What each addition has added to the selection, the latest last; removing an object removes the whole addition."""
     grow_steps: int = 0
     """Number of steps of growth over the neighbor graph; negative: steps of shrinking."""
     box: SelectionBox | None = None
     hidden: Bool[Tensor, " n"] | None = None
     """Gaussians that are not drawn."""
-    color_mode: str = "colours"
+    layers: tuple[Layer, ...] = ()
+    color_mode: str = "rgb"
     """Color mode; each viewer defines the names."""
+    colormap: Colormap = "viridis"
+    """Colormap of relevancies."""
     action: str = ""
     """Description of the action that led to this state."""
 
@@ -71,8 +87,11 @@ class State:
 
     @property
     def drawn(self) -> Bool[Tensor, " n"]:
-        """Gaussians that are not hidden."""
-        return ~self.space.empty_mask() if self.hidden is None else ~self.hidden
+        """Gaussians that are neither hidden nor in a hidden layer."""
+        mask = ~self.space.empty_mask() if self.hidden is None else ~self.hidden
+        for layer in self.layers:
+            mask = mask if layer.visible else mask & ~layer.mask
+        return mask
 
     @property
     def by_hand_suffix(self) -> str:

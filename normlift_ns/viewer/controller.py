@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from threading import Lock, RLock
 from typing import Any, cast
 
@@ -16,18 +14,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from normlift_ns.errors import InputError, describe_error
-from normlift_ns.exports import TrainedSplat, write_splat_ply
-from normlift_ns.io.atomic import safe_file_name
-from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.session import actions
 from normlift_ns.session.actions import ClickMode, carry_threshold
 from normlift_ns.session.objects import ObjectRow
-from normlift_ns.session.prompts import build_query, click_name, encode_prompts, merge_queries
+from normlift_ns.session.prompts import build_query, click_name, encode_prompts
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
 NO_FIELD_MESSAGE = "No semantics yet. They are lifted at the end of training."
-_CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "take away"}
+_CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "remove"}
 
 
 def _show_prompt(state: State, option: str) -> State:
@@ -312,28 +307,3 @@ class Controller(ABC):
             self._session.clicks[name] = clicked
             self._set_prompts(name)
         self.act(Action.ASK)
-
-
-def store_query(folder: Path | None, query: Query | None, *, replaces: bool = False) -> str:
-    """Store prompts in a run, in addition to those stored there or instead of them; return their number in words.
-
-    Raises:
-        ValueError: there is no query or no folder; as `merge_queries`.
-    """
-    if query is None or folder is None:
-        raise InputError("No query yet; there is nothing to save.")
-    merged = merge_queries(None if replaces else load_query(folder), query)
-    save_query(folder, merged)
-    return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"
-
-
-def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], name: str) -> tuple[str, bytes, int]:
-    """Return the name and content of a PLY file of Gaussians, and their number.
-
-    Raises:
-        ValueError: none of them is ever drawn.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{safe_file_name(name)}.ply"
-        rows = write_splat_ply(path, splat, state.space.field, state.answer, keep=mask)
-        return path.name, path.read_bytes(), len(rows)

@@ -28,10 +28,11 @@ from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.query.question import Query, load_query
 from normlift_ns.rasterization.rasterize import ray_weights
 from normlift_ns.rendering.colors import prompt_rgb_tuples
+from normlift_ns.session.outputs import splat_bytes, store_query
 from normlift_ns.session.prompts import join_prompts, prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
-from normlift_ns.viewer.controller import Session, splat_bytes, store_query
+from normlift_ns.viewer.controller import Session
 
 MOST_DRAWN = 1_000_000
 """Gaussians that a browser sorts and draws without stuttering; more cost memory of its tab."""
@@ -168,7 +169,7 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 # What a state looks like: a colour for every Gaussian, and a legend in words and colours.
 
 
-Look = Literal["colours", "overlay", "prompts", "reliability"]
+Look = Literal["rgb", "overlay", "prompts", "reliability"]
 LOOKS: tuple[Look, ...] = get_args(Look)
 """colours: the scene itself. overlay: relevancy of what is selected. prompts: the colour of the most relevant prompt.
 reliability: R, on a fixed scale."""
@@ -188,7 +189,7 @@ def painted(records: Records, state: State) -> tuple[UInt8[np.ndarray, "m 3"], B
     colours = records.colours
     if state.color_mode == "reliability":
         return _ramp(_array(state.space.field.scalars.reliability)[rows]), drawn
-    if state.color_mode == "colours":
+    if state.color_mode == "rgb":
         return colours, drawn
     chosen = _array(state.selection)[rows]
     grey = np.repeat((colours @ np.array([0.3, 0.59, 0.11]) * 0.8).astype(np.uint8)[:, None], 3, axis=1)
@@ -210,7 +211,7 @@ def opacities(records: Records, state: State) -> UInt8[np.ndarray, " m"]:
 
 def coloured(state: State) -> State:
     """The state, with what is selected in colours where it would not be seen."""
-    return replace(state, color_mode="overlay") if state.color_mode == "colours" else state
+    return replace(state, color_mode="overlay") if state.color_mode == "rgb" else state
 
 
 def scale(state: State) -> tuple[float, float]:
@@ -230,7 +231,7 @@ def legend(state: State) -> str:
     It is empty if the scene keeps its own colors, or if colors only mark the selection.
     """
     by_hand = state.answer is None or not state.prompts_select
-    if state.color_mode in ("colours", "prompts") or (state.color_mode == "overlay" and by_hand):
+    if state.color_mode in ("rgb", "prompts") or (state.color_mode == "overlay" and by_hand):
         return ""
     low, high, what = (0.0, 1.0, "reliability R") if state.color_mode == "reliability" else (*scale(state), "relevancy")
     stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in _ramp(np.linspace(0, 1, 6)).tolist())

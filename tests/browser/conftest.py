@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.browser.page import OnPage
 from tests.browser.person import chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
-from tests.browser.viewer import Own, Tab
+from tests.browser.viewer import Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -45,7 +46,7 @@ def stock(servers: dict[str, Server]) -> Iterator[Server]:
 
 @pytest.fixture
 def own(servers: dict[str, Server]) -> Iterator[Server]:
-    """Our own viewer before the same room."""
+    """ns-normlift-view before the same room."""
     yield from as_stored(servers[OWN])
 
 
@@ -69,7 +70,7 @@ def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
 
 
 @pytest.fixture
-def page(own: Server, browser: Browser) -> Iterator[Own]:
-    """A fresh tab before our own viewer."""
-    yield (page := Own(browser, own.address))
+def page(own: Server, browser: Browser) -> Iterator[OnPage]:
+    """A fresh tab before our own page."""
+    yield (page := OnPage(browser, own.address))
     page.leave()

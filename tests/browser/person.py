@@ -135,19 +135,20 @@ class Person:
     drawn = ""
     """What the page says once the picture is as fine as it gets, a pattern."""
 
-    def __init__(
-        self, browser: Browser, address: str, size: tuple[int, int], *, sharpness: float = COARSE, webgl: bool = True
-    ) -> None:
+    def __init__(self, browser: Browser, address: str, size: tuple[int, int], *, webgl: bool = True) -> None:
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.context.set_default_timeout(1000 * PATIENCE)
         self.page: Page = self.context.new_page()
-        draw_in_software(self.page, sharpness)
+        self.prepare()
         if not webgl:
             self.page.add_init_script(_BLIND)
         self.size, self.problems = size, []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")
         self.button("Ask").wait_for()
+
+    def prepare(self) -> None:
+        """Changes the page before it is loaded."""
 
     def leave(self) -> None:
         """Closes the tab, in which nothing has gone wrong. NORMLIFT_SCREENSHOTS names a folder for its last picture."""

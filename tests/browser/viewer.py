@@ -1,8 +1,7 @@
-"""Both viewers in processes of their own, and a person before each."""
+"""nerfstudio's viewer in a process of its own, and a person before it."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tests.browser.person import Person, coloured
-from tests.browser.server import OWN, STOCK, Server
+from tests.browser.person import COARSE, Person, coloured, draw_in_software
+from tests.browser.server import STOCK, Server
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Locator
 
 TITLE = 52
 """Height of the title bar in pixels."""
@@ -29,26 +28,6 @@ def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
         yield address
 
 
-@contextmanager
-def own_viewer(config: Path, log: Path, *flags: str, python: Path | str = sys.executable) -> Iterator[str]:
-    """The same for ns-normlift-view."""
-    with Server(OWN, config, log, python=python).running(*flags) as address:
-        yield address
-
-
-class Own(Person):
-    """A browser tab with our own viewer in it, where every tab has a panel of its own."""
-
-    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480), **how: Any) -> None:
-        super().__init__(browser, address, size, **how)
-        self.ready()
-
-    def ready(self) -> None:
-        """Waits until the page has the prompts that the run stores, or those that it had before."""
-        self.button("Ask").wait_for()
-        self.until(lambda: self.typed("Prompts"), "greeted")
-
-
 class Tab(Person):
     """A browser tab with nerfstudio's viewer in it, whose panel all tabs share."""
 
@@ -57,6 +36,13 @@ class Tab(Person):
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1300, 1000), **how: Any) -> None:
         super().__init__(browser, address, size, **how)
+
+    def prepare(self) -> None:
+        draw_in_software(self.page, COARSE)
+
+    @property
+    def prompts(self) -> Locator:
+        return self.field("Prompts")
 
     def fresh(self) -> None:
         """Takes back what was done before in any tab, but for what is stored."""

@@ -513,7 +513,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
 def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipeline: Any) -> None:
     browser, event = Browser(), ray(pipeline)
     weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
-    for name, mode in (("Select", "select"), ("Drop", "take away"), ("Add", "add")):
+    for name, mode in (("Select", "select"), ("Drop", "remove"), ("Add", "add")):
         expected = actions.click(panel.state, weights, mode).selection  # type: ignore[arg-type]
         panel.act(Action(name), client=browser)
         browser._scene_pointer_cb(event)

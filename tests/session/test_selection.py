@@ -49,10 +49,10 @@ def test_a_click_selects_the_connected_object_adds_and_takes_away():
     state = asked("red")
     assert chosen(actions.click(state, ray(0)), 0)
     assert chosen(actions.click(state, ray(BLOCK), "add"), 0, 1, 2)
-    assert chosen(actions.click(state, ray(0), "take away"), 2)
+    assert chosen(actions.click(state, ray(0), "remove"), 2)
     alone = actions.click(State(world()), ray(2 * BLOCK + 5))
     assert chosen(alone, 2)
-    both = actions.click(actions.click(alone, ray(BLOCK), "add"), ray(2 * BLOCK), "take away")
+    both = actions.click(actions.click(alone, ray(BLOCK), "add"), ray(2 * BLOCK), "remove")
     assert chosen(both, 1)
     assert chosen(actions.add(actions.remove(state, rows(0)), rows(0)), 0, 2)
     for blind, gaussian in ((state, 3 * BLOCK), (actions.hide(actions.click(state, ray(0))), 0)):

@@ -105,7 +105,7 @@ def test_colours_show_what_is_selected_and_hidden():
     colours, _ = painted(records, actions.set_color_mode(state, "reliability"))
     assert len(np.unique(colours, axis=0)) >= 2
     assert "0.00 reliability R 1.00" in legend(actions.set_color_mode(state, "reliability"))
-    np.testing.assert_array_equal(painted(records, actions.set_color_mode(state, "colours"))[0], records.colours)
+    np.testing.assert_array_equal(painted(records, actions.set_color_mode(state, "rgb"))[0], records.colours)
 
 
 def test_a_faint_selection_can_be_seen():
@@ -123,7 +123,7 @@ def test_a_faint_selection_can_be_seen():
         assert legend(by_hand) == ""
     for state in (
         plain,
-        actions.set_color_mode(chosen, "colours"),
+        actions.set_color_mode(chosen, "rgb"),
         actions.set_color_mode(actions.select(plain, ~faint), "overlay"),
     ):
         np.testing.assert_array_equal(opacities(records, state), records.alpha)

@@ -1,0 +1,361 @@
+"""The Starlette application: pages, sessions and the HTTP API, with checks and limits; and the server that runs it."""
+
+from __future__ import annotations
+
+import html
+import ipaddress
+import secrets
+import socket
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import anyio
+import uvicorn
+from anyio import CapacityLimiter
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+import normlift_ns
+from normlift_ns.errors import InputError, describe_error
+from normlift_ns.server.runs import RunStore, ServedRun, without_paths
+from normlift_ns.server.session import PageLimits, PageSession
+from normlift_ns.viewer.host_check import accepted_names, refuse_request
+
+PAGE_FOLDER = Path(normlift_ns.__file__).parent / "page"
+"""Folder of the built page."""
+BUILD_COMMAND = "python setup.py build_page"
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; img-src 'self' data: blob:; "
+    "connect-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; font-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+MAX_BODY = 4 * 2**20
+"""Bytes of the body of a request, and of a message of a page."""
+MAX_PAGES = 64
+"""Number of pages that may be open at a time."""
+MAX_CONNECTIONS = 512
+REQUEST_TIMEOUT = 120.0
+"""Seconds after which a request is answered with status 504."""
+_BODY_TIMEOUT = 20.0
+_MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
+_QUICK_THREADS, _SLOW_THREADS = 4, 4
+_HEADERS = {
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin", "X-Frame-Options": "DENY",
+}  # fmt: skip
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Options of the server."""
+
+    host: str = "127.0.0.1"
+    port: int = 7008
+    allowed_hosts: tuple[str, ...] = ()
+    read_only: bool = False
+    access_token: str = field(default_factory=lambda: secrets.token_urlsafe(18))
+    """Text that requests must know which write into a run, if the server listens on other addresses than localhost."""
+
+    @property
+    def is_local(self) -> bool:
+        """True if only this machine can reach the server."""
+        try:
+            return self.host == "localhost" or ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    def knows(self, access: str) -> bool:
+        """Return whether a text is the access token."""
+        return secrets.compare_digest(access.encode(), self.access_token.encode())
+
+    def may_write(self, access: str) -> bool:
+        """Return whether a request with this access token may write."""
+        return not self.read_only and (self.is_local or self.knows(access))
+
+
+class Guard:
+    """Middleware that checks Host and Origin, limits bodies and time, and adds security headers."""
+
+    def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
+        self._app, self._names = app, names
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one connection."""
+        if scope["type"] not in ("http", "websocket"):
+            return await self._app(scope, receive, send)
+        headers = Headers(scope=scope)
+        refused = refuse_request(headers.getlist("host"), headers.getlist("origin"), self._names)
+        if scope["type"] == "websocket":
+            if refused is None:
+                return await self._app(scope, receive, send)
+            return await _refuse_websocket(scope, receive, send, refused)
+        if refused is not None:
+            return await PlainTextResponse(f"403: {refused}\n", 403, _HEADERS)(scope, receive, send)
+        length = headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > MAX_BODY:
+            response = JSONResponse({"error": f"A request may have at most {MAX_BODY:,} bytes."}, 413, _HEADERS)
+            return await response(scope, receive, send)
+        started = False
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                given = {name for name, _ in message["headers"]}
+                new = ((name.lower().encode(), value.encode()) for name, value in _HEADERS.items())
+                message["headers"] = [*message["headers"], *(pair for pair in new if pair[0] not in given)]
+            await send(message)
+
+        try:
+            with anyio.fail_after(REQUEST_TIMEOUT):
+                await self._app(scope, _limited(receive), send_with_headers)
+        except TimeoutError:
+            if not started:
+                await JSONResponse({"error": "The request took too long."}, 504, _HEADERS)(scope, receive, send)
+        return None
+
+
+def _limited(receive: Receive) -> Receive:
+    """Return a `receive` that refuses bodies that are too large or come too slowly."""
+    total = 0
+
+    async def limited() -> Message:
+        nonlocal total
+        if total < 0:
+            return await receive()
+        with anyio.fail_after(_BODY_TIMEOUT):
+            message = await receive()
+        if message["type"] == "http.request":
+            total += len(message.get("body", b""))
+            if total > MAX_BODY:
+                raise HTTPException(413, f"A request may have at most {MAX_BODY:,} bytes.")
+            total = total if message.get("more_body") else -1
+        return message
+
+    return limited
+
+
+async def _refuse_websocket(scope: Scope, receive: Receive, send: Send, reason: str) -> None:
+    await receive()
+    if "websocket.http.response" in scope.get("extensions", {}):
+        headers = [(b"content-type", b"text/plain; charset=utf-8")]
+        await send({"type": "websocket.http.response.start", "status": 403, "headers": headers})
+        await send({"type": "websocket.http.response.body", "body": f"403: {reason}\n".encode()})
+    else:
+        await send({"type": "websocket.close", "code": 1008, "reason": reason[:120]})
+
+
+class WarmServer:
+    """Lifted runs behind one port.
+
+    Args:
+        runs: the runs.
+        options: address, and who may write.
+    """
+
+    def __init__(self, runs: RunStore, options: ServerOptions) -> None:
+        self.runs, self.options = runs, options
+        self.quick, self.slow = CapacityLimiter(_QUICK_THREADS), CapacityLimiter(_SLOW_THREADS)
+        self._opening = CapacityLimiter(MAX_PAGES)
+        self._downloads: OrderedDict[str, tuple[str, bytes]] = OrderedDict()
+        self._pages = 0
+        self._server: uvicorn.Server | None = None
+
+    def app(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> ASGIApp:
+        """Return the ASGI application.
+
+        Args:
+            extra_routes: routes besides those of the page and of the API.
+            lifespan: context of Starlette in which the application runs.
+        """
+        from normlift_ns.server.http_api import api_routes  # noqa: PLC0415 (it imports this module)
+
+        routes = [
+            Route("/", self._page), Route("/assets/{path:path}", self._asset), Route("/favicon.ico", _no_icon),
+            Route("/api/runs", self._list_runs), Route("/api/runs/{run}/geometry", self._geometry),
+            Route("/api/runs/{run}/cameras", self._cameras),
+            Route("/api/runs/{run}/images/{index:int}", self._image),
+            Route("/api/downloads/{key}/{name}", self._download),
+            WebSocketRoute("/api/runs/{run}/session", self._session),
+            *api_routes(self), *extra_routes,
+        ]  # fmt: skip
+        handlers: dict[Any, Any] = {
+            Exception: _failed,
+            HTTPException: _http_error,
+            InputError: _failed,
+            OSError: _failed,
+        }
+        app = Starlette(routes=routes, exception_handlers=handlers, lifespan=lifespan)
+        return Guard(app, accepted_names(self.options.host, self.options.allowed_hosts))
+
+    async def run_of(self, name: str) -> ServedRun:
+        """Return an open run, by its id.
+
+        Raises:
+            HTTPException: there is no such run (status 404).
+        """
+        if name not in self.runs.ids:
+            raise HTTPException(404, f"There is no run {name[:80]!r}. The runs are: {', '.join(self.runs.ids)}.")
+        return await anyio.to_thread.run_sync(self.runs.get, name, limiter=self._opening, abandon_on_cancel=True)
+
+    async def in_thread(self, work: Callable[[], T]) -> T:
+        """Run slow work in a thread."""
+        return await anyio.to_thread.run_sync(work, limiter=self.slow, abandon_on_cancel=True)
+
+    def offer(self, name: str, content: bytes) -> str:
+        """Keep a file for a download, and return its address; the oldest files are dropped."""
+        key = secrets.token_urlsafe(16)
+        self._downloads[key] = name, content
+        while len(self._downloads) > 1 and (
+            len(self._downloads) > _MAX_DOWNLOADS
+            or sum(len(one) for _, one in self._downloads.values()) > _MAX_DOWNLOAD_BYTES
+        ):
+            self._downloads.popitem(last=False)
+        return f"/api/downloads/{key}/{name}"
+
+    async def _page(self, request: Request) -> Response:
+        index = PAGE_FOLDER / "index.html"
+        if index.is_file():
+            return FileResponse(index, headers={"Cache-Control": "no-cache"})
+        text = f"The web page is not built. Build it with: {BUILD_COMMAND}"
+        return HTMLResponse(f"<!doctype html><title>normlift</title><p>{html.escape(text)}</p>")
+
+    async def _asset(self, request: Request) -> Response:
+        folder = PAGE_FOLDER / "assets"
+        path = folder / request.path_params["path"]
+        if ".." in path.parts or not path.is_file() or folder.resolve() not in path.resolve().parents:
+            raise HTTPException(404)
+        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+
+    async def _list_runs(self, request: Request) -> Response:
+        runs = [await self.run_of(name) for name in self.runs.ids]
+        describe = partial(_describe_all, runs, read_only=self.options.read_only)
+        return JSONResponse({"runs": await self.in_thread(describe)})
+
+    async def _geometry(self, request: Request) -> Response:
+        run = await self.run_of(request.path_params["run"])
+        content, digest = await self.in_thread(lambda: run.geometry)
+        lifetime = "max-age=31536000, immutable" if request.query_params.get("digest") == digest else "no-cache"
+        headers = {"ETag": f'"{digest}"', "Cache-Control": f"private, {lifetime}"}
+        if request.headers.get("if-none-match") == f'"{digest}"':
+            return Response(status_code=304, headers=headers)
+        return Response(content, headers=headers, media_type="application/octet-stream")
+
+    async def _cameras(self, request: Request) -> Response:
+        train = (await self.run_of(request.path_params["run"])).run.scene.train
+        cameras = [
+            {"name": name, "world_to_camera": camera.world_to_camera.tolist(), "K": camera.K.tolist(),
+             "width": camera.width, "height": camera.height}
+            for name, camera in zip(train.names, train.cameras)
+        ]  # fmt: skip
+        return JSONResponse({"cameras": cameras})
+
+    async def _image(self, request: Request) -> Response:
+        run, size = await self.run_of(request.path_params["run"]), request.query_params.get("max_size", "1024")
+        if not size.isdecimal() or not 16 <= int(size) <= 4096:
+            raise InputError(f"max_size must be 16 to 4096, got {size[:20]!r}.")
+        content = await self.in_thread(partial(run.image, request.path_params["index"], int(size)))
+        return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
+
+    async def _download(self, request: Request) -> Response:
+        name, content = self._downloads.get(request.path_params["key"], (None, b""))
+        if name != request.path_params["name"]:
+            raise HTTPException(404, "This download is no longer kept; export again.")
+        headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
+        return Response(content, headers=headers, media_type="application/octet-stream")
+
+    async def _session(self, websocket: WebSocket) -> None:
+        try:
+            await websocket.accept()
+            if self._pages >= MAX_PAGES:
+                return await websocket.close(1013, f"{MAX_PAGES} pages are open; close one.")
+            self._pages += 1
+            try:
+                run = await self.run_of(websocket.path_params["run"])
+                limits = PageLimits(self.quick, self.slow, self.options.may_write, self.offer)
+                await PageSession(run, websocket, limits).run()
+            finally:
+                self._pages -= 1
+        except (WebSocketDisconnect, anyio.BrokenResourceError):
+            return None
+        except HTTPException as error:
+            return await websocket.close(1008, error.detail[:120])
+        except Exception as error:
+            ended = all(isinstance(one, WebSocketDisconnect) for one in getattr(error, "exceptions", [error]))
+            return None if ended else await _close(websocket, error)
+
+    def start(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> int:
+        """Start to serve in a thread, and return the port: that of the options, or the next free one."""
+        listener = _bind(self.options.host, self.options.port)
+        config = uvicorn.Config(
+            self.app(extra_routes, lifespan), log_config=None, access_log=False, server_header=False,
+            ws="websockets-sansio", ws_max_size=MAX_BODY, ws_per_message_deflate=False, ws_ping_interval=20.0,
+            timeout_keep_alive=20, timeout_graceful_shutdown=2, limit_concurrency=MAX_CONNECTIONS,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        threading.Thread(target=self._server.run, args=([listener],), daemon=True).start()
+        return listener.getsockname()[1]
+
+    def stop(self) -> None:
+        """Stop to serve."""
+        if self._server is not None:
+            self._server.should_exit = True
+
+
+async def _close(websocket: WebSocket, error: BaseException) -> None:
+    """Close a connection because of an error, unless it has ended already."""
+    while isinstance(getattr(error, "exceptions", None), tuple):
+        error = error.exceptions[0]  # type: ignore[attr-defined]
+    reason = without_paths(describe_error(error)[0]) if not isinstance(error, TimeoutError) else "no greeting"
+    try:
+        await websocket.close(1008 if isinstance(error, InputError | TimeoutError) else 1011, reason[:120])
+    except RuntimeError:  # it has ended
+        return
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    """Return a socket that listens on the port, or on the next free one."""
+    family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+    for number in [0] if port == 0 else range(port, min(port + 100, 65536)):
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((address[0], number, *address[2:]))
+            listener.listen(256)
+        except OSError:
+            listener.close()
+        else:
+            return listener
+    raise InputError(f"--port {port} and the 99 ports after it are in use; give another one.")
+
+
+def _describe_all(runs: Sequence[ServedRun], *, read_only: bool) -> list[dict[str, Any]]:
+    return [run.describe(read_only=read_only) for run in runs]
+
+
+async def _no_icon(request: Request) -> Response:
+    return Response(status_code=204)
+
+
+async def _http_error(request: Request, error: HTTPException) -> Response:
+    return JSONResponse({"error": error.detail}, error.status_code)
+
+
+async def _failed(request: Request, error: Exception) -> Response:
+    """Return the message of an error without paths of this machine."""
+    message, code = describe_error(error)
+    return JSONResponse({"error": without_paths(message)}, 400 if code == 1 else 500)

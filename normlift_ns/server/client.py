@@ -1,0 +1,359 @@
+"""Client of a server of lifted runs: `normlift_ns.connect`, with the verbs of `LiftedRun`."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal
+from urllib.parse import quote, urlsplit
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from safetensors.torch import load as load_safetensors
+from torch import Tensor
+
+from normlift_ns.core.arguments import check_arguments
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import atomic_file, atomic_files
+from normlift_ns.io.guard import refuse_inputs
+from normlift_ns.options import RelevancyRule, check_path
+from normlift_ns.server.schema import (
+    Arrays,
+    ExplainResult,
+    ObjectsResult,
+    PromptResult,
+    QueryRequest,
+    QueryResult,
+    Question,
+    Selection,
+    SelectResult,
+    pack_mask,
+)  # fmt: skip
+
+_TIMEOUT = 180.0
+_MAX_ANSWER = 2**32
+"""Largest number of bytes of an answer."""
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False, repr=False)
+class RemoteAnswer:
+    """Answer of a server; `answer["fox"]` is the result for one prompt."""
+
+    question: Question
+    result: QueryResult
+    relevancy: Float[Tensor, "n q"]
+    selected: Bool[Tensor, "n q"]
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The prompts."""
+        return tuple(self.question.texts)
+
+    @property
+    def mask(self) -> Bool[Tensor, " n"]:
+        """Gaussians that any of the prompts selects."""
+        return self.selected.any(dim=1)
+
+    def __len__(self) -> int:
+        return len(self.texts)
+
+    def __iter__(self) -> Iterator[RemoteFinding]:
+        return (RemoteFinding(self, index) for index in range(len(self)))
+
+    def __getitem__(self, text: str) -> RemoteFinding:
+        """Return the result for one prompt.
+
+        Raises:
+            KeyError: the prompt is not part of the question.
+        """
+        if text not in self.texts:
+            raise KeyError(f"{text!r} is not a prompt of this question; its prompts are {', '.join(self.texts)}")
+        return RemoteFinding(self, self.texts.index(text))
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{one.text!r}: {one.result.count:,}" for one in self)
+        return f"Answer of {len(self.selected):,} Gaussians, selected {counts}"
+
+
+@dataclass(frozen=True, eq=False)
+class RemoteFinding:
+    """Result for one prompt; `result` has its numbers, as in `Finding`."""
+
+    answer: RemoteAnswer
+    index: int
+
+    @property
+    def text(self) -> str:
+        """The prompt."""
+        return self.answer.texts[self.index]
+
+    @property
+    def result(self) -> PromptResult:
+        """Numbers: verdict, fraction, centroid, extent, peak, mean reliability, nearest match."""
+        return self.answer.result.results[self.index]
+
+    @property
+    def relevancy(self) -> Float[Tensor, " n"]:
+        """Relevancy of every Gaussian."""
+        return self.answer.relevancy[:, self.index]
+
+    @property
+    def mask(self) -> Bool[Tensor, " n"]:
+        """The selected Gaussians."""
+        return self.answer.selected[:, self.index]
+
+    @property
+    def verdict(self) -> str | None:
+        """Presence of the prompt in the scene, as in `Finding.verdict`."""
+        return self.result.verdict
+
+
+Part = RemoteAnswer | RemoteFinding | Tensor
+
+
+@dataclass(eq=False, repr=False)
+class RemoteRun:
+    """A lifted run on a server, with the verbs of `LiftedRun`. Methods may be called from any thread.
+
+    >>> run = connect(url)
+    >>> answer = run.ask("red", "yellow")
+    >>> answer["red"].mask.shape, answer["red"].verdict
+    (torch.Size([6012]), 'found')
+    >>> run.render("0001", answer["red"]).shape
+    torch.Size([120, 160, 3])
+    """
+
+    address: str
+    """Scheme, host and port of the server."""
+    id: str
+    access_token: str = ""
+    _connection: http.client.HTTPConnection | None = field(default=None, repr=False)
+    _lock: Lock = field(default_factory=Lock, repr=False)
+
+    def __repr__(self) -> str:
+        return f"RemoteRun {self.id} at {self.address}"
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Name, encoder, number of Gaussians, saved prompts and other facts of the run."""
+        runs = json.loads(self._get("/api/runs"))["runs"]
+        return next(run for run in runs if run["id"] == self.id)
+
+    def ask(
+        self,
+        *texts: str,
+        negatives: Sequence[str] | None = None,
+        relevancy: RelevancyRule | Literal["auto"] = "auto",
+        threshold: float | Literal["auto"] | None = None,
+        min_reliability: float = 0.0,
+        refined: bool = True,
+    ) -> RemoteAnswer:
+        """Compute the relevancy and the selection of every Gaussian for each prompt; as `LiftedRun.ask`.
+
+        Raises:
+            ValueError: the server refuses the question, for instance because the encoder does not know a prompt.
+            OSError: the server does not answer.
+        """
+        arrays: Arrays = "safetensors"
+        settings = (None if negatives is None else list(negatives), relevancy, threshold, min_reliability, refined)
+        body = self._post("query", QueryRequest(list(texts), *settings, arrays=arrays))
+        tensors, length = load_safetensors(body), int.from_bytes(body[:8], "little")
+        metadata = json.loads(body[8 : 8 + length])["__metadata__"]
+        result = msgspec.json.decode(metadata["answer"], type=QueryResult)
+        return RemoteAnswer(Question(list(texts), *settings), result, tensors["relevancy"], tensors["selected"])
+
+    def objects(self, part: Part) -> ObjectsResult:
+        """List the objects of a selection with their boxes."""
+        return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
+
+    def select(self, part: Part | Selection) -> SelectResult:
+        """Return size and position of a selection, such as `Selection(ray=…)`."""
+        return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
+
+    def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
+        """List the objects of prompts with oriented boxes; the content of `Catalogue.to_json`."""
+        return json.loads(self._post("catalog", _selection(part).question))
+
+    def inventory(self) -> dict[str, Any]:
+        """List the objects of the scene without prompts; the content of `Catalogue.to_json`."""
+        return json.loads(self._get(self._path("inventory")))
+
+    def why(self, part: Part) -> ExplainResult:
+        """Explain a selection by the images that voted for it."""
+        return msgspec.json.decode(self._post("explain", _selection(part)), type=ExplainResult)
+
+    def floaters(self) -> Bool[Tensor, " n"]:
+        """Return the mask of Gaussians that likely belong to no surface."""
+        return torch.from_numpy(np.load(io.BytesIO(self._get(self._path("floaters?arrays=npy")))))
+
+    def coverage(self, min_reliability: float | None = None) -> dict[str, Any]:
+        """Find regions without reliable evidence; the content of `Coverage.to_json`."""
+        query = "" if min_reliability is None else f"?min_reliability={min_reliability}"
+        return json.loads(self._get(self._path("coverage" + query)))
+
+    def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
+        """Return the unit features of the Gaussians from `start` to before `stop`."""
+        query = f"features?start={start}" + ("" if stop is None else f"&stop={stop}")
+        return torch.from_numpy(np.load(io.BytesIO(self._get(self._path(query)))))
+
+    def render(
+        self, view: str | int | Camera = 0, found: Part | None = None, *, max_size: int = 2048
+    ) -> UInt8[Tensor, "h w 3"]:
+        """Render the scene from a camera, with what is found in color and the rest gray."""
+        request: dict[str, Any] = {"max_size": max_size}
+        if isinstance(view, Camera):
+            size = {"width": view.width, "height": view.height}
+            request["camera"] = {"K": view.K.tolist(), "world_to_camera": view.world_to_camera.tolist(), **size}
+        else:
+            request["view"] = view
+        if found is not None:
+            request["selection"] = _selection(found)
+        with Image.open(io.BytesIO(self._post("render", request))) as image:
+            return torch.from_numpy(np.array(image.convert("RGB")))
+
+    def export(self, path: str | Path, part: Part | None = None, *, overwrite: bool = False) -> Path:
+        """Write Gaussians to a PLY file on this machine; None: the whole scene.
+
+        Raises:
+            FileExistsError: the file exists and `overwrite` is False.
+        """
+        path = check_path("path", path)
+        refuse_inputs([path], instead="name")
+        with atomic_file(path, overwrite=overwrite) as draft:
+            draft.write_bytes(self._post("export", {} if part is None else _selection(part)))
+        return path
+
+    def masks(self, folder: str | Path, part: Part, *, overwrite: bool = False) -> list[Path]:
+        """Write a PNG mask for each training image to a folder on this machine, and return the paths."""
+        folder = check_path("folder", folder)
+        content = msgspec.to_builtins(_selection(part), str_keys=True)
+        with zipfile.ZipFile(io.BytesIO(self._post("export", {**content, "format": "masks"}))) as archive:
+            names = [
+                name for name in archive.namelist() if ".." not in Path(name).parts and not Path(name).is_absolute()
+            ]
+            paths = [folder / name for name in names]
+            refuse_inputs(paths, instead="folder")
+            with atomic_files(*paths, overwrite=overwrite) as drafts:
+                for draft, name in zip(drafts, names):
+                    draft.write_bytes(archive.read(name))
+        return paths
+
+    def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
+        """Store a question in the run; needs the access token unless the server is on this machine."""
+        return json.loads(self._post("save", {"question": answer.question, "replace": replace}))["stored"]
+
+    def camera(self, view: str | int) -> Camera:
+        """Return the camera of a training image, by its name or index."""
+        cameras = json.loads(self._get(self._path("cameras")))["cameras"]
+        if isinstance(view, int):
+            matches = cameras[view : view + 1] if view >= 0 else []
+        else:
+            matches = [one for one in cameras if view in (one["name"], Path(one["name"]).name, Path(one["name"]).stem)]
+        if len(matches) != 1:
+            raise InputError(f"view must be one of {len(cameras)} training images; there are {len(matches)} {view!r}")
+        found = matches[0]
+        pose, K = torch.tensor(found["world_to_camera"]), torch.tensor(found["K"])
+        return Camera(K, pose, found["width"], found["height"])
+
+    def _path(self, verb: str) -> str:
+        return f"/api/runs/{quote(self.id)}/{verb}"
+
+    def _post(self, verb: str, request: Any) -> bytes:
+        return self._send("POST", self._path(verb), msgspec.json.encode(request))
+
+    def _get(self, path: str) -> bytes:
+        return self._send("GET", path, None)
+
+    def _send(self, method: str, path: str, body: bytes | None) -> bytes:
+        headers = {"Content-Type": "application/json"}
+        headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
+        with self._lock:
+            for attempt in range(2):
+                try:
+                    if self._connection is None:
+                        self._connection = _connect(self.address)
+                    self._connection.request(method, path, body, headers)
+                    response = self._connection.getresponse()
+                    content = response.read(_MAX_ANSWER)
+                    break
+                except (http.client.HTTPException, OSError) as error:
+                    if self._connection is not None:
+                        self._connection.close()
+                    self._connection = None
+                    if attempt == 1 or isinstance(error, TimeoutError):
+                        raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
+        if response.status != 200:
+            raise InputError(f"The server at {self.address} refuses the request: {_reason(content)}")
+        return content
+
+
+def _connect(address: str) -> http.client.HTTPConnection:
+    parts = urlsplit(address)
+    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+    return kind(parts.hostname or "", parts.port, timeout=_TIMEOUT)
+
+
+def _reason(content: bytes) -> str:
+    text = content.decode("utf8", "replace")[:2000]
+    try:
+        return str(json.loads(text)["error"])
+    except (ValueError, LookupError, TypeError):
+        return text.strip()
+
+
+def _selection(part: Any) -> Selection:
+    """Return a part of a run as a request.
+
+    Raises:
+        ValueError: it is not an answer, a finding, a mask or a `Selection`.
+    """
+    if isinstance(part, RemoteAnswer):
+        return Selection(part.question)
+    if isinstance(part, RemoteFinding):
+        return Selection(part.answer.question, prompt=part.index)
+    if isinstance(part, Tensor) and part.dtype == torch.bool and part.ndim == 1:
+        return Selection(mask=pack_mask(part))
+    if isinstance(part, Selection):
+        return part
+    raise InputError(
+        f"part must be an answer of this run, its finding for one prompt, or a mask; got {type(part).__name__}"
+    )
+
+
+@check_arguments
+def connect(url: str, run: str | None = None, *, access_token: str = "") -> RemoteRun:
+    """Connect to a run on a server that ns-normlift-serve or ns-normlift-view started.
+
+    Args:
+        url: address of the server, such as http://localhost:7008.
+        run: id of the run (default: the only one).
+        access_token: token that the server printed, to store prompts from another machine.
+    Raises:
+        ValueError: the address is not valid, or the server has no such run.
+        OSError: the server does not answer.
+
+    >>> run = connect(url)
+    >>> 0.2 < run.ask("red")["red"].result.fraction < 0.3
+    False
+    """
+    parts = urlsplit(url if "://" in url else f"http://{url}")
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise InputError(f"url must be the address of a server such as http://localhost:7008, got {url!r}")
+    remote = RemoteRun(f"{parts.scheme}://{parts.netloc}", run or "", access_token)
+    ids = [one["id"] for one in json.loads(remote._get("/api/runs"))["runs"]]
+    if run is None and len(ids) == 1:
+        remote.id = ids[0]
+    if remote.id not in ids:
+        raise InputError(f"run must be one of the runs of this server, {', '.join(ids)}; got {run!r}")
+    return remote

@@ -1,0 +1,293 @@
+"""Routes of the HTTP API, and its OpenAPI document."""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import torch
+from safetensors.torch import save as save_safetensors
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+from starlette.routing import Route
+
+import normlift_ns
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.coverage import coverage
+from normlift_ns.server import schema
+from normlift_ns.server.coloring import make_codes
+from normlift_ns.server.protocol import decode
+from normlift_ns.server.runs import ServedRun
+from normlift_ns.server.session import explanation_of
+from normlift_ns.session.state import State
+
+if TYPE_CHECKING:
+    from normlift_ns.server.app import WarmServer
+
+MAX_FEATURES = 2**17
+"""Largest number of Gaussians of one request for features."""
+_BINARY = "application/octet-stream"
+
+
+@dataclass(frozen=True)
+class Content:
+    """Answer that is not JSON."""
+
+    body: bytes
+    media_type: str = _BINARY
+    name: str | None = None
+    """Name of a file."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """Endpoint of one run."""
+
+    path: str
+    summary: str
+    request: Any
+    """Type of the JSON body; None: the request is a GET."""
+    answer: Any
+    """Type of the JSON answer; None: the answer is a file."""
+    work: Callable[[ServedRun, Any], Any]
+    """Computes the answer, a JSON type or `Content`, in a thread. For GET, its second argument is the query."""
+    writes: bool = False
+    """True if it writes into the run, which needs the access token unless the server listens on localhost only."""
+    parameters: tuple[str, ...] = ()
+    """Parameters of the query."""
+
+
+def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
+    """Answer a question."""
+    result, content = schema.answered(served, request)
+    if request.arrays == "none":
+        return content
+    arrays = {"relevancy": result.relevancy.float().cpu().contiguous(), "selected": result.selected.cpu().contiguous()}
+    return Content(save_safetensors(arrays, {"answer": msgspec.json.encode(content).decode()}))
+
+
+def objects(served: ServedRun, selection: schema.Selection) -> schema.ObjectsResult:
+    """List the objects of a selection."""
+    return schema.objects_result(schema.select_state(served, selection))
+
+
+def select(served: ServedRun, request: schema.SelectRequest) -> schema.SelectResult | Content:
+    """Select Gaussians."""
+    state = schema.select_state(served, request)
+    return schema.select_result(served, state) if request.arrays == "none" else npy(state.selection)
+
+
+def explain(served: ServedRun, selection: schema.Selection) -> schema.ExplainResult:
+    """Explain a selection."""
+    return msgspec.convert(explanation_of(served, schema.select_state(served, selection)), schema.ExplainResult)
+
+
+def export(served: ServedRun, request: schema.ExportRequest) -> Content:
+    """Export a selection."""
+    state = schema.select_state(served, request)
+    whole = request == schema.ExportRequest(format=request.format)
+    mask = ~served.space.empty_mask() if whole else state.selection
+    texts = [] if request.question is None else request.question.texts
+    texts = texts if request.prompt is None else texts[request.prompt : request.prompt + 1]
+    name = "scene" if whole else " ".join([*texts, *([] if request.object is None else [str(request.object)])])
+    file, content, _ = served.export(state, mask, name or "selection", request.format)
+    return Content(content, name=file)
+
+
+def render(served: ServedRun, request: schema.RenderRequest) -> Content:
+    """Render a view."""
+    selection = request.selection
+    state = State(served.space) if selection is None else schema.select_state(served, selection)
+    if selection is not None:
+        state = schema.isolated(state) if request.isolate else actions_mode(state, request.mode)
+    codes = make_codes(state, served.rows, served.pca if state.color_mode == "pca" else None)
+    return Content(served.still(codes, _camera(served, request)), "image/jpeg")
+
+
+def actions_mode(state: State, mode: str) -> State:
+    """Return the state drawn in a color mode."""
+    return schema.replace(state, color_mode=mode)
+
+
+def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
+    if request.page_view is not None:
+        if not request.page_view.is_valid:
+            raise InputError("page_view must look at another point than its position, and not along up.")
+        return request.page_view.camera(request.max_size)
+    camera = served.run.camera(request.view) if request.camera is None else request.camera.camera()
+    return camera.downscaled(request.max_size / max(camera.width, camera.height))
+
+
+def save(served: ServedRun, request: schema.SaveRequest) -> dict[str, str]:
+    """Store a question in the run."""
+    asked = schema.answer(served, request.question).question
+    return {"stored": served.save(asked, replaces=request.replace)}
+
+
+def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
+    """Find Gaussians that likely belong to no surface."""
+    return select(served, schema.SelectRequest(floaters=True, arrays="npy" if query.get("arrays") == "npy" else "none"))
+
+
+def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
+    """Find regions without reliable evidence."""
+    least = query.get("min_reliability")
+    options = {} if least is None else {"min_reliability": _number("min_reliability", least)}
+    return coverage(served.run, **options).to_json()
+
+
+def features(served: ServedRun, query: Any) -> Content:
+    """Return unit features of Gaussians."""
+    count = len(served.space)
+    start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
+    if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:
+        raise InputError(
+            f"start and stop must be 0 <= start < stop <= {count:,} with at most {MAX_FEATURES:,} rows between them, "
+            f"got {start:,} and {stop:,}."
+        )
+    return npy(
+        served.space.field.directions(torch.arange(start, stop), refined=query.get("refined") != "false").float()
+    )
+
+
+def inventory(served: ServedRun, query: Any) -> dict[str, Any]:
+    """List the objects of the scene without prompts, with their boxes."""
+    with served.reading:
+        return served.run.inventory().catalog.to_json()
+
+
+def catalog(served: ServedRun, question: schema.Question) -> dict[str, Any]:
+    """List the objects of prompts with oriented boxes and the images that show them."""
+    return served.run.catalogue(schema.answer(served, question)).to_json()
+
+
+def npy(array: torch.Tensor) -> Content:
+    """Return an array as an NPY file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array.cpu().numpy())
+    return Content(buffer.getvalue())
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not -1e15 < value < 1e15:
+        raise InputError(f"{name} must be a number, got {text[:40]!r}.")
+    return value
+
+
+ENDPOINTS = (
+    Endpoint("query", "Answer prompts: relevancy and selection of every Gaussian.", schema.QueryRequest,
+             schema.QueryResult, query),
+    Endpoint("objects", "List the objects of a selection with their boxes.", schema.Selection, schema.ObjectsResult,
+             objects),
+    Endpoint("catalog", "List the objects of prompts with oriented boxes, in the coordinates of the capture too, and "
+             "the images that show them. Takes seconds.", schema.Question, dict[str, Any], catalog),
+    Endpoint("explain", "Explain a selection by the images that voted for it.", schema.Selection, schema.ExplainResult,
+             explain),
+    Endpoint("select", "Return size and position of a selection, or its mask.", schema.SelectRequest,
+             schema.SelectResult, select),
+    Endpoint("render", "Render the scene, a selection or an object as JPEG.", schema.RenderRequest, None, render),
+    Endpoint("export", "Return a selection as a file: ply, or masks for a ZIP file of images.", schema.ExportRequest,
+             None, export),
+    Endpoint("save", "Store prompts in the run.", schema.SaveRequest, dict[str, str], save, writes=True),
+    Endpoint("floaters", "Find Gaussians that likely belong to no surface.", None, schema.SelectResult, floaters,
+             parameters=("arrays",)),
+    Endpoint("coverage", "Find regions without reliable evidence. Takes seconds.", None, dict[str, Any], coverage_of,
+             parameters=("min_reliability",)),
+    Endpoint("features", "Return unit features [M, D] float32 of the Gaussians start to stop, as NPY.", None, None,
+             features, parameters=("start", "stop", "refined")),
+    Endpoint("inventory", "List at most 20 objects of the scene without prompts. Takes seconds.", None, dict[str, Any],
+             inventory),
+)  # fmt: skip
+"""Endpoints of `/api/runs/{run}/`."""
+
+
+def api_routes(server: WarmServer) -> list[Route]:
+    """Return the routes of the API."""
+
+    def route(endpoint: Endpoint) -> Route:
+        async def handle(request: Request) -> Response:
+            if endpoint.writes and not server.options.may_write(_access(request)):
+                return _json({"error": "This request writes; it needs the access token of the server."}, 403)
+            value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
+            served = await server.run_of(request.path_params["run"])
+            result = await server.in_thread(lambda: endpoint.work(served, value))
+            if not isinstance(result, Content):
+                return _json(result)
+            given = {} if result.name is None else {"Content-Disposition": f'attachment; filename="{result.name}"'}
+            return Response(result.body, headers=given, media_type=result.media_type)
+
+        methods = ["GET" if endpoint.request is None else "POST"]
+        return Route(f"/api/runs/{{run}}/{endpoint.path}", handle, methods=methods)
+
+    document = openapi(ENDPOINTS)
+    page = _overview(ENDPOINTS)
+
+    async def describe(request: Request) -> Response:
+        return _json(document)
+
+    async def overview(request: Request) -> Response:
+        return HTMLResponse(page)
+
+    return [Route("/api", overview), Route("/api/openapi.json", describe), *map(route, ENDPOINTS)]
+
+
+def _access(request: Request) -> str:
+    """Return the access token of a request: "Authorization: Bearer TOKEN"."""
+    return request.headers.get("authorization", "").removeprefix("Bearer ")
+
+
+def _json(content: Any, status: int = 200) -> Response:
+    return Response(msgspec.json.encode(content), status, media_type="application/json")
+
+
+def openapi(endpoints: Sequence[Endpoint]) -> dict[str, Any]:
+    """Return the OpenAPI document of the endpoints."""
+    types = [kind for endpoint in endpoints for kind in (endpoint.request, endpoint.answer) if kind is not None]
+    schemas, components = msgspec.json.schema_components(types, ref_template="#/components/schemas/{name}")
+    by_type = {repr(kind): schema_of for kind, schema_of in zip(types, schemas)}
+    run = {"name": "run", "in": "path", "required": True, "schema": {"type": "string"}}
+    error = {"description": "The request is not valid; `error` says why.", "content": _body({"type": "object"})}
+    paths: dict[str, Any] = {
+        "/api/runs": {"get": {"summary": "List the runs.", "responses": {"200": {"description": "Runs"}}}}
+    }
+    for endpoint in endpoints:
+        answer = {_BINARY: {}} if endpoint.answer is None else _body(by_type[repr(endpoint.answer)])
+        operation: dict[str, Any] = {
+            "summary": endpoint.summary,
+            "operationId": endpoint.path,
+            "parameters": [
+                run,
+                *({"name": n, "in": "query", "schema": {"type": "string"}} for n in endpoint.parameters),
+            ],
+            "responses": {"200": {"description": "Answer", "content": answer}, "400": error},
+        }
+        if endpoint.request is not None:
+            operation["requestBody"] = {"required": True, "content": _body(by_type[repr(endpoint.request)])}
+        method = "get" if endpoint.request is None else "post"
+        paths[f"/api/runs/{{run}}/{endpoint.path}"] = {method: operation}
+    info = {"title": "normlift_ns", "version": normlift_ns.__version__}
+    return {"openapi": "3.1.0", "info": info, "paths": paths, "components": {"schemas": components}}
+
+
+def _body(schema_of: Any) -> dict[str, Any]:
+    return {"application/json": {"schema": schema_of}}
+
+
+def _overview(endpoints: Sequence[Endpoint]) -> str:
+    rows = "".join(
+        f"<tr><td><code>{'GET' if one.request is None else 'POST'} /api/runs/{{run}}/{one.path}</code></td>"
+        f"<td>{html.escape(one.summary)}</td></tr>"
+        for one in endpoints
+    )
+    head = "<!doctype html><html lang=en><title>normlift API</title><h1>API</h1>"
+    return f"{head}<p>The schemas are in <a href='/api/openapi.json'>openapi.json</a>.</p><table>{rows}</table></html>"

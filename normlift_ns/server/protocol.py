@@ -1,0 +1,178 @@
+"""Messages of a page to the server: every action with the type of its value."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import torch
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.errors import InputError
+from normlift_ns.options import RelevancyRule
+from normlift_ns.rendering.colors import Colormap
+from normlift_ns.server.coloring import ColorMode
+from normlift_ns.server.permalink import Finite, Greeting, PageView, Place, Side
+
+Text = Annotated[str, msgspec.Meta(max_length=4000)]
+Texts = Annotated[list[Text], msgspec.Meta(max_length=64)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
+Mode = Literal["select", "add", "remove"]
+Points = Annotated[list[tuple[Finite, Finite]], msgspec.Meta(min_length=1, max_length=4000)]
+Row = tuple[Finite, Finite, Finite, Finite]
+
+
+class Message(msgspec.Struct, frozen=True):
+    """Message of a page."""
+
+    action: str
+    value: msgspec.Raw = msgspec.Raw(b"null")
+    seq: int = 0
+    """Number of the message, which all answers to it repeat."""
+
+
+class Ask(msgspec.Struct, frozen=True):
+    """Question: prompts separated by commas."""
+
+    line: Text
+    negatives: Texts | None = None
+
+
+class CameraValue(msgspec.Struct, frozen=True):
+    """Camera of a view, as in `core.gaussians.Camera`."""
+
+    K: tuple[Place, Place, Place]
+    world_to_camera: tuple[Row, Row, Row, Row]
+    width: Side
+    height: Side
+
+    def camera(self) -> Camera:
+        """Return the camera; raises ValueError if it is not valid."""
+        return Camera(torch.tensor(self.K), torch.tensor(self.world_to_camera), self.width, self.height)
+
+
+class Ray(msgspec.Struct, frozen=True):
+    """Ray in the units of the scene."""
+
+    origin: Place
+    direction: Place
+
+
+class Pick(Ray, frozen=True):
+    """Click; "like" asks for everything similar to the clicked Gaussian."""
+
+    mode: Literal["select", "add", "remove", "like"] = "select"
+
+
+class Region(msgspec.Struct, frozen=True):
+    """Polygon in pixels of a camera."""
+
+    polygon: Points
+    camera: CameraValue
+    mode: Mode = "select"
+
+
+class Brush(msgspec.Struct, frozen=True):
+    """Trace of a brush in pixels of a camera."""
+
+    points: Points
+    radius: Annotated[float, msgspec.Meta(gt=0, le=2000)]
+    camera: CameraValue
+    mode: Mode = "select"
+
+
+class ObjectAction(msgspec.Struct, frozen=True):
+    """Selection of a listed object."""
+
+    id: Count
+    mode: Mode = "select"
+
+
+class Target(msgspec.Struct, frozen=True):
+    """Object or position to look at."""
+
+    id: Count | None = None
+    position: Place | None = None
+
+
+class Save(msgspec.Struct, frozen=True):
+    """Storage of prompts in the run, instead of or in addition to those stored there."""
+
+    replace: bool = False
+
+
+class LayerName(msgspec.Struct, frozen=True):
+    """Layer."""
+
+    name: Text
+
+
+class LayerVisibility(LayerName, frozen=True):
+    """Layer to show or hide."""
+
+    visible: bool
+
+
+class Export(msgspec.Struct, frozen=True):
+    """Download of the selection or of an object."""
+
+    format: Annotated[str, msgspec.Meta(max_length=20)] = "ply"
+    object: Count | None = None
+
+
+class Still(msgspec.Struct, frozen=True):
+    """Image of what the page shows, rendered by the server."""
+
+    max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+_Unit = Annotated[float, msgspec.Meta(ge=0, le=1)]
+_Step = Annotated[int, msgspec.Meta(ge=-100, le=100)]
+VALUES: dict[str, Any] = {
+    **dict.fromkeys(
+        ("cancel", "undo", "redo", "clear", "suggested", "invert", "show_all", "remove_weak", "floaters", "explain",
+         "link"), Any,
+    ),
+    **dict.fromkeys(("hide", "isolate"), Annotated[list[Count], msgspec.Meta(max_length=1000)] | None),
+    **dict.fromkeys(("layer_add", "layer_select", "layer_remove"), LayerName),
+    "greet": Greeting, "ask": Ask, "go_to_step": Count, "threshold": Finite, "reliability": _Unit,
+    "show_prompt": Count | None, "rule": RelevancyRule | Literal["auto"], "negatives": Texts | None,
+    "color_mode": ColorMode, "colormap": Colormap, "pick": Pick, "hover": Ray, "region": Region, "brush": Brush,
+    "grow": _Step, "object": ObjectAction, "go_to": Target, "save_prompts": Save | None,
+    "layer_visible": LayerVisibility, "export": Export, "camera": PageView, "still": Still,
+}  # fmt: skip
+"""Types of the values, by action."""
+
+
+def read_message(text: str | bytes) -> Message:
+    """Return a message of a page.
+
+    Raises:
+        ValueError: it is not a valid message.
+    """
+    return decode(text, Message)
+
+
+def read_value(message: Message) -> Any:
+    """Return the value of a message.
+
+    Raises:
+        ValueError: there is no such action, or its value is not valid.
+    """
+    if message.action not in VALUES:
+        raise InputError(f"There is no action {message.action[:40]!r}.")
+    kind = VALUES[message.action]
+    return None if kind is Any else decode(message.value, kind)
+
+
+def decode(text: str | bytes | msgspec.Raw, kind: Any) -> Any:
+    """Decode JSON of a type.
+
+    Raises:
+        ValueError: it is not valid.
+    """
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"The server does not understand this request: {error}.") from error

@@ -1,0 +1,434 @@
+"""Open runs with everything that their pages share, and a store of several runs within a memory limit."""
+
+from __future__ import annotations
+
+import io
+import re
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import torch
+import xxhash
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from normlift_ns.analysis.objects import find_floaters
+from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.spz import encode_spz
+from normlift_ns.errors import InputError
+from normlift_ns.io.memory import free_memory
+from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.text_encoder import encoder_name, own_words
+from normlift_ns.rasterization.rasterize import ray_weights, render
+from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
+from normlift_ns.server.permalink import PageView
+from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
+from normlift_ns.session.outputs import selection_bytes, store_query
+from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts, prompts_of_query
+from normlift_ns.session.selection import SelectionContext
+from normlift_ns.session.state import History, State
+
+MAX_MEMORIES = 64
+"""Number of pages that are remembered after they were closed."""
+_MAX_RESULTS = 8
+_SAMPLE = 4096
+_NUM_EXAMPLES, _NUM_CANDIDATES = 4, 24
+_BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray")
+_FIELDS_OF_VIEW = (0.3, 1.9)
+_GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
+_JPEG_QUALITY = 85
+_MEMORY_SHARE = 0.5
+"""Share of the free memory that open runs may take."""
+_render_lock = threading.Lock()
+"""Held while an image is rendered, because numba's threads do not support two renders at a time."""
+
+
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class PageMemory:
+    """Session of one page, which is kept when the connection is lost."""
+
+    history: History[State]
+    line: str = ""
+    """Text of the search box."""
+    clicks: dict[str, int] = field(default_factory=dict)
+    """Clicked Gaussians by the names of their prompts."""
+    negatives: tuple[str, ...] | None = None
+    """Negative prompts of the next query; None: those of the encoder."""
+    rule: str = "auto"
+    min_reliability: float = 0.0
+    view: PageView | None = None
+    link: str = ""
+    """The last link that was followed or made."""
+    page: object | None = None
+    """The page that shows this session now."""
+
+
+@dataclass(eq=False)
+class ServedRun:
+    """An open run, shared by all pages and requests.
+
+    Args:
+        max_gaussians: largest number of Gaussians to draw: the most opaque and largest ones.
+    """
+
+    id: str
+    run: LiftedRun
+    max_gaussians: int
+    reading: threading.Lock = field(default_factory=threading.Lock)
+    """Held while the text encoder or the votes are used, so that they are not loaded twice."""
+    _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
+    _results: OrderedDict[bytes, Any] = field(default_factory=OrderedDict)
+    _memory_lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @cached_property
+    def space(self) -> SelectionContext:
+        """The field with the centers of its Gaussians."""
+        return SelectionContext(self.run.field, self.run.scene.gaussians.means.detach())
+
+    @cached_property
+    def visible(self) -> Bool[torch.Tensor, " n"]:
+        """Mask of the Gaussians that are opaque enough to be seen."""
+        gaussians = self.run.scene.gaussians
+        return gaussians.drawable & (gaussians.opacities >= MIN_OPACITY)
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Rows of the drawn Gaussians, ascending."""
+        gaussians, rows = self.run.scene.gaussians, self.visible.nonzero().squeeze(1)
+        if len(rows) > self.max_gaussians:
+            largest = gaussians.scales[rows].double().topk(2, dim=1).values.prod(dim=1)
+            rows = rows[(gaussians.opacities[rows] * largest).topk(self.max_gaussians).indices].sort().values
+        return rows.cpu().numpy()
+
+    @cached_property
+    def drawn_scene(self) -> GaussianScene:
+        """The drawn Gaussians."""
+        whole, rows = self.run.scene.gaussians, torch.from_numpy(self.rows)
+        return GaussianScene(
+            *(x.detach().cpu()[rows] for x in (whole.means, whole.quats, whole.scales, whole.opacities))
+        )
+
+    @cached_property
+    def geometry(self) -> tuple[bytes, str]:
+        """The drawn Gaussians as SPZ, and the digest of these bytes."""
+        scene, rows = self.run.scene, torch.from_numpy(self.rows)
+        values = {name: value.detach().float().cpu()[rows] for name, value in scene.parameters.items()}
+        if not scene.has_harmonics:
+            values["features_dc"] = (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
+            values["features_rest"] = values["features_rest"][:, :0]
+        content = encode_spz(SplatParameters(**values), antialiased=scene.rasterize_mode == "antialiased")
+        return content, xxhash.xxh3_128_hexdigest(content)
+
+    @cached_property
+    def frame(self) -> tuple[list[float], list[float], float]:
+        """Up direction of the cameras, center of the scene, and the radius that contains most of it."""
+        poses = [camera.world_to_camera.double().cpu().numpy() for camera in self.run.scene.train.cameras]
+        up = -np.mean([pose[1, :3] for pose in poses], axis=0) if len(poses) > 0 else np.zeros(3)
+        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
+        means = self.drawn_scene.means.double().numpy()
+        places = np.concatenate(
+            [*(np.linalg.inv(pose)[None, :3, 3] for pose in poses), means[:: 1 + len(means) // 10_000]]
+        )
+        if len(places) == 0:
+            return up.tolist(), [0.0, 0.0, 0.0], 1.0
+        center = np.median(places, axis=0)
+        radius = float(np.quantile(np.abs(places - center).max(axis=1), 0.8))
+        return up.tolist(), center.tolist(), radius if radius > 0 else 1.0
+
+    @cached_property
+    def first_view(self) -> PageView | None:
+        """The camera of the first training image, looking as far as the scene is away; None without images."""
+        cameras = self.run.scene.train.cameras
+        if len(cameras) == 0:
+            return None
+        pose = np.linalg.inv(cameras[0].world_to_camera.double().cpu().numpy())
+        position, ahead = pose[:3, 3], pose[:3, 2]
+        depth = (self.drawn_scene.means[::50].double().numpy() - position) @ ahead
+        distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else self.frame[2]
+        fov = float(np.clip(2 * np.arctan(cameras[0].height / 2 / float(cameras[0].K[1, 1])), *_FIELDS_OF_VIEW))
+        target = position + distance * ahead
+        return PageView(tuple(position.tolist()), tuple(target.tolist()), tuple(self.frame[0]), fov)
+
+    @cached_property
+    def examples(self) -> list[str]:
+        """Words of the encoder's own vocabulary that are found in the scene, at different places; [] if it has none."""
+        color = encoder_name(self.run.field) == "color"
+        words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
+        if len(words) == 0:
+            return []
+        sample = torch.from_numpy(self.rows[:: 1 + len(self.rows) // _SAMPLE])
+        vectors = torch.nn.functional.normalize(torch.from_numpy(np.asarray(self.read(words))).float())
+        cosine = self.run.field.directions(sample).float().cpu() @ vectors.T
+        null = self.run.field.null_levels().cpu()[sample]
+        lead = cosine - (null if null.shape[1] > 0 else cosine.mean(dim=1, keepdim=True))
+        best = torch.quantile(lead, 0.99, dim=0).argsort(descending=True)[:_NUM_CANDIDATES].tolist()
+        prompts = encode_prompts(join_prompts([words[index] for index in best]), self.read)
+        query = build_query(self.space.field, prompts, self.read)[1]
+        found, taken = [], self.space.empty_mask()
+        for finding in run_query(self.space.field, self.space.means, query):
+            size = int(finding.mask.sum())
+            if finding.verdict == "found" and 2 * int((finding.mask & taken).sum()) < size:
+                found.append(finding.text)
+                taken = taken | finding.mask
+        return found[:_NUM_EXAMPLES]
+
+    @cached_property
+    def pca(self) -> Float[torch.Tensor, "n 3"]:
+        """Three principal components of the features, in 0..1."""
+        axes, ends = pca_of(self.run.field.directions(torch.from_numpy(self.rows[:: 1 + len(self.rows) // _SAMPLE])))
+        values = self.run.field.query(axes).double()
+        return ((values - ends[:, 0]) / (ends[:, 1] - ends[:, 0]).clamp(min=1e-9)).clamp(0, 1)
+
+    @cached_property
+    def floaters(self) -> Bool[torch.Tensor, " n"]:
+        """Mask of the Gaussians that likely belong to no surface."""
+        with self.reading:
+            return find_floaters(self.run.scene.gaussians, self.run.field.scalars).mask
+
+    def describe(self, *, read_only: bool) -> dict[str, Any]:
+        """Return the facts of the run for `GET /api/runs`."""
+        (up, center, radius), drawn = self.frame, len(self.rows)
+        return {
+            "id": self.id, "name": self.run.scene.name, "encoder": encoder_name(self.run.field) or "",
+            "num_gaussians": len(self.space), "num_drawn": drawn, "num_left_out": int(self.visible.sum()) - drawn,
+            "num_views": len(self.run.scene.train), "saved_prompts": list(self.stored()), "examples": self.examples,
+            "read_only": read_only, "up": up, "center": center, "radius": radius, "digest": self.geometry[1],
+        }  # fmt: skip
+
+    def weights(self, origin: Sequence[float], direction: Sequence[float]) -> Float[torch.Tensor, " n"]:
+        """Return the weights of the Gaussians on a ray."""
+        if not any(direction):
+            raise InputError("The direction of a ray must not be zero.")
+        start, ahead = (torch.tensor(x, dtype=torch.float64) for x in (origin, direction))
+        return ray_weights(self.run.scene.gaussians, start, ahead)
+
+    def read(self, texts: Sequence[str]) -> Any:
+        """Return the vectors of texts."""
+        with self.reading:
+            return self.run.texts.rows(texts)
+
+    def stored(self) -> dict[str, Any]:
+        """Return the vectors of the prompts that the run stores."""
+        return {row.text: row.vector for row in prompts_of_query(load_query(self.run.folder / FIELD_FOLDER))}
+
+    def known(self, clicks: Mapping[str, int]) -> dict[str, Any]:
+        """Return the vectors that need no encoder: of stored prompts and of clicks.
+
+        Raises:
+            ValueError: a click is on a Gaussian that this scene does not have.
+        """
+        for name, gaussian in clicks.items():
+            if gaussian >= len(self.space):
+                raise InputError(f"{name}: this scene has no Gaussian {gaussian:,}; the link is for another one.")
+        rows = self.space.field.directions(torch.tensor(list(clicks.values()), dtype=torch.long)).cpu().numpy()
+        return {**self.stored(), **{name: row for name, row in zip(clicks, rows) if np.any(row)}}
+
+    def save(self, query: Query | None, *, replaces: bool = False) -> str:
+        """Store prompts in the run; return their number in words."""
+        return store_query(self.run.folder / FIELD_FOLDER, query, replaces=replaces)
+
+    def export(self, state: State, mask: Bool[torch.Tensor, " n"], name: str, kind: str) -> tuple[str, bytes, str]:
+        """Return the name and content of a file of Gaussians, and a message; see `selection_bytes`."""
+        file, content = selection_bytes(self.run.scene, self.run.field, state, mask, name, kind)
+        faint = int((mask & ~self.visible).sum())
+        note = f" {faint:,} Gaussians are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
+        return file, content, f"Downloaded {file} with {int(mask.sum()) - faint:,} Gaussians.{note}"
+
+    def cached(self, key: bytes, compute: Callable[[], T]) -> T:
+        """Return a result of this run by its key; the latest ones are kept."""
+        with self._memory_lock:
+            found = self._results.pop(key, None)
+        found = compute() if found is None else found
+        with self._memory_lock:
+            self._results[key] = found
+            while len(self._results) > _MAX_RESULTS:
+                self._results.popitem(last=False)
+        return found
+
+    def view_of(
+        self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
+    ) -> PageView:
+        """Return a camera that looks at an object or a point, from where nothing occludes it.
+
+        Args:
+            view: current camera; None: that of the first training image.
+            drawn: mask of the Gaussians that are drawn.
+        """
+        view = view or self.first_view
+        if view is None:
+            raise InputError("The camera is not known yet; move it, and try again.")
+        scene = self.run.scene.gaussians
+        position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
+        return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
+
+    def image(self, index: int, max_size: int) -> bytes:
+        """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
+        if not 0 <= index < len(self.run.scene.train):
+            raise InputError(f"There is no image {index}; the run has {len(self.run.scene.train)} images.")
+        return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
+
+    def still(self, codes: Codes, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
+        """Render the drawn Gaussians in the colors of a state, as JPEG."""
+        scene, rows = self.run.scene, torch.from_numpy(self.rows)
+        kept = torch.from_numpy(codes.codes != NOT_DRAWN)
+        own = scene.colors(camera).detach().cpu()[rows][kept].clamp(0, 1)
+        table = torch.tensor([*codes.palette], dtype=own.dtype)[torch.from_numpy(codes.codes).long()[kept]]
+        gray = (own @ own.new_tensor(_GRAY_WEIGHTS) * _GRAY_DIMMING)[:, None].expand_as(own)
+        color = torch.where(table[:, 4:] > 0, gray, own)
+        color = color + table[:, 3:4] * (table[:, :3] / 255 - color)
+        whole = self.drawn_scene
+        part = GaussianScene(*(x[kept] for x in (whole.means, whole.quats, whole.scales, whole.opacities)))
+        with _render_lock:
+            image, alpha = render(part, camera, color.to(part.means), rasterize_mode=scene.rasterize_mode)
+        shown = image + (1 - alpha)[:, :, None] * image.new_tensor(list(background))
+        return to_jpeg((shown.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+
+    def remember(self, token: str, page: object) -> tuple[PageMemory, str]:
+        """Return the session of a token, and the token that the page has from now on.
+
+        A page that is open already, such as the original of a duplicated tab, keeps its session; the new page gets a
+        copy with a token of its own.
+        """
+        with self._memory_lock:
+            found = self._memories.get(token)
+            if found is not None and found.page is not None:
+                token = secrets.token_urlsafe(16)
+                copy = {name: value for name, value in vars(found).items() if name != "page"}
+                found = PageMemory(**{**copy, "clicks": dict(found.clicks)})
+            if found is None:
+                found = PageMemory(History.of(State(self.space), lean=State.without_caches))
+            found.page = page
+            self._memories[token] = found
+            self._memories.move_to_end(token)
+            for old in [name for name, memory in self._memories.items() if memory.page is None][:-MAX_MEMORIES]:
+                del self._memories[old]
+            return found, token
+
+    def warm_up(self) -> None:
+        """Compute what the first page would wait for."""
+        _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
+        view = self.first_view
+        if view is not None:
+            codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
+            self.still(codes, view.camera(64))  # compiles the renderer
+        _ = self.pca
+
+    @property
+    def in_use(self) -> bool:
+        """True if a page is open."""
+        with self._memory_lock:
+            return any(memory.page is not None for memory in self._memories.values())
+
+
+def to_jpeg(image: UInt8[np.ndarray, "h w 3"], max_size: int | None = None) -> bytes:
+    """Encode an image as JPEG, scaled down to at most `max_size` pixels along its longer side."""
+    picture, buffer = Image.fromarray(image), io.BytesIO()
+    if max_size is not None:
+        picture.thumbnail((max_size, max_size))
+    picture.save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+class RunStore:
+    """Runs by their ids, opened at first use. The least recently used ones are closed if memory becomes scarce.
+
+    Args:
+        configs: paths of config.yml.
+        open_run: opens one of them.
+        memory_limit: bytes that open runs may take together; None: half of the memory that is free now.
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[Path],
+        open_run: Callable[[Path], LiftedRun],
+        *,
+        max_gaussians: int = 1_000_000,
+        memory_limit: int | None = None,
+    ) -> None:
+        self._configs = {name: config for name, config in zip(_run_ids(configs), configs)}
+        self._open_run, self._max_gaussians = open_run, max_gaussians
+        free = min(free_memory().values(), default=2**33)
+        self._limit = int(_MEMORY_SHARE * free) if memory_limit is None else memory_limit
+        self._open: OrderedDict[str, tuple[ServedRun, int]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._locks = {name: threading.Lock() for name in self._configs}
+
+    @property
+    def ids(self) -> list[str]:
+        """Ids of all runs."""
+        return list(self._configs)
+
+    @property
+    def folders(self) -> list[Path]:
+        """Folders of all runs."""
+        return [config.absolute().parent for config in self._configs.values()]
+
+    def get(self, name: str) -> ServedRun:
+        """Return a run, after opening it if it is not open.
+
+        Raises:
+            ValueError: there is no such run, or it cannot be opened.
+        """
+        if name not in self._configs:
+            raise InputError(f"There is no run {name!r}. The runs are: {', '.join(self.ids)}.")
+        with self._locks[name]:
+            with self._lock:
+                if name in self._open:
+                    self._open.move_to_end(name)
+                    return self._open[name][0]
+            run = self._open_run(self._configs[name])
+            served = ServedRun(name, run, self._max_gaussians)
+            with self._lock:
+                self._open[name] = served, _estimated_bytes(run)
+                for other in [one for one in self._open if one != name and not self._open[one][0].in_use]:
+                    if sum(size for _, size in self._open.values()) > self._limit:
+                        del self._open[other]
+            return served
+
+
+def _estimated_bytes(run: LiftedRun) -> int:
+    """Return the size of the checkpoint and of the field, which are read into memory, with room for results."""
+    files = [run.scene.checkpoint_path, *(run.folder / FIELD_FOLDER).glob("*.safetensors")]
+    return 2 * sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _run_ids(configs: Sequence[Path]) -> list[str]:
+    """Return a short unique name for each config, from the names of its experiment and its time stamp."""
+    names: list[str] = []
+    for config in configs:
+        parts = config.absolute().parent.parts
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts[-3::2])).strip("-.") or "run"
+        names.append(name if name not in names else f"{name}-{1 + len(names)}")
+    return names
+
+
+@lru_cache(maxsize=1)
+def _roots() -> tuple[str, ...]:
+    return tuple(sorted((str(Path.home()), str(Path.cwd())), key=len, reverse=True))
+
+
+def without_paths(text: str) -> str:
+    """Return a message in which absolute paths are reduced to their last name.
+
+    >>> without_paths("/home/me/captures/fox/config.yml is missing; see https://example.org/a/b")
+    'config.yml is missing; see https://example.org/a/b'
+    """
+    for root in _roots():
+        text = text.replace(root + "/", "/") if len(root) > 1 else text
+    return re.sub(r"(?<![\w:/.])/(?:[^\s/'\",;:()]+/)*([^\s/'\",;:()]*)", r"\1", text)

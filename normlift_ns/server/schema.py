@@ -1,0 +1,324 @@
+"""Requests and answers of the HTTP API."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import torch
+
+from normlift_ns.errors import InputError
+from normlift_ns.options import RelevancyRule
+from normlift_ns.query.engine import Answer
+from normlift_ns.query.question import Query
+from normlift_ns.server.coloring import ColorMode
+from normlift_ns.server.permalink import Finite, PageView
+from normlift_ns.server.protocol import CameraValue, Ray, Region
+from normlift_ns.server.runs import ServedRun
+from normlift_ns.server.session import region_mask
+from normlift_ns.session import actions
+from normlift_ns.session.objects import ObjectRow, list_objects
+from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts
+from normlift_ns.session.state import State
+
+Prompt = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Arrays = Literal["none", "safetensors"]
+
+
+class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Prompts, and how they select Gaussians; as in `LiftedRun.ask`."""
+
+    texts: Annotated[list[Prompt], msgspec.Meta(min_length=1, max_length=64)]
+    negatives: Annotated[list[Prompt], msgspec.Meta(max_length=64)] | None = None
+    relevancy: RelevancyRule | Literal["auto"] = "auto"
+    threshold: Finite | Literal["auto"] | None = None
+    min_reliability: Fraction = 0.0
+    refined: bool = True
+
+
+class QueryRequest(Question, frozen=True, forbid_unknown_fields=True):
+    """Question, with the arrays that the answer contains."""
+
+    arrays: Arrays = "none"
+    """safetensors: the answer is a safetensors file with `relevancy` [N, Q] float32 and `selected` [N, Q] bool, and the
+    JSON answer in its metadata."""
+
+
+class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Gaussians: those that prompts select, or one of these: an object, a ray, a region, floaters or a mask."""
+
+    question: Question | None = None
+    """Prompts; None: no prompt selects."""
+    prompt: Annotated[int, msgspec.Meta(ge=0)] | None = None
+    """Index of the only prompt that selects."""
+    object: Annotated[int, msgspec.Meta(ge=1)] | None = None
+    """Number of an object in the answer of /objects to this question."""
+    ray: Ray | None = None
+    """The object that a ray hits."""
+    region: Region | None = None
+    """Visible Gaussians inside a polygon in an image."""
+    floaters: bool = False
+    """Likely floaters."""
+    mask: Annotated[bytes, msgspec.Meta(max_length=2**22)] | None = None
+    """Mask of all Gaussians as packed bits, the first in the highest bit of the first byte; in base64."""
+    invert: bool = False
+    """Select all other Gaussians instead."""
+
+
+class ExportRequest(Selection, frozen=True, forbid_unknown_fields=True):
+    """Selection to export; the answer is a file."""
+
+    format: Annotated[str, msgspec.Meta(max_length=20)] = "ply"
+
+
+class SelectRequest(Selection, frozen=True, forbid_unknown_fields=True):
+    """Selection whose rows are wanted."""
+
+    arrays: Literal["none", "npy"] = "none"
+    """npy: the answer is the mask [N] as an NPY file."""
+
+
+class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Question to store in the run."""
+
+    question: Question
+    replace: bool = True
+    """False: add its prompts to those stored in the run."""
+
+
+class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Image of the scene; the answer is a JPEG file."""
+
+    view: str | int = 0
+    """Name or index of a training image."""
+    camera: CameraValue | None = None
+    """Camera, instead of a training image."""
+    page_view: PageView | None = None
+    """Camera by its position and target, instead of a training image."""
+    selection: Selection | None = None
+    mode: ColorMode = "overlay"
+    isolate: bool = False
+    """Draw the selection alone."""
+    max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
+
+
+class Histogram(msgspec.Struct, frozen=True):
+    """Histogram of relevancies, in bins of equal width."""
+
+    low: float
+    high: float
+    counts: list[int]
+    median: float
+    top: float
+
+
+class PromptResult(msgspec.Struct, frozen=True):
+    """Result for one prompt; positions are in units of the scene. See `Finding`."""
+
+    text: str
+    fraction: float
+    centroid: list[float] | None
+    extent: list[float] | None
+    peak: float | None
+    mean_reliability: float | None
+    verdict: str | None
+    nearest: list[float] | None
+    suggested_threshold: float | None
+    histogram: Histogram | None
+    count: int
+
+
+class QueryResult(msgspec.Struct, frozen=True):
+    """Answer to a question."""
+
+    results: list[PromptResult]
+    relevancy: str
+    """Rule that computed the relevancies."""
+    threshold: float
+    min_reliability: float
+    num_gaussians: int
+
+
+class ObjectResult(msgspec.Struct, frozen=True):
+    """Object: a connected part of what a prompt selects. Positions are in units of the scene."""
+
+    id: int
+    text: str
+    count: int
+    center: list[float]
+    min: list[float]
+    """Lower corner of the box that holds 98 % of the centers along each axis."""
+    max: list[float]
+    reliability: float
+    views: float
+    evidence: str
+
+
+class ObjectsResult(msgspec.Struct, frozen=True):
+    """Objects, by prompt and by descending size."""
+
+    objects: list[ObjectResult]
+    left_out: int
+    """Number of further objects."""
+    in_smaller_parts: int
+
+
+class SelectResult(msgspec.Struct, frozen=True):
+    """Size and position of a selection."""
+
+    count: int
+    visible: int
+    center: list[float] | None
+    min: list[float] | None
+    max: list[float] | None
+
+
+class VoteResult(msgspec.Struct, frozen=True):
+    """Vote of an image."""
+
+    name: str
+    url: str | None
+    """The image with the regions that voted, as a data URL."""
+    regions: int
+    share: float
+    agreement: float
+    disagreement: float
+
+
+class ExplainResult(msgspec.Struct, frozen=True):
+    """Images that voted for a selection."""
+
+    text: str
+    agreement: float
+    effective_views: float
+    problem: str | None
+    support: list[VoteResult]
+    disagreement: list[VoteResult]
+
+
+MAX_OBJECTS = 64
+
+
+def make_query(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], Query]:
+    """Encode a question; return its prompts and the query.
+
+    Raises:
+        ValueError: the encoder does not know a prompt.
+    """
+    settings = {"negatives": question.negatives, "relevancy": question.relevancy, "threshold": question.threshold}
+    settings |= {"min_reliability": question.min_reliability, "refined": question.refined}
+    prompts = encode_prompts(join_prompts(question.texts), served.read, served.stored())
+    unknown = next((prompt.error for prompt in prompts if prompt.error), None)
+    if unknown is not None:
+        raise InputError(unknown)
+    return build_query(served.space.field, prompts, served.read, **settings)
+
+
+def answer(served: ServedRun, question: Question) -> Answer:
+    """Answer a question."""
+    return served.space.answer(make_query(served, question)[1])
+
+
+def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
+    """Return the answer to a question, as arrays and as JSON types; the latest ones are cached."""
+    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question))
+
+
+def _answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
+    result = answer(served, question)
+    return result, query_result(result)
+
+
+def query_result(result: Answer) -> QueryResult:
+    """Return an answer as JSON types."""
+    rows = [{**finding.to_json(), "count": int(finding.mask.sum())} for finding in result]
+    settings = result.question.settings()
+    return msgspec.convert({"results": rows, "num_gaussians": len(result.valid), **settings}, QueryResult)
+
+
+def select_state(served: ServedRun, selection: Selection) -> State:
+    """Return a state whose selection is the one described.
+
+    Raises:
+        ValueError: it is not valid, or nothing is there.
+    """
+    state = State(served.space, color_mode="overlay")
+    if selection.question is not None:
+        state = actions.ask(state, *make_query(served, selection.question))
+        state = actions.show_prompt(state, selection.prompt)
+    if selection.object is not None:
+        state = actions.select(state, find_object(state, selection.object).mask)
+    elif selection.ray is not None:
+        state = actions.click(state, served.weights(selection.ray.origin, selection.ray.direction))
+    elif selection.region is not None:
+        state = actions.select(state, region_mask(served, state, selection.region))
+    elif selection.floaters:
+        state = actions.select(state, served.floaters)
+    elif selection.mask is not None:
+        state = actions.select(state, unpack_mask(selection.mask, len(served.space)))
+    return actions.invert(state) if selection.invert else state
+
+
+def find_object(state: State, number: int) -> ObjectRow:
+    """Return an object by its number in the list of objects.
+
+    Raises:
+        ValueError: there is no such object.
+    """
+    objects = list_objects(state, max_objects=MAX_OBJECTS).objects
+    if number > len(objects):
+        raise InputError(f"There is no object {number}; the selection has {len(objects)} objects.")
+    return objects[number - 1]
+
+
+def pack_mask(mask: torch.Tensor) -> bytes:
+    """Pack a mask into bits; the inverse of `unpack_mask`."""
+    return np.packbits(mask.cpu().numpy()).tobytes()
+
+
+def unpack_mask(packed: bytes, count: int) -> torch.Tensor:
+    """Unpack a mask.
+
+    Raises:
+        ValueError: it has another length.
+
+    >>> unpack_mask(pack_mask(torch.tensor([True, False, True])), 3).tolist()
+    [True, False, True]
+    """
+    if len(packed) != (count + 7) // 8:
+        raise InputError(f"The mask has {len(packed):,} bytes; expected {(count + 7) // 8:,} for {count:,} Gaussians.")
+    return torch.from_numpy(np.unpackbits(np.frombuffer(packed, np.uint8), count=count).astype(bool))
+
+
+def objects_result(state: State) -> ObjectsResult:
+    """Return the objects of a selection."""
+    found, rows = list_objects(state, max_objects=MAX_OBJECTS), []
+    for number, row in enumerate(found.objects, 1):
+        low, high = extent(state, row.mask)
+        facts = (number, row.text, row.size, list(row.center), low, high, row.reliability, row.mean_views, row.evidence)
+        rows.append(ObjectResult(*facts))
+    return ObjectsResult(rows, found.left_out, found.in_smaller_parts)
+
+
+def extent(state: State, mask: torch.Tensor) -> tuple[list[float], list[float]]:
+    """Return the corners of the box that holds 98 % of the centers of some Gaussians along each axis."""
+    low, high = np.quantile(state.space.means[mask].double().cpu().numpy(), (0.01, 0.99), axis=0)
+    return low.tolist(), high.tolist()
+
+
+def select_result(served: ServedRun, state: State) -> SelectResult:
+    """Return the size and position of a selection."""
+    mask = state.selection
+    count, visible = int(mask.sum()), int((mask & served.visible).sum())
+    if count == 0:
+        return SelectResult(0, 0, None, None, None)
+    low, high = extent(state, mask)
+    return SelectResult(count, visible, state.space.means[mask].double().mean(dim=0).tolist(), low, high)
+
+
+def isolated(state: State) -> State:
+    """Return a state that draws its selection alone, in its own colors."""
+    return replace(actions.show_only(state), color_mode="rgb")

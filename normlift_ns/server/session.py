@@ -1,0 +1,692 @@
+"""One page: its actions on the state, in order, and what the server sends to it."""
+
+from __future__ import annotations
+
+import base64
+import struct
+from collections import OrderedDict, deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
+
+import anyio
+import msgspec
+import numpy as np
+import torch
+from anyio import CapacityLimiter, Event, Lock, create_task_group
+from anyio.abc import TaskGroup
+from jaxtyping import Bool
+from torch import Tensor
+
+from normlift_ns.analysis.explain import ViewVote
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.errors import InputError, describe_error
+from normlift_ns.query.engine import Finding
+from normlift_ns.server import protocol
+from normlift_ns.server.coloring import COLOR_MODES, Codes, legend, make_codes, prompt_display_colors
+from normlift_ns.server.permalink import Greeting, PageView, link_of, read_link, write_link
+from normlift_ns.server.runs import PageMemory, ServedRun, to_jpeg, without_paths
+from normlift_ns.session import actions
+from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
+from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects
+from normlift_ns.session.prompts import (
+    build_query,
+    click_name,
+    encode_prompts,
+    is_click,
+    join_prompts,
+)  # fmt: skip
+from normlift_ns.session.region import inside_polygon, near_path, project, visible_gaussians
+from normlift_ns.session.state import RequestTokens, State
+
+_MAX_PENDING = 256
+"""Number of actions of a page that may wait; a page that sends more is closed."""
+_REST = 0.03
+"""Seconds without a change after which objects and histograms are computed."""
+_GREETING_TIMEOUT = 20.0
+_MAX_OBJECTS = 24
+_MAX_IMAGES = 3
+"""Number of images of an explanation, of those with the largest weight and of those that disagree most."""
+_IMAGE_SIZE = 480
+_SPOT = 0.3
+"""Size of what is shown around a position, in radii of the scene."""
+_SLIDERS = ("threshold", "reliability", "grow")
+"""Actions of which only the last of several waiting ones counts, and which make one step of the history."""
+_LATEST = ("hover", "still", "camera")
+"""Actions that do not wait for others, and of which only the latest counts."""
+_OVER_VIEWS = "Based on about {:.0f} images; {}."
+
+T = TypeVar("T")
+
+
+class Latest(Generic[T]):
+    """Slot that holds the latest value until it is taken."""
+
+    def __init__(self) -> None:
+        self._values: list[T] = []
+        self._event = Event()
+
+    def put(self, value: T) -> None:
+        """Replace the value."""
+        self._values = [value]
+        self._event.set()
+
+    async def take(self) -> T:
+        """Wait for a value, and remove it."""
+        while len(self._values) == 0:
+            self._event = Event()
+            await self._event.wait()
+        return self._values.pop()
+
+    @property
+    def empty(self) -> bool:
+        """True if there is no value."""
+        return len(self._values) == 0
+
+
+class PageSocket(Protocol):
+    """Connection to a page."""
+
+    async def receive_text(self) -> str:
+        """Return the next message; raises an exception when the connection ends."""
+        ...
+
+    async def send_text(self, data: str) -> None:
+        """Send a text message."""
+        ...
+
+    async def send_bytes(self, data: bytes) -> None:
+        """Send a binary message."""
+        ...
+
+
+@dataclass(frozen=True)
+class PageLimits:
+    """Threads that all pages share, and what pages may do."""
+
+    quick: CapacityLimiter
+    """For actions."""
+    slow: CapacityLimiter
+    """For text encoders, explanations, exports and images."""
+    may_write: Callable[[str], bool]
+    """Returns whether a page with this access token may store prompts in a run."""
+    offer: Callable[[str, bytes], str]
+    """Keeps a file for a download; returns its address."""
+
+
+@dataclass(frozen=True)
+class _Pending:
+    action: str
+    value: Any
+    seq: int
+
+
+class PageSession:
+    """Session of one page.
+
+    All actions that change the state run in order, one at a time, in a thread of `limits.quick`. Slow requests run
+    beside them, and their result is applied like an action, unless it is stale.
+    """
+
+    def __init__(self, served: ServedRun, socket: PageSocket, limits: PageLimits) -> None:
+        self._run, self._socket, self._limits = served, socket, limits
+        self._pending: deque[_Pending] = deque()
+        self._wake = Event()
+        self._sending = Lock()
+        self._dirty: Latest[int] = Latest()
+        self._slots: dict[str, Latest[_Pending]] = {name: Latest() for name in ("hover", "still")}
+        self._tokens, self._explaining = RequestTokens(), RequestTokens()
+        self._objects: OrderedDict[int, ObjectRow] = OrderedDict()
+        self._next_object = 1
+        self._revision = 0
+        self._read_only = True
+        self._group: TaskGroup
+        self._memory: PageMemory
+        self._changes: dict[str, Callable[..., State]] = {
+            "clear": actions.clear, "threshold": actions.set_threshold, "suggested": actions.use_suggested_threshold,
+            "reliability": self._set_reliability, "show_prompt": actions.show_prompt, "grow": actions.resize,
+            "color_mode": actions.set_color_mode, "invert": actions.invert, "show_all": actions.show_all,
+            "remove_weak": actions.remove_weak, "pick": self._pick, "region": self._select_region,
+            "brush": self._select_region, "object": self._select_object,
+            "colormap": lambda state, name: replace(state, colormap=name, action=f"Colormap {name}"),
+            "hide": lambda state, ids: actions.hide(state, self._mask_of(ids)),
+            "isolate": lambda state, ids: actions.show_only(state, self._mask_of(ids)),
+            "layer_add": lambda state, value: actions.add_layer(state, value.name),
+            "layer_remove": lambda state, value: actions.remove_layer(state, value.name),
+            "layer_visible": lambda state, value: actions.show_layer(state, value.name, visible=value.visible),
+            "layer_select": lambda state, value: actions.select(
+                state, actions.find_layer(state, value.name).mask, f"Select layer {value.name}"
+            ),
+        }  # fmt: skip
+        self._slow: dict[str, Callable[[_Pending], Any]] = {
+            "ask": self._ask, "negatives": self._ask, "rule": self._ask, "floaters": self._select_floaters,
+            "explain": self._explain, "export": self._export, "go_to": self._go_to, "save_prompts": self._save,
+        }  # fmt: skip
+
+    @property
+    def _state(self) -> State:
+        return self._memory.history.now
+
+    async def run(self) -> None:
+        """Serve the page until its connection ends."""
+        with anyio.fail_after(_GREETING_TIMEOUT):
+            first = protocol.read_message(await self._socket.receive_text())
+        if first.action != "greet":
+            raise InputError("The first message of a page must be its greeting.")
+        greeting = protocol.read_value(first)
+        self._memory, token = self._run.remember(greeting.token, self)
+        self._read_only = not self._limits.may_write(greeting.access)
+        try:
+            async with create_task_group() as self._group:
+                await self._greet(greeting, token, first.seq)
+                for task in (self._work, self._paint, self._hover_on, self._draw_stills):
+                    self._group.start_soon(task)
+                while len(self._pending) < _MAX_PENDING:
+                    await self._receive(await self._socket.receive_text())
+                self._group.cancel_scope.cancel()
+        finally:
+            self._memory.page = None
+
+    # Incoming messages.
+
+    async def _receive(self, text: str) -> None:
+        message = protocol.Message("")
+        try:
+            message = protocol.read_message(text)
+            pending = _Pending(message.action, protocol.read_value(message), message.seq)
+        except InputError as error:
+            await self._tell(str(error), "error", message.seq)
+            return
+        if pending.action in self._slots:
+            self._slots[pending.action].put(pending)
+        elif pending.action == "camera":
+            self._memory.view = pending.value if pending.value.is_valid else self._memory.view
+        elif pending.action == "cancel":
+            self._pending.clear()
+            self._tokens.cancel()
+            self._explaining.cancel()
+            await self._send(type="busy", text=None, seq=pending.seq)
+        else:
+            self._append(pending)
+
+    def _append(self, pending: _Pending) -> None:
+        if pending.action in _SLIDERS and self._pending and self._pending[-1].action == pending.action:
+            self._pending.pop()
+        self._pending.append(pending)
+        self._wake.set()
+
+    async def _work(self) -> None:
+        while True:
+            while self._pending:
+                await self._do(self._pending.popleft())
+            self._wake = Event()
+            await self._wake.wait()
+
+    async def _do(self, pending: _Pending) -> None:
+        try:
+            if pending.action in self._slow:
+                await self._slow[pending.action](pending)
+            elif pending.action in ("undo", "redo", "go_to_step"):
+                self._step(pending)
+            elif pending.action == "link":
+                self._memory.link = write_link(link_of(self._state, self._memory.clicks, self._memory.view))
+                await self._send(type="token", token="", link=self._memory.link, seq=pending.seq)
+            elif pending.action == "pick" and pending.value.mode == "like":
+                await self._ask_similar(pending)
+            elif pending.action != "greet":
+                await self._change(pending)
+        except Exception as error:  # libraries may raise anything; no error may end the session
+            await self._tell(describe_error(error)[0], "error", pending.seq)
+
+    def _step(self, pending: _Pending) -> None:
+        history = self._memory.history
+        steps = {"undo": history.undo, "redo": history.redo}
+        history = steps[pending.action]() if pending.action in steps else history.go_to(pending.value)
+        if history is not self._memory.history:
+            self._memory.history = history
+            self._memory.line = join_prompts([prompt.text for prompt in history.now.prompts])
+        self._show(pending.seq)
+
+    async def _change(self, pending: _Pending) -> None:
+        """Apply an action that only changes the state."""
+        change = pending.value if callable(pending.value) else self._changes[pending.action]
+        takes_value = not callable(pending.value) and protocol.VALUES[pending.action] is not Any
+        arguments = (pending.value,) if takes_value else ()
+
+        def compute() -> State:
+            state = change(self._state, *arguments)
+            _ = state.selection  # computed here instead of when it is first sent
+            return state
+
+        state = await self._in_thread(compute, self._limits.quick)
+        if pending.action == "clear":
+            self._memory.line, self._memory.min_reliability = "", 0.0
+        key = pending.action if pending.action in _SLIDERS else None
+        self._memory.history = self._memory.history.do(state, key=key)
+        self._show(pending.seq)
+
+    def _show(self, seq: int) -> None:
+        self._revision += 1
+        self._dirty.put(seq)
+
+    async def _in_thread(self, work: Callable[[], T], limiter: CapacityLimiter) -> T:
+        return await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
+
+    # Actions that only change the state.
+
+    def _set_reliability(self, state: State, value: float) -> State:
+        self._memory.min_reliability = value
+        return actions.set_min_reliability(state, value)
+
+    def _visible(self, state: State) -> State:
+        """Return the state with a color mode that shows the selection."""
+        return replace(state, color_mode="overlay") if state.color_mode == "rgb" else state
+
+    def _pick(self, state: State, value: protocol.Pick) -> State:
+        weights = self._run.weights(value.origin, value.direction)
+        return self._visible(actions.click(state, weights, value.mode))  # pyright: ignore[reportArgumentType]
+
+    def _select_object(self, state: State, value: protocol.ObjectAction) -> State:
+        return self._visible(actions.change_objects(state, self._object(value.id).mask, value.mode))
+
+    def _select_region(self, state: State, value: protocol.Region | protocol.Brush) -> State:
+        mask = region_mask(self._run, state, value)
+        return self._visible(actions.change_selection(state, mask, value.mode, "a region"))
+
+    def _object(self, number: int) -> ObjectRow:
+        if number not in self._objects:
+            raise InputError("This object is no longer listed; choose one of the list.")
+        return self._objects[number]
+
+    def _mask_of(self, ids: Sequence[int] | None) -> Bool[Tensor, " n"] | None:
+        if ids is None:
+            return None
+        return torch.stack([self._object(number).mask for number in ids or [0]]).any(dim=0)
+
+    # Slow requests.
+
+    async def _ask(self, pending: _Pending) -> None:
+        """Answer the prompts of the search box, with new negatives or another rule if these were sent."""
+        memory = self._memory
+        if pending.action == "ask":
+            memory.line = pending.value.line
+            memory.negatives = memory.negatives if pending.value.negatives is None else tuple(pending.value.negatives)
+        elif pending.action == "negatives":
+            memory.negatives = None if pending.value is None else tuple(pending.value)
+        else:
+            memory.rule = pending.value
+        if pending.action != "ask" and self._state.query is None:
+            return self._show(pending.seq)
+        return await self._ask_line(pending.seq)
+
+    async def _ask_similar(self, pending: _Pending) -> None:
+        """Ask for everything similar to a clicked Gaussian."""
+        memory = self._memory
+        pick = partial(self._run.weights, pending.value.origin, pending.value.direction)
+        gaussian = actions.pick_gaussian(self._state, await self._in_thread(pick, self._limits.quick))
+        names = {*memory.clicks, *self._run.stored()}
+        name = next(name for n in range(1, len(names) + 2) if (name := click_name(n)) not in names)
+        memory.clicks[name], memory.line = gaussian, name
+        await self._ask_line(pending.seq)
+
+    async def _ask_line(self, seq: int, **settings: Any) -> None:
+        memory, line = self._memory, self._memory.line
+        negatives = memory.negatives
+        options = {
+            "relevancy": memory.rule,
+            "negatives": negatives,
+            "min_reliability": memory.min_reliability,
+            **settings,
+        }
+
+        def compute() -> Callable[[State], State]:
+            known = self._run.known(memory.clicks)
+            prompts = encode_prompts(line, self._run.read, known)
+            rows, query = build_query(self._run.space.field, prompts, self._run.read, **options)
+            self._run.space.answer(query)  # cached for the state
+            return lambda state: self._visible(actions.ask(state, rows, query))
+
+        await self._start("Searching …", compute, seq)
+
+    async def _select_floaters(self, pending: _Pending) -> None:
+        def compute() -> Callable[[State], State]:
+            floaters = self._run.floaters
+            return lambda state: self._visible(actions.select_floaters(state, floaters))
+
+        await self._start("Finding likely floaters …", compute, pending.seq, actions.FLOATERS_HINT)
+
+    async def _start(
+        self, text: str, compute: Callable[[], Callable[[State], State]], seq: int, done: str = ""
+    ) -> None:
+        """Start a slow request; its result is a function that makes the new state of the current one."""
+        token = self._tokens.start(text)
+
+        async def work() -> None:
+            try:
+                change = await self._in_thread(compute, self._limits.slow)
+                if self._tokens.finish(token):
+                    self._append(_Pending("apply", change, seq))
+                    if done:
+                        await self._tell(done, "info", seq)
+            except Exception as error:
+                if self._tokens.finish(token):
+                    await self._tell(describe_error(error)[0], "error", seq)
+                    self._show(seq)
+
+        await self._send(type="busy", text=text, seq=seq)
+        self._group.start_soon(work)
+
+    async def _explain(self, pending: _Pending) -> None:
+        state, token = self._state, self._explaining.start("Finding supporting images …")
+        compute = partial(explanation_of, self._run, state)
+
+        async def work() -> None:
+            try:
+                result = await self._in_thread(compute, self._limits.slow)
+                if self._explaining.finish(token):
+                    await self._send(type="explanation", seq=pending.seq, **result)
+            except Exception as error:
+                if self._explaining.finish(token):
+                    await self._tell(describe_error(error)[0], "error", pending.seq)
+            await self._send(type="busy", text=self._tokens.busy or None, seq=pending.seq)
+
+        await self._send(type="busy", text=token.description, seq=pending.seq)
+        self._group.start_soon(work)
+
+    async def _export(self, pending: _Pending) -> None:
+        state, value = self._state, pending.value
+        row = None if value.object is None else self._object(value.object)
+        mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
+        if not bool(mask.any()):
+            raise InputError("Nothing is selected; there is nothing to export.")
+
+        async def work() -> None:
+            try:
+                compute = partial(self._run.export, state, mask, name, value.format)
+                file, content, text = await self._in_thread(compute, self._limits.slow)
+                address = self._limits.offer(file, content)
+                await self._send(type="download", name=file, url=address, text=text, seq=pending.seq)
+            except Exception as error:
+                await self._tell(describe_error(error)[0], "error", pending.seq)
+
+        self._group.start_soon(work)
+
+    async def _save(self, pending: _Pending) -> None:
+        if self._read_only:
+            raise InputError(
+                "This page may not store prompts in the run. Start the server without --read-only and, for pages of "
+                "other machines, open the address with the access token that it prints."
+            )
+        replaces = pending.value is not None and pending.value.replace
+        store = partial(self._run.save, self._state.query, replaces=replaces)
+        count = await self._in_thread(store, self._limits.slow)
+        await self._tell(f"The run stores {count} now.", "done", pending.seq)
+
+    async def _go_to(self, pending: _Pending) -> None:
+        """Move the camera to an object or a position: closer, and where nothing occludes it."""
+        value = pending.value
+        if value.id is None and value.position is None:
+            raise InputError("Name an object or a position to go to.")
+        spot = LookAtTarget(value.position or (0.0, 0.0, 0.0), _SPOT * self._run.frame[2])
+        target = spot if value.id is None else self._object(value.id)
+        find = partial(self._run.view_of, target, self._memory.view, self._state.drawn)
+        self._memory.view = await self._in_thread(find, self._limits.slow)
+        await self._send_camera(self._memory.view, pending.seq)
+
+    async def _send_camera(self, view: PageView, seq: int) -> None:
+        place = {"position": view.position, "look_at": view.look_at, "up": view.up, "fov": view.fov}
+        await self._send(type="camera", seq=seq, **place)
+
+    # What the page is told.
+
+    async def _greet(self, greeting: Greeting, token: str, seq: int) -> None:
+        """Bring back what was lost with the connection, or follow a link."""
+        memory = self._memory
+        fresh = memory.view is None and len(memory.history.states) == 1
+        link = None
+        try:
+            link = read_link(greeting.link) if greeting.link != memory.link else None
+        except InputError as error:
+            await self._tell(str(error), "error", seq)
+        memory.link = greeting.link
+        if link is not None:
+            memory.clicks |= {name: gaussian for name, gaussian in link.clicks.items() if is_click(name)}
+            memory.view = link.view if link.view is not None and link.view.is_valid else memory.view
+            if link.look in COLOR_MODES:
+                memory.history = memory.history.do(actions.set_color_mode(self._state, link.look))
+        stored = [] if greeting.webgl is None else list(await self._in_thread(self._run.stored, self._limits.slow))
+        if fresh and (link is None or not link.prompts) and len(stored) > 0:
+            memory.line = join_prompts(stored)
+            await self._tell("Saved prompts for this scene: press Ask", "info", seq)
+        await self._send(type="token", token=token, link=memory.link, read_only=self._read_only, seq=seq)
+        view = memory.view or await self._in_thread(lambda: self._run.first_view, self._limits.slow)
+        if view is not None:
+            await self._send(
+                type="camera", position=view.position, look_at=view.look_at, up=view.up, fov=view.fov, seq=seq
+            )
+        self._show(seq)
+        if link is not None and link.prompts:
+            memory.line, memory.min_reliability = link.prompts, link.min_reliability
+            await self._ask_line(seq, threshold=link.threshold)
+
+    async def _paint(self) -> None:
+        """Send colors and state after each change, and details after a rest."""
+        while True:
+            seq = await self._dirty.take()
+            try:
+                state, revision = self._state, self._revision
+                codes = await self._in_thread(partial(self._codes, state), self._limits.quick)
+                header = {"type": "codes", "revision": revision, "seq": seq, "palette": codes.palette}
+                await self._send_binary(header, codes.codes.tobytes())
+                await self._send_state(state, revision, seq)
+                await anyio.sleep(_REST)
+                if self._dirty.empty:
+                    await self._send_state(state, revision, seq, details=True)
+            except Exception as error:
+                await self._tell(describe_error(error)[0], "error", seq)
+
+    async def _send_state(self, state: State, revision: int, seq: int, *, details: bool = False) -> None:
+        memory, history = self._memory, self._memory.history
+        describe = partial(describe_state, state, self._run.rows, details=details)
+        content, objects = await self._in_thread(describe, self._limits.quick)
+        if details:
+            rows = range(self._next_object, self._next_object + len(objects))
+            self._next_object += len(objects)
+            self._objects.update(zip(rows, objects))
+            while len(self._objects) > 2 * _MAX_OBJECTS:
+                self._objects.popitem(last=False)
+            content["objects"] = [_object_json(state, number, row) for number, row in zip(rows, objects)]
+        content |= {
+            "line": memory.line, "rule": memory.rule, "negatives": memory.negatives, "step": history.index,
+            "history": [{"text": one.action or "Open"} for one in history.states], "busy": self._tokens.busy or None,
+        }  # fmt: skip
+        await self._send(type="state", revision=revision, seq=seq, **content)
+
+    def _codes(self, state: State) -> Codes:
+        return make_codes(state, self._run.rows, self._run.pca if state.color_mode == "pca" else None)
+
+    async def _hover_on(self) -> None:
+        while True:
+            pending = await self._slots["hover"].take()
+            try:
+                describe = partial(describe_hover, self._run, self._state, pending.value, tuple(self._objects.items()))
+                result = await self._in_thread(describe, self._limits.quick)
+            except Exception:  # a hover must never disturb
+                result = None
+            empty = dict.fromkeys(("label", "relevancy", "reliability", "object", "position", "distance"))
+            await self._send(type="hover", seq=pending.seq, **(result or empty))
+
+    async def _draw_stills(self) -> None:
+        while True:
+            pending = await self._slots["still"].take()
+            state, revision = self._state, self._revision
+            try:
+                view = self._memory.view or self._run.first_view
+                if view is None:
+                    raise InputError("The camera of the page is not known yet.")
+                camera = view.camera(pending.value.max_size)
+                draw = partial(self._still, state, camera, pending.value.background)
+                jpeg = await self._in_thread(draw, self._limits.slow)
+                await self._send_binary({"type": "still", "seq": pending.seq, "revision": revision}, jpeg)
+            except Exception as error:
+                await self._tell(describe_error(error)[0], "error", pending.seq)
+
+    def _still(self, state: State, camera: Camera, background: Sequence[float]) -> bytes:
+        return self._run.still(self._codes(state), camera, background)
+
+    async def _tell(self, text: str, kind: str, seq: int) -> None:
+        await self._send(type="message", text=without_paths(text), kind=kind, seq=seq)
+
+    async def _send(self, **message: Any) -> None:
+        async with self._sending:
+            await self._socket.send_text(msgspec.json.encode(message).decode())
+
+    async def _send_binary(self, header: dict[str, Any], payload: bytes) -> None:
+        head = msgspec.json.encode(header)
+        async with self._sending:
+            await self._socket.send_bytes(struct.pack("<I", len(head)) + head + payload)
+
+
+def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:
+    """Return the mask of the visible Gaussians whose centers lie in a region of a view.
+
+    Raises:
+        ValueError: the camera is not valid, or there are none.
+    """
+    camera, scene = value.camera.camera(), served.run.scene
+    pixels, inside = project(scene.gaussians.means, camera)
+    rows = np.flatnonzero(inside)
+    if isinstance(value, protocol.Brush):
+        hit = near_path(pixels[rows], np.array(value.points), value.radius)
+    else:
+        hit = inside_polygon(pixels[rows], np.array(value.polygon))
+    mask = served.space.empty_mask()
+    mask[torch.from_numpy(rows[hit])] = True
+    drawn = state.drawn & served.visible
+    mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
+    if not bool(mask.any()):
+        raise InputError("There are no visible Gaussians in this region.")
+    return mask
+
+
+def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[dict[str, Any], tuple[ObjectRow, ...]]:
+    """Return the content of the message `state`, and the listed objects.
+
+    Args:
+        rows: rows of the drawn Gaussians.
+        details: list objects and histograms, which takes longer.
+    """
+    selection, answer, query = state.selection, state.answer, state.query
+    content: dict[str, Any] = {
+        "prompts": _prompts_json(state),
+        "threshold": None if query is None else query.threshold,
+        "suggested": threshold_suggestion(state) if details else None,
+        "reliability": 0.0 if query is None else query.min_reliability,
+        "used_rule": None if query is None else query.rule,
+        "used_negatives": [] if query is None else list(query.negatives),
+        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap, "legend": legend(state),
+        "selected": int(selection.sum()),
+        "selected_visible": int((selection & state.drawn).cpu().numpy()[rows].sum()),
+        "hidden": int((~state.drawn).sum()), "total": len(state.space),
+        "layers": [{"name": x.name, "count": int(x.mask.sum()), "visible": x.visible} for x in state.layers],
+        "grow": state.grow_steps, "by_hand": not state.prompts_select, "warning": state.warning,
+        "details": details, "histogram": None, "objects": None, "more_objects": 0,
+    }  # fmt: skip
+    if not details:
+        return content, ()
+    if answer is not None and state.prompts_select:
+        colors = dict(zip(answer.texts, prompt_display_colors(state)))
+        content["histogram"] = [
+            {
+                "text": one.text, "color": colors[one.text], "warning": one.warning, "nearest": one.nearest_position,
+                "threshold": one.histogram.threshold, "suggested": one.histogram.suggested, **one.histogram.to_json(),
+            }
+            for one in diagnose_prompts(state, max_prompts=8)
+        ]  # fmt: skip
+    found = list_objects(state, max_objects=_MAX_OBJECTS)
+    content["more_objects"], content["in_smaller_parts"] = found.left_out, found.in_smaller_parts
+    return content, found.objects
+
+
+def _prompts_json(state: State) -> list[dict[str, Any]]:
+    """Return a row for each prompt, with its error or with the result for it."""
+    answer = state.answer
+    colors = prompt_display_colors(state)
+    rows = []
+    for prompt in state.prompts:
+        row: dict[str, Any] = dict.fromkeys(("color", "verdict", "relevancy", "threshold", "count"))
+        if answer is not None and prompt.error == "" and prompt.text in answer:
+            finding = Finding(answer, answer.texts.index(prompt.text))
+            row = {
+                "color": colors[finding.index], "verdict": finding.verdict, "threshold": answer.question.threshold,
+                "relevancy": None if finding.peak is None else min(1.0, finding.peak),
+                "count": int(finding.mask.sum()),
+            }  # fmt: skip
+        rows.append({"text": prompt.text, "error": prompt.error or None, **row})
+    return rows
+
+
+def _object_json(state: State, number: int, row: ObjectRow) -> dict[str, Any]:
+    means, answer = state.space.means[row.mask].double(), state.answer
+    ends = torch.quantile(means, means.new_tensor([0.01, 0.99]), dim=0).tolist()
+    relevancy = None
+    if answer is not None and state.prompts_select and row.text in answer:
+        relevancy = min(1.0, float(answer[row.text].relevancy[row.mask].max()))
+    return {
+        "id": number, "name": row.name, "text": row.text, "count": row.size, "center": row.center, "color": row.color,
+        "box": {"min": ends[0], "max": ends[1]}, "relevancy": relevancy, "reliability": row.reliability,
+        "evidence": row.evidence, "views": row.mean_views,
+    }  # fmt: skip
+
+
+def describe_hover(
+    served: ServedRun, state: State, value: protocol.Ray, objects: Sequence[tuple[int, ObjectRow]]
+) -> dict[str, Any] | None:
+    """Return what lies under the pointer: the nearest Gaussian with the largest weight; None if there is none."""
+    with suppress(InputError):
+        gaussian = actions.pick_gaussian(state, served.weights(value.origin, value.direction))
+        position, answer = state.space.means[gaussian].double().cpu(), state.answer
+        row = next(((number, one) for number, one in reversed(objects) if bool(one.mask[gaussian])), None)
+        label, relevancy = None, None
+        if answer is not None:
+            best = int(answer.relevancy[gaussian].argmax()) if state.shown is None else state.shown
+            relevancy = min(1.0, float(answer.relevancy[gaussian, best]))
+            label = answer.texts[best] if bool(answer.selected[gaussian, best]) else None
+        return {
+            "gaussian": gaussian, "label": label, "relevancy": relevancy,
+            "reliability": float(state.space.field.scalars.reliability[gaussian]),
+            "object": None if row is None else {"id": row[0], "name": row[1].name},
+            "position": position.tolist(), "selected": bool(state.selection[gaussian]),
+            "distance": float((position - torch.tensor(value.origin, dtype=torch.float64)).norm()),
+        }  # fmt: skip
+    return None
+
+
+def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
+    """Return the images that voted for the selection, and those that disagree most, as a message.
+
+    Raises:
+        ValueError: nothing is selected, or the votes are no longer known.
+    """
+    with served.reading:
+        votes = served.run.votes
+        why = votes.explain(state.selection.cpu(), refined=state.refined)
+        groups = {"support": why.views[:_MAX_IMAGES], "disagreement": why.most_different[:_MAX_IMAGES]}
+        images, problem = {}, None
+        try:
+            for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):
+                jpeg = to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE)
+                images[picture.vote.view] = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+        except (InputError, OSError) as error:
+            problem = without_paths(f"The images cannot be shown: {error}")
+
+    def entry(vote: ViewVote) -> dict[str, Any]:
+        facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
+        return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
+
+    smoothed = f"{why.copied / why.gaussians:.0%} was smoothed from neighbors"
+    facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
+    votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
+    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}

@@ -1,0 +1,76 @@
+"""Files of a selection, and storage of prompts in a run."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from pathlib import Path
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.scene import Scene
+from normlift_ns.errors import InputError
+from normlift_ns.exports import EXPORTERS, ExportJob, TrainedSplat, write_splat_ply
+from normlift_ns.io.atomic import safe_file_name
+from normlift_ns.query.question import Query, load_query, save_query
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.figures import write_masks
+from normlift_ns.session.prompts import merge_queries
+from normlift_ns.session.state import State
+
+
+def store_query(folder: Path | None, query: Query | None, *, replaces: bool = False) -> str:
+    """Store prompts in a run, in addition to those stored there or instead of them; return their number in words.
+
+    Raises:
+        ValueError: there is no query or no folder; as `merge_queries`.
+    """
+    if query is None or folder is None:
+        raise InputError("No query yet; there is nothing to save.")
+    merged = merge_queries(None if replaces else load_query(folder), query)
+    save_query(folder, merged)
+    return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"
+
+
+def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], name: str) -> tuple[str, bytes, int]:
+    """Return the name and content of a PLY file of Gaussians, and their number.
+
+    Raises:
+        ValueError: none of them is ever drawn.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{safe_file_name(name)}.ply"
+        rows = write_splat_ply(path, splat, state.space.field, state.answer, keep=mask)
+        return path.name, path.read_bytes(), len(rows)
+
+
+def selection_bytes(
+    scene: Scene, field: SemanticField, state: State, mask: Bool[Tensor, " n"], name: str, kind: str = "ply"
+) -> tuple[str, bytes]:
+    """Return the name and content of a file of Gaussians.
+
+    Args:
+        name: name of the selection.
+        kind: name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
+    Raises:
+        ValueError: none of the Gaussians is ever drawn, or there is no such exporter.
+    """
+    if not bool(mask.any()):
+        raise InputError("Nothing is selected; there is nothing to export.")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / safe_file_name(name)
+        if kind == "masks":
+            settings, buffer = RasterSettings.recorded(field.manifest), io.BytesIO()
+            with zipfile.ZipFile(buffer, "w") as archive:
+                for file in write_masks(scene, mask, path, settings=settings):
+                    archive.write(file, file.relative_to(path))
+            return f"{path.name}_masks.zip", buffer.getvalue()
+        exporter = EXPORTERS.load(kind)
+        if exporter.suffix == "":
+            raise InputError(f"The format {kind} is a folder of files; choose ply or masks.")
+        path = path.with_name(path.name + exporter.suffix)
+        exporter.write(ExportJob(scene, field, mask, state.answer), path)
+        return path.name, path.read_bytes()

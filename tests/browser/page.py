@@ -1,0 +1,178 @@
+"""A person before the page of ns-normlift-view."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from tests.browser.person import Person
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator
+
+_BARE = ".bare #stage > :not(#canvas, #still), .bare #toasts, .bare #tip { visibility: hidden; }"
+_CALM = """() => {
+  const {scene, revision} = page;
+  if (!scene) return !document.querySelector("#still").hidden && !page.stills.waiting;
+  const {splats, busy, waiting, coarse, plain, spark} = scene;
+  return splats && spark.activeSplats > 0 && !(busy || waiting || coarse || plain || spark.sorting) && revision > 0;
+}"""
+"""True once the scene is drawn as finely as it gets."""
+_WATCH = """() => {
+  const {scene, view} = page, {spark, renderer, splats} = scene, centers = [];
+  scene.scene.children.find((one) => one.numSplats).forEachSplat((i, center) => centers.push(...center.toArray()));
+  const canvas = document.createElement("canvas"), context = canvas.getContext("2d", {willReadFrequently: true});
+  const sort = spark.sortWorker.call.bind(spark.sortWorker);
+  let order = null;
+  spark.sortWorker.call = async (...task) => {
+    const result = await sort(...task);
+    order = result.ordering.slice(0, result.activeSplats);
+    return result;
+  };
+  spark.sortedDir.setScalar(0);  // sorts once more
+  window.frames45 = [];
+  const draw = renderer.render.bind(renderer);
+  renderer.render = (what, camera) => {
+    draw(what, camera);
+    if (what !== scene.scene || renderer.getRenderTarget() !== null) return;
+    [canvas.width, canvas.height] = [160, 100];
+    context.drawImage(renderer.domElement, 0, 0, 160, 100);
+    const pixels = context.getImageData(0, 0, 160, 100).data;
+    let covered = 0, unsorted = 0;
+    for (let i = 0; i < pixels.length; i += 4) covered += Math.abs(pixels[i] - pixels[i + 1]) + pixels[i] > 30 ? 1 : 0;
+    if (order) {
+      const forward = camera.getWorldDirection(camera.position.clone());
+      const depth = (i) => centers[3 * i] * forward.x + centers[3 * i + 1] * forward.y + centers[3 * i + 2] * forward.z;
+      const slack = 0.003 * page.run.radius;
+      for (let i = 1; i < order.length; i++) unsorted += depth(order[i]) > depth(order[i - 1]) + slack ? 1 : 0;
+    }
+    frames45.push({covered: covered / 16000, unsorted: order && unsorted / order.length, splats: spark.activeSplats});
+  };
+}"""
+"""Looks at every frame: the share of pixels that show the scene, and of neighbors in the wrong order."""
+
+
+class OnPage(Person):
+    """A browser tab with the page of ns-normlift-view."""
+
+    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1000, 640), **how: Any) -> None:
+        super().__init__(browser, address, size, **how)
+        self.page.add_style_tag(content=_BARE)
+        self.ready()
+
+    def prepare(self) -> None:
+        """Keeps what the browser complains about, and addresses of other servers."""
+        self.page.on(
+            "console", lambda line: self.problems.append(line.text) if "Content Security" in line.text else None
+        )
+        local = ("http://127.0.0.1", "ws://127.0.0.1", "blob:", "data:")
+        self.page.on("request", lambda one: None if one.url.startswith(local) else self.problems.append(one.url))
+
+    def ready(self) -> None:
+        """Waits until the scene is drawn."""
+        self.until(lambda: self.page.evaluate("window.page?.state?.details ?? false"), "a state")
+        self.calm()
+
+    def calm(self) -> None:
+        self.until(lambda: self.page.evaluate(_CALM), "the scene is drawn")
+
+    def state(self, name: str) -> Any:
+        return self.page.evaluate(f"page.state.{name}")
+
+    def selected(self) -> int:
+        return self.state("selected")
+
+    def press(self, name: str) -> None:
+        self.button(name).first.click()
+
+    def does(self, element: str) -> None:
+        """Presses a button by its id."""
+        self.page.locator(f"#{element}").click()
+
+    @property
+    def prompts(self) -> Locator:
+        return self.page.get_by_role("searchbox", name="Search the scene")
+
+    def ask(self, line: str, *, key: bool = True) -> None:
+        """Types prompts and presses Enter or Ask, and waits for the answer."""
+        before = self.page.evaluate("page.revision")
+        self.prompts.fill(line)
+        self.prompts.press("Enter") if key else self.press("Ask")
+        self.until(lambda: self.page.evaluate("page.revision") > before, f"an answer to {line!r}")
+
+    def chips(self) -> list[str]:
+        return self.page.locator("#answers .chip").all_inner_texts()
+
+    def changes(self, act: Callable[[], Any], what: str) -> int:
+        """Number of selected Gaussians after something that changes it."""
+        before = self.selected()
+        act()
+        return self.selects(lambda count: count != before, what)
+
+    def click(self, place: tuple[float, float], *, hold: str = "") -> None:
+        if hold:
+            self.page.keyboard.down(hold)
+        self.page.mouse.click(*place)
+        if hold:
+            self.page.keyboard.up(hold)
+
+    def trace(self, *places: tuple[float, float]) -> None:
+        """Drags the pointer along some places."""
+        self.page.mouse.move(*places[0])
+        self.page.mouse.down()
+        for place in places[1:]:
+            self.page.mouse.move(*place, steps=3)
+        self.page.mouse.up()
+
+    def shot(self) -> np.ndarray:
+        """RGB of the scene as it is now, without what lies over it."""
+        box = self.page.locator("#stage").bounding_box()
+        self.page.evaluate("document.body.classList.add('bare')")
+        shot = self.page.screenshot(clip=box, animations="disabled")  # type: ignore[arg-type]
+        self.page.evaluate("document.body.classList.remove('bare')")
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
+
+    def sees(self, true: Callable[[np.ndarray], Any], what: str) -> np.ndarray:
+        """RGB of the scene, once it is drawn and something holds of it."""
+        shots: list[np.ndarray] = []
+
+        def holds() -> bool:
+            self.calm()
+            shots.append(self.shot())
+            return bool(true(shots[-1]))
+
+        self.until(holds, what)
+        return shots[-1]
+
+    def save(self, element: str, folder: Path) -> Path:
+        """The file that a button downloads."""
+        with self.page.expect_download() as waiting:
+            self.does(element)
+        waiting.value.save_as(folder / waiting.value.suggested_filename)
+        return folder / waiting.value.suggested_filename
+
+    def toast(self) -> tuple[str, dict[str, float]]:
+        """Text and box of the latest toast."""
+        toast = self.page.locator(".toast").last
+        toast.wait_for()
+        return toast.inner_text(), toast.bounding_box() or {}  # type: ignore[return-value]
+
+    def watch(self) -> None:
+        """Looks at every frame from now on."""
+        self.calm()
+        self.page.evaluate(_WATCH)
+        self.page.evaluate("page.scene.invalidate('order')")
+        self.until(lambda: self.page.evaluate("frames45.some((frame) => frame.unsorted !== null)"), "sorted again")
+        self.page.evaluate("frames45.length = 0")
+
+    def frames(self) -> list[dict[str, float]]:
+        return self.page.evaluate("frames45")
+
+    def measured(self, name: str) -> list[float]:
+        """Milliseconds from a press to "colors", to a "coarse" picture or to the full "picture"."""
+        return self.page.evaluate(f"performance.getEntriesByName('{name}', 'measure').map((one) => one.duration)")

@@ -1,0 +1,309 @@
+"""A person before the page of ns-normlift-view: asks, selects, hides, explains, exports, and comes back."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image
+from plyfile import PlyData
+
+from normlift_ns.query.question import load_query
+from tests.browser.page import OnPage
+from tests.browser.person import RED, YELLOW, changed, coloured, hue_mask, iou, middle, needs_chromium
+from tests.browser.server import Server
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytestmark = [pytest.mark.slow, needs_chromium]
+
+
+def things(page: OnPage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The picture of the room, and where its red and its yellow thing are."""
+    photo = page.sees(lambda seen: min(hue_mask(seen, *rule).sum() for rule in (RED, YELLOW)) > 500, "the room")
+    return photo, hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
+
+
+def covers(seen: np.ndarray, where: np.ndarray) -> bool:
+    """Whether colors lie there, and hardly elsewhere."""
+    return bool(coloured(seen)[where].mean() > 0.8 and coloured(seen)[~where].mean() < 0.03)
+
+
+def test_a_person_asks(page: OnPage) -> None:
+    photo, red, yellow = things(page)
+    assert "normlift" in page.page.title() and page.page.locator("#name").inner_text() in page.page.title()
+    assert page.page.locator("#examples button").count() >= 2
+    assert page.prompts.input_value() == "red, yellow"  # those that the run stores
+
+    page.ask("red, zebra; yellow")
+    both = page.selects(lambda count: count > 0, "an answer")
+    chips = page.chips()
+    assert chips[0].startswith("red") and "not understood" in chips[1] and chips[2].startswith("yellow")
+    assert all(0 < float(re.findall(r"\d\.\d\d", chips[i])[0]) <= 1 for i in (0, 2))
+    seen = page.sees(lambda seen: covers(seen, red | yellow), "an overlay of both")
+    swatches = page.page.locator(".swatch").evaluate_all(
+        "all => all.map((one) => getComputedStyle(one).backgroundColor)"
+    )
+    for swatch, where in zip(swatches, (red, yellow)):  # one scheme of colors
+        rgb = np.array(re.findall(r"\d+", swatch)[:3], dtype=float)
+        drawn = np.median(seen[where], axis=0)
+        assert np.corrcoef(rgb, drawn)[0, 1] > 0.9
+
+    page.page.locator(".chip", has_text="yellow").click()
+    page.sees(lambda seen: covers(seen, yellow), "one answer alone")
+    page.page.locator(".chip", has_text="yellow").click()
+    page.until(lambda: page.page.locator(".histogram").count() == 2, "two histograms")
+    fewer = page.changes(lambda: page.page.locator("#threshold").press("End"), "a higher threshold")
+    assert fewer < both
+    page.page.keyboard.press("Control+z")
+    page.selects(lambda count: count == both, "undone")
+
+    page.does("mode-heat")
+    heat = page.sees(lambda seen: coloured(seen).mean() > 0.5, "a heat map")
+    assert page.page.locator("#mode-heat").get_attribute("aria-checked") == "true"
+    assert page.page.locator("#legend").inner_text().startswith("relevancy")
+    page.page.locator("#canvas").focus()
+    page.page.keyboard.press("4")
+    assert changed(page.sees(lambda seen: changed(seen, heat) > 10, "RGB"), photo) < 3
+
+    page.ask("glorp")
+    page.until(lambda: page.page.locator("#answers.stale").count() == 1, "the old answer is dimmed")
+    assert "glorp" in page.toast()[0]
+    page.does("do-clear")
+    page.until(lambda: page.prompts.input_value() == "", "an empty box")
+    page.sees(lambda seen: changed(seen, photo) < 3, "the colors of the scene")
+
+
+def test_a_person_selects_by_hand(page: OnPage) -> None:
+    _, red, yellow = things(page)
+    page.ask("red, yellow")
+    both = page.selects(lambda count: count > 0, "an answer")
+    ball = page.changes(lambda: page.click(middle(red)), "the ball")
+    assert 0 < ball < both and page.chips() == ["red" + page.chips()[0][3:], *page.chips()[1:]]
+    assert "Selected by hand" in page.chips()[-1] and page.page.locator("#answer").is_hidden()
+    page.sees(lambda seen: covers(seen, red), "the ball is drawn")
+    added = page.changes(lambda: page.click(middle(yellow), hold="Shift"), "added at the first click")
+    assert added > ball
+    page.sees(lambda seen: covers(seen, red | yellow), "both")
+    assert page.changes(lambda: page.click(middle(yellow), hold="Control"), "removed") == ball
+
+    grown = page.changes(lambda: page.does("do-grow"), "grown")
+    assert grown > ball and page.changes(lambda: page.does("do-shrink"), "shrunk") == ball
+    total = page.state("total")
+    assert page.changes(lambda: page.does("do-invert"), "inverted") == total - ball
+    for key, count in (("Control+z", ball), ("Control+Shift+z", total - ball), ("Control+z", ball)):
+        page.page.keyboard.press(key)
+        page.selects(lambda found, count=count: found == count, key)
+
+    page.page.locator("#fold-history summary").click()
+    steps = page.page.locator("#history button").count()
+    assert steps >= 6
+    page.page.locator("#history button").nth(1).click()
+    page.selects(lambda count: count == both, "a step of the history")
+    assert page.page.locator("#history button").count() == steps
+
+    rows, columns = np.nonzero(yellow)
+    corners = [(columns.min() - 3.0, rows.min() - 3.0), (columns.max() + 3.0, rows.max() + 3.0)]
+    page.page.locator("#canvas").focus()
+    page.page.keyboard.press("r")
+    assert page.page.locator("#tool-rectangle").get_attribute("aria-checked") == "true"
+    inside = page.changes(lambda: page.trace(*corners), "a rectangle")
+    assert 0 < inside < total / 2
+    page.does("tool-brush")
+    x, y = middle(red)
+    painted = page.changes(lambda: page.trace((x - 8, y), (x + 8, y)), "a brush")
+    page.does("tool-lasso")
+    around = [(x - 80, y - 25), (x + 80, y - 25), (x + 80, y + 90), (x - 80, y + 90)]
+    assert page.changes(lambda: page.trace(*around), "a lasso") != painted
+    page.page.keyboard.press("Escape")
+    assert page.page.locator("#tool-select").get_attribute("aria-checked") == "true"
+
+    ball = page.changes(lambda: page.click(middle(red)), "the ball")
+    page.does("do-layer")
+    page.until(lambda: page.page.locator("#layers li").count() == 1, "a layer")
+    page.does("do-hide")
+    page.sees(lambda seen: hue_mask(seen, *RED).sum() < 0.1 * red.sum(), "hidden")
+    page.until(lambda: page.state("hidden") == ball, "so many")
+    page.does("do-show")
+    page.until(lambda: page.state("hidden") == 0, "shown")
+    page.click(middle(yellow))
+    page.does("do-isolate")
+    page.until(lambda: page.state("hidden") > total / 2, "isolated")
+    page.sees(lambda seen: hue_mask(seen, *RED).sum() < 0.1 * red.sum(), "the ball is not there")
+    page.does("do-show")
+    page.page.locator("#layers .main").click()
+    page.selects(lambda count: count == ball, "the layer")
+
+
+def test_a_person_looks_around_explains_and_exports(page: OnPage, own: Server, tmp_path: Path) -> None:
+    _, red, yellow = things(page)
+    page.ask("red")
+    some = page.selects(lambda count: count > 0, "an answer")
+    page.until(lambda: page.page.locator("#objects button").count() > 1, "objects")
+
+    def distance() -> float:
+        return page.page.evaluate("page.view.camera.position.distanceTo(page.view.controls.target)")
+
+    far = distance()
+    page.page.locator("#objects button[aria-label^='Go to']").first.click()
+    page.until(lambda: distance() < 0.9 * far, "closer")
+    near = page.sees(lambda seen: coloured(seen).mean() > red.mean(), "larger")
+    page.page.locator("#canvas").focus()
+    page.page.keyboard.press("ArrowLeft")
+    page.sees(lambda seen: changed(seen, near) > 1, "turned")
+    page.page.locator("#fold-cameras summary").click()
+    page.page.locator("#cameras button").nth(2).click()
+    page.until(lambda: page.page.evaluate("page.view.camera.fov") != 55, "a training camera")
+    page.does("do-home")
+
+    page.does("do-why")
+    page.until(lambda: page.page.locator("#why img").count() >= 3, "images")
+    page.until(
+        lambda: page.page.evaluate("[...document.querySelectorAll('#why img')].every((one) => one.naturalWidth)"),
+        "drawn",
+    )
+    assert re.search(r"Based on about \d+ images", page.page.locator("#why").inner_text())
+    assert page.page.locator("#stage").bounding_box()["height"] > 200  # type: ignore[index]  # beside the scene
+    page.page.keyboard.press("Escape")
+    page.until(lambda: page.page.locator("#why").is_hidden(), "closed")
+
+    vertices = PlyData.read(page.save("save-ply", tmp_path), mmap=False)["vertex"]
+    assert 0 < vertices.count <= some
+    text, box = page.toast()
+    button = page.page.locator("#save-ply").bounding_box()
+    assert "Downloaded" in text and button is not None and abs(box["y"] - button["y"]) < 150  # near what was pressed
+    picture = Image.open(page.save("do-screenshot", tmp_path))
+    assert picture.format == "PNG" and picture.width >= 600
+
+    page.sees(lambda seen: covers(seen, red), "the start view")
+    page.does("tool-measure")
+    page.click(middle(red))
+    page.until(lambda: page.page.locator("#overlay circle").count() == 1, "one end")
+    page.click(middle(yellow))
+    page.says(r"Distance: \d")
+    page.page.keyboard.press("Escape")
+    page.page.mouse.move(*middle(red))
+    page.page.mouse.move(middle(red)[0] + 1, middle(red)[1])
+    page.until(lambda: re.search(r"red\s+relevancy \d\.\d\d · R \d\.\d\d", page.text()), "hover")
+
+    page.page.locator("#do-hide").hover()
+    page.until(lambda: page.page.locator("#tip").is_visible(), "a tooltip")
+    assert re.search(r"Hide the selected Gaussians\.\s*H", page.page.locator("#tip").inner_text())
+    page.page.keyboard.press("?")
+    assert page.page.locator("#help kbd").count() > 20
+    page.page.keyboard.press("Escape")
+    page.page.locator("#fold-advanced summary").click()
+    page.ask("red, yellow, purple")
+    page.does("do-save")
+    page.until(lambda: len((load_query(own.config.parent / "normlift") or page).texts) == 3, "stored")  # type: ignore[union-attr]
+
+
+def test_pages_are_their_own_and_outlive_the_server(own: Server, browser: Browser) -> None:
+    one, two = OnPage(browser, own.address), OnPage(browser, own.address)
+    _, red, _ = things(one)
+    one.ask("red")
+    two.ask("yellow")
+    count = one.selects(lambda count: count > 0, "one asks")
+    two.selects(lambda other: other not in (0, count), "two asks something else")
+    two.leave()
+    one.does("do-hide")
+    one.until(lambda: one.state("hidden") == count, "hidden")
+    one.page.reload()
+    one.page.add_style_tag(content="")
+    one.ready()
+    assert one.selected() == one.state("hidden") == count and one.prompts.input_value() == "red"
+    one.page.keyboard.press("Control+z")
+    one.until(lambda: one.state("hidden") == 0, "history comes back too")
+
+    one.does("do-link")
+    one.until(lambda: "?q=" in one.page.url, "a link")
+    link = one.page.url
+    one.ask("yellow")
+    other = one.selects(lambda found: found not in (0, count), "asks again")
+    one.page.wait_for_timeout(1500)  # until the page knows what to come back to
+    own.stop()
+    one.says("Connection lost")
+    own.start("--read-only", "True")
+    one.until(lambda: one.page.locator("#offline").is_hidden(), "back")
+    one.selects(lambda found: found == other, "with the last question")
+    three = OnPage(browser, link)
+    three.selects(lambda found: found == count, "the link asks its question")
+    three.sees(lambda seen: covers(seen, red), "from its camera")
+    assert three.page.locator("#do-save").count() == 0
+    three.leave()
+    one.leave()
+
+
+@pytest.mark.parametrize("size", [(390, 760), (1300, 800)])
+def test_everything_has_a_name_and_fits(own: Server, browser: Browser, size: tuple[int, int]) -> None:
+    page = OnPage(browser, own.address, size)
+    page.ask("red, sky blue")
+    page.until(lambda: page.page.locator(".histogram").count() == 2, "histograms")
+    assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert page.page.evaluate("document.querySelector('#panel').scrollWidth") <= size[0]
+    stage, panel = (page.page.locator(name).bounding_box() for name in ("#stage", "#panel"))
+    assert stage is not None and panel is not None
+    if size[0] < 720:  # the scene above the panel
+        assert stage["y"] + stage["height"] <= panel["y"] + 1 and stage["height"] > 300
+    nameless = """[...document.querySelectorAll("button, input, select, [role=slider]")].filter((one) =>
+      one.checkVisibility() && !(one.textContent.trim() || one.getAttribute("aria-label") || one.labels?.length))"""
+    assert page.page.evaluate(f"{nameless}.map((one) => one.outerHTML)") == []
+    seen = set()
+    for _ in range(60):
+        page.page.keyboard.press("Tab")
+        seen.add(page.page.evaluate("document.activeElement.id"))
+    assert {"prompts", "ask", "do-hide", "threshold", "mode-heat", "tool-select"} <= seen
+    assert page.page.locator("#stage").bounding_box() == stage  # nothing shifts
+    page.leave()
+
+
+def test_a_browser_without_webgl_gets_stills(page: OnPage, own: Server, browser: Browser) -> None:
+    _, *drawn = things(page)
+    blind = OnPage(browser, own.address, webgl=False)
+
+    def as_drawn(seen: np.ndarray) -> bool:
+        return all(iou(mask, hue_mask(seen, *rule)) > 0.8 for mask, rule in zip(drawn, (RED, YELLOW)))
+
+    blind.sees(as_drawn, "what the browser draws")
+    blind.ask("red")
+    blind.sees(lambda seen: covers(seen, drawn[0]), "an overlay")
+    blind.click(middle(drawn[1]))
+    before = blind.sees(lambda seen: covers(seen, drawn[1]), "the other object")
+    blind.trace((300, 300), (380, 320))
+    blind.sees(lambda seen: changed(seen, before) > 2, "the camera has turned")
+    blind.leave()
+
+
+def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
+    """Over changes of colors, thresholds and visibility, with a sorter that takes half a second longer."""
+    things(page)
+    page.watch()
+    page.page.evaluate("page.scene.spark.sortDelay = 500")
+    geometry = page.page.evaluate(
+        "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"
+    )
+    page.ask("red, yellow")
+    revision = page.page.evaluate("page.revision")
+    modes = ("heat", "prompts", "rgb", "reliability", "pca", "overlay")
+    names = "hide show invert hide show undo undo redo grow shrink isolate show theme theme"
+    steps = [*(f"mode-{mode}" for mode in modes), *(f"do-{name}" for name in names.split()), "mode-heat", "mode-rgb"]
+    for step in steps:
+        page.does(step)
+        page.page.wait_for_timeout(150)
+    page.until(lambda: page.page.evaluate("page.revision") >= revision + len(steps) - 4, "changes")
+    page.calm()
+    frames = page.frames()
+    assert len(frames) > 10
+    assert min(frame["splats"] for frame in frames) == max(frame["splats"] for frame in frames)
+    assert max(frame["unsorted"] for frame in frames) < 0.002
+    assert (
+        page.page.evaluate(
+            "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"
+        )
+        == geometry
+    )
+    assert min(page.measured("colors")) <= 150

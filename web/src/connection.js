@@ -1,0 +1,77 @@
+/**
+ * Connection to the server's session of this page.
+ *
+ * It comes back by itself, with the last question. Dispatches `status` with `online`, and an event per type of message.
+ */
+
+/** @typedef {{type: string, seq?: number, [name: string]: any}} Message */
+
+const DELAYS = [300, 600, 1000, 2000, 4000];
+
+/** @param {ArrayBuffer} frame @returns {{header: Message, payload: Uint8Array}} */
+export function parseFrame(frame) {
+  const size = new DataView(frame).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(frame, 4, size)));
+  return { header, payload: new Uint8Array(frame, 4 + size) };
+}
+
+export class Connection extends EventTarget {
+  /** @param {string} run Id of the run. @param {() => object} greeting Further fields of the first action. */
+  constructor(run, greeting) {
+    super();
+    this.run = run;
+    this.greeting = greeting;
+    this.seq = 0;
+    this.attempts = 0;
+    this.online = false;
+    this.key = `normlift:${run}`;
+    this.open();
+  }
+
+  /** @returns {Record<string, string>} What this tab knows of its session, also after a reload. */
+  get memory() {
+    return JSON.parse(sessionStorage.getItem(this.key) ?? "{}");
+  }
+
+  /** @param {Record<string, string>} facts */
+  remember(facts) {
+    sessionStorage.setItem(this.key, JSON.stringify({ ...this.memory, ...facts }));
+  }
+
+  open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.socket = new WebSocket(`${scheme}://${location.host}/api/runs/${encodeURIComponent(this.run)}/session`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => {
+      this.attempts = 0;
+      this.send("greet", this.greeting());
+      this.report(true);
+    };
+    this.socket.onmessage = ({ data }) => this.receive(data);
+    this.socket.onclose = () => {
+      this.report(false);
+      const delay = DELAYS[Math.min(this.attempts++, DELAYS.length - 1)];
+      setTimeout(() => this.open(), delay);
+    };
+  }
+
+  /** @param {boolean} online */
+  report(online) {
+    this.online = online;
+    this.dispatchEvent(Object.assign(new Event("status"), { online }));
+  }
+
+  /** @param {string | ArrayBuffer} data */
+  receive(data) {
+    const { header, payload } = typeof data === "string" ? { header: JSON.parse(data), payload: null } : parseFrame(data);
+    this.dispatchEvent(Object.assign(new Event(header.type), { message: header, payload }));
+  }
+
+  /** @param {string} action @param {any} [value] @returns {number} Number that answers carry; -1 without connection. */
+  send(action, value = null) {
+    if (this.socket?.readyState !== WebSocket.OPEN) return -1;
+    this.seq++;
+    this.socket.send(JSON.stringify({ action, value, seq: this.seq }));
+    return this.seq;
+  }
+}

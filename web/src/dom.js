@@ -1,0 +1,65 @@
+/** Small helpers for elements. */
+
+/**
+ * @param {string} name Tag, with classes after dots.
+ * @param {Record<string, any>} [attributes] Functions become listeners, null and false are left out.
+ * @param {...(Node | string | null | undefined | false)} children
+ * @returns {any}
+ */
+export function h(name, attributes = {}, ...children) {
+  const [tag, ...classes] = name.split(".");
+  const element = document.createElement(tag);
+  if (classes.length > 0) element.className = classes.join(" ");
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key === "style") element.style.cssText = value;
+    else element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+/** @param {string} id @returns {any} */
+export const $ = (id) => document.getElementById(id);
+
+/** @param {number} count @returns {string} */
+export const grouped = (count) => count.toLocaleString("en-US");
+
+/** @param {number} value @param {number} [digits] */
+export const fixed = (value, digits = 2) => (Number.isFinite(value) ? value.toFixed(digits) : "–");
+
+/** @param {number[]} rgb Values in 0..1. */
+export const cssColor = (rgb) => `rgb(${rgb.map((x) => Math.round(255 * x)).join(" ")})`;
+
+/** @param {Element} parent @param {Node[]} children Replaces only what differs, so that focus stays. */
+export function fill(parent, children) {
+  const fresh = h("div", {}, ...children);
+  if (fresh.innerHTML === parent.innerHTML && fresh.childNodes.length === parent.childNodes.length) return;
+  const focused = parent.contains(document.activeElement) ? document.activeElement?.getAttribute("data-key") : null;
+  parent.replaceChildren(...fresh.childNodes);
+  if (focused) /** @type {HTMLElement | null} */ (parent.querySelector(`[data-key="${CSS.escape(focused)}"]`))?.focus();
+}
+
+/** @param {Blob} blob @param {string} name */
+export function saveBlob(blob, name) {
+  const url = URL.createObjectURL(blob);
+  h("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 10000);
+}
+
+/** @param {(...values: any[]) => void} call @param {number} wait Milliseconds. @returns {(...values: any[]) => void} At most one call per wait, the last one always. */
+export function throttled(call, wait) {
+  let timer = 0;
+  let last = 0;
+  return (...values) => {
+    clearTimeout(timer);
+    const left = last + wait - performance.now();
+    const run = () => {
+      last = performance.now();
+      call(...values);
+    };
+    if (left <= 0) run();
+    else timer = setTimeout(run, left);
+  };
+}

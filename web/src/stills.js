@@ -1,0 +1,67 @@
+/** Pictures that the server draws: for browsers without WebGL 2, and while a slow one draws. */
+import { $ } from "./dom.js";
+
+const COARSE = 480;
+const FINE = 1280;
+const REST = 350;
+
+export class Stills {
+  /**
+   * @param {import("./view.js").View3D} view
+   * @param {(value: any) => number} send Asks for a picture.
+   * @param {() => void} place Tells the server the camera.
+   */
+  constructor(view, send, place) {
+    this.view = view;
+    this.send = send;
+    this.place = place;
+    this.background = [0, 0, 0];
+    this.waiting = false;
+    this.again = false;
+    this.timer = 0;
+    this.url = "";
+  }
+
+  /** @param {string} css Hexadecimal color. */
+  setBackground(css) {
+    const hex = css.slice(1).replace(/^(.)(.)(.)$/, "$1$1$2$2$3$3");
+    this.background = [0, 2, 4].map((i) => Number.parseInt(hex.slice(i, i + 2), 16) / 255);
+  }
+
+  /** @param {boolean} moving True for a small picture, which a large one follows. */
+  request(moving) {
+    clearTimeout(this.timer);
+    if (moving) this.timer = setTimeout(() => this.request(false), REST);
+    if (this.waiting && moving) return;
+    this.waiting = true;
+    this.place();
+    const most = Math.min(2048, Math.round(Math.max(this.view.width, this.view.height)));
+    this.send({ max_size: Math.max(16, Math.min(most, moving ? COARSE : FINE)), background: this.background });
+  }
+
+  /** @param {Uint8Array} bytes */
+  show(bytes) {
+    this.waiting = false;
+    this.last = new Blob([/** @type {any} */ (bytes)], { type: bytes[0] === 0x89 ? "image/png" : "image/jpeg" });
+    const old = this.url;
+    this.url = URL.createObjectURL(this.last);
+    const image = $("still");
+    image.onload = () => {
+      image.hidden = false;
+      $("loading").hidden = true;
+      if (old) URL.revokeObjectURL(old);
+    };
+    image.src = this.url;
+  }
+
+  hide() {
+    clearTimeout(this.timer);
+    this.waiting = false;
+    $("still").hidden = true;
+  }
+
+  /** @returns {Promise<Blob | null>} */
+  async blob() {
+    return this.last ?? null;
+  }
+}
