@@ -229,8 +229,8 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
     """Return the regions of "auto" for the encoder, the preferred first, whether their weights are here or not.
 
-    On a CPU, SAM is left out, and so are crops of edges: twelve crops through CLIP take as long as all patches
-    (`python -m research.edges`).
+    On a CPU, SAM is left out, and so are crops of edges: twelve crops through CLIP take longer than all patches of an
+    image (`python -m research.edges --clip`).
     """
     kind, on_gpu = encoder_kind(options.encoder), device.startswith("cuda")
     if not kind.learned:
