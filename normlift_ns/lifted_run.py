@@ -36,7 +36,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder
-from normlift_ns.errors import InputError, MissingImageError
+from normlift_ns.errors import InputError, MissingImageError, truncate_text
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -394,6 +394,13 @@ class LiftedRun:
             check_number("meters_per_unit", meters_per_unit)
         words = own_words(self.field) if vocabulary is None else tuple(vocabulary)
         check_prompt_list("vocabulary", words)
+        kind = find_encoder_kind(encoder_name(self.field))
+        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
+        if len(unknown) > 0:
+            raise InputError(
+                f"the encoder of the run does not know {len(unknown)} of the {len(words)} words of the vocabulary; "
+                f"leave them out: {truncate_text(', '.join(unknown), 400)}"
+            )
         (evidence, features), norm = self.votes.table, self.field.scalars.norm
         spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
         means = self.scene.gaussians.means

@@ -102,6 +102,9 @@ def test_command_writes_a_list_and_a_picture(
         assert image.size == (160, 120)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     assert "exists" in said(capsys)
+    words.write_text("fork\nred\nknife\n", encoding="utf8")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", True) == 1
+    assert "2 of the 3 words" in (message := said(capsys)) and "fork, knife" in message
 
 
 @pytest.mark.parametrize(
