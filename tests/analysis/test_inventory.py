@@ -68,8 +68,10 @@ def test_a_name_must_stand_out_from_those_that_are_best_by_chance() -> None:
     words, scene = (torch.nn.functional.normalize(torch.randn(n, 64, generator=generator), dim=1) for n in (400, 500))
     scene = torch.nn.functional.normalize(scene + words[7], dim=1)  # a word that is near to everything
     things = torch.stack([scene[:9].mean(0), words[3] + 0.5 * words[7], scene[0]]).double()
-    assert best_words(things, scene, words, by_chance=0.25) == [None, 3, None]
-    assert best_words(things, scene, words, by_chance=float("inf"))[:2] == [7, 3]
+    assert best_words(things, scene, words, by_chance=0.25, count=400) == [None, 3, None]
+    assert best_words(things, scene, words, by_chance=float("inf"), count=400)[:2] == [7, 3]
+    assert best_words(things, scene, words, by_chance=0.25, count=9) == [None, 3, None]  # the others only compared with
+    assert best_words(things, scene, words, by_chance=0.25, count=3) == [None] * 3
 
 
 @pytest.fixture(scope="module")

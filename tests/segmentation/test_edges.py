@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import label
 
 from normlift_ns.cli.preflight import check_source_options
-from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.package_files import EDGES
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.edges import (
@@ -140,7 +140,9 @@ def test_regions_of_another_algorithm_are_not_reused(monkeypatch, tmp_path):
     kept = CachedRegions(source, tmp_path)
     labels = kept.labels(image, "a.png")
     digest = sha256(labels.numpy().tobytes()).hexdigest()[:16]
-    assert (ALGORITHM, digest) == (2, "5c1926ec108e096b"), "other regions need another number, which is part of the cache's key"
+    assert (ALGORITHM, digest) == (2, "5c1926ec108e096b"), (
+        "other regions need another number, which is part of the cache's key"
+    )
     path = kept.path(image, "a.png")
     assert path.exists()
     monkeypatch.setattr("normlift_ns.segmentation.edges.ALGORITHM", ALGORITHM + 1)
