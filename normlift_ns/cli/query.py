@@ -455,10 +455,12 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
-    """Print the table of an answer, and a note for each prompt that is not found."""
+    """Print the table of an answer, and a note for each prompt that is not found, or of which only words count."""
     rule = f"{question.rule} > {question.threshold:.4g}"
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
+        if row["read_as"] is not None:
+            common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the other words.')
         if row["verdict"] in ("weak match", "probably not here"):
             top = row["histogram"]["top"]
             position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
