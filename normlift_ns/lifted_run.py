@@ -36,7 +36,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.null_words import null_words
 from normlift_ns.encoders.registry import find_encoder_kind
-from normlift_ns.encoders.text_files import LazyTextEncoder
+from normlift_ns.encoders.text_files import LazyTextEncoder, check_template
 from normlift_ns.errors import InputError, MissingImageError, truncate_text
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
@@ -588,6 +588,8 @@ def open_run(
     True
     """
     vectors = None if text_embeddings is None else check_path("text_embeddings", text_embeddings)
+    if prompt_template is not None:
+        check_template(prompt_template)
     device = choose_device(device)
     folder, scene, stored = open_stored_run(load_config, data)
     return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=prompt_template), device)
