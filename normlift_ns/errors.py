@@ -110,9 +110,9 @@ def _user_message(error: BaseException) -> str | None:
         named = error.filename is not None and error.strerror is not None
         return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
-        return (
-            str(error) if isinstance(error, MemoryError) else ""
-        ) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale"
+        own = str(error) if type(error) is MemoryError else ""
+        advice = "close other programs, or lift fewer or smaller views: --max-views, --lift-downscale"
+        return own or f"the memory is full; {advice}"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
     if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):

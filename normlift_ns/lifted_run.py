@@ -34,9 +34,10 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
+from normlift_ns.encoders.null_words import null_words
 from normlift_ns.encoders.registry import find_encoder_kind
-from normlift_ns.encoders.text_files import LazyTextEncoder
-from normlift_ns.errors import InputError, MissingImageError
+from normlift_ns.encoders.text_files import LazyTextEncoder, check_template
+from normlift_ns.errors import InputError, MissingImageError, truncate_text
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -62,7 +63,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
 
 _MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
-"""Of a vocabulary of at least 100 words, so many objects of an inventory may have a wrong name by chance; the scene is
+"""Compared with at least 100 words, so many objects of an inventory may have a wrong name by chance; the scene is
 represented by about 5,000 Gaussians."""
 
 
@@ -380,8 +381,8 @@ class LiftedRun:
         """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
 
         An object has a name only if the verdict on the best word of the vocabulary is "found" and the word selects more
-        than half of the object; else it is called "object 3". From 100 words, the word must also stand out from those
-        that would be best by chance, except for colors.
+        than half of the object; else it is called "object 3". The word must also stand out, from the 200 unrelated
+        words of the encoder or from at least 100 of the vocabulary, by more than chance would allow. Colors need not.
 
         Args:
             vocabulary: words to name objects by. If None, use those of the encoder: the 1,000 classes of imagenet, the
@@ -398,8 +399,15 @@ class LiftedRun:
         """
         if meters_per_unit is not None:
             check_number("meters_per_unit", meters_per_unit)
-        words = own_words(self.field) if vocabulary is None else tuple(vocabulary)
+        words = own_words(self.field) if vocabulary is None else tuple(dict.fromkeys(vocabulary))
         check_prompt_list("vocabulary", words)
+        kind = find_encoder_kind(encoder_name(self.field))
+        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
+        if len(unknown) > 0:
+            raise InputError(
+                f"the encoder of the run does not know {len(unknown)} of the {len(words)} words of the vocabulary; "
+                f"leave them out: {truncate_text(', '.join(unknown), 400)}"
+            )
         (evidence, features), norm = self.votes.table, self.field.scalars.norm
         spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
         means = self.scene.gaussians.means
@@ -420,10 +428,12 @@ class LiftedRun:
         if len(words) == 0 or len(names) == 0:
             return tuple(names)
         kind = find_encoder_kind(encoder_name(self.field))
-        absolute = len(words) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
+        others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
+        compared = tuple(dict.fromkeys((*words, *others)))
+        absolute = len(compared) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
         sample = self.field.directions(torch.arange(0, len(self.field), max(1, len(self.field) // _SAMPLE)))
-        vectors = torch.from_numpy(self.texts.rows(words))
-        best = best_words(directions, sample, vectors, by_chance=float("inf") if absolute else _FALSE_NAMES)
+        vectors, limit = torch.from_numpy(self.texts.rows(compared)), float("inf") if absolute else _FALSE_NAMES
+        best = best_words(directions, sample, vectors, by_chance=limit, count=len(words))
         chosen = {number: words[index] for number, index in enumerate(best, 1) if index is not None}
         if len(chosen) > 0:
             answer = self.ask(*dict.fromkeys(chosen.values()))
@@ -578,6 +588,8 @@ def open_run(
     True
     """
     vectors = None if text_embeddings is None else check_path("text_embeddings", text_embeddings)
+    if prompt_template is not None:
+        check_template(prompt_template)
     device = choose_device(device)
     folder, scene, stored = open_stored_run(load_config, data)
     return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=prompt_template), device)

@@ -2,6 +2,7 @@
 
     python -m research.edges                   the fox: error, seconds per image, fit; results/edges.json
     python -m research.edges --device cuda     error, seconds per image, differences from a CPU; results/edges_gpu.json
+    python -m research.edges --clip            CLIP ViT-B-16 on a CPU, in patches and on crops; results/edges_clip.json
 
 *Error*: the largest difference of edge probabilities on a crop of 300 x 300 from numpy in float64, which reads the
 weight file by itself (`tests/encoders/hed.py`).
@@ -20,15 +21,18 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from statistics import mean, median
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.package_files import EDGES
 from normlift_ns.segmentation.edges import EDGE_COUNTS, WORKING_PIXELS, EdgeRegions, watershed_levels
 from normlift_ns.segmentation.regions import Superpixels, read_image
+from research.front_end_inputs import Size, random_clip
 from research.report import Report
 from tests.captures import SHARED, capture
 from tests.encoders.hed import edge_probability
@@ -42,16 +46,20 @@ def main() -> None:
     """Write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    device = parser.parse_args().device
-    report = Report("edges" if device == "cpu" else "edges_gpu")
+    parser.add_argument("--clip", action="store_true")
+    args = parser.parse_args()
+    device, paths = args.device, sorted((CAPTURES / "fox" / "images").glob("*.jpg"))
     source = EdgeRegions(device=device)
-    paths = sorted((CAPTURES / "fox" / "images").glob("*.jpg"))
-    measure_error(report, source, read_image(paths[0])[300:600, 100:400])
-    measure_time(report, source, paths)
-    if device == "cpu":
-        measure_fit(report, source)
+    report = Report("edges_clip" if args.clip else "edges" if device == "cpu" else "edges_gpu")
+    if args.clip:
+        time_clip(report, source, read_image(paths[0]))
     else:
-        compare_devices(report, source, paths)
+        measure_error(report, source, read_image(paths[0])[300:600, 100:400])
+        measure_time(report, source, paths)
+        if device == "cpu":
+            measure_fit(report, source)
+        else:
+            compare_devices(report, source, paths)
     report.write()
 
 
@@ -80,6 +88,19 @@ def measure_time(report: Report, source: EdgeRegions, paths: list[Path]) -> None
     again = replace(source)
     same = [torch.equal(source.labels(x, ""), again.labels(x, "")) for x in photographs]
     report.add("repeats", mean(same), "share of images whose regions are equal in a second run")
+
+
+def time_clip(report: Report, source: EdgeRegions, image: torch.Tensor) -> None:
+    """Add the times of CLIP, with random weights, for all patches of an image and for twelve of its regions."""
+    labels = source.labels(image, "")[1]
+    with TemporaryDirectory() as folder:
+        encoder = random_clip(Size(), Path(folder), source.device)
+        patches = PatchFeatures(encoder, 1024)
+        twelve = labels.where(labels < 12, -1)
+        calls = (lambda: patches.features(image, ""), lambda: encoder.encode(image, twelve))
+        taken = [[seconds(call) for call in calls] for _ in range(8)]
+    for name, values in zip(("patches", "crops"), zip(*taken)):
+        report.add(name, min(values), "s, all patches of an image or 12 crops, the fastest of 8")
 
 
 def seconds(call: Callable[[], object]) -> float:

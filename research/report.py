@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
-NAMED = ("--quick", "--statistic", "real")
+NAMED = ("--quick", "--statistic", "real", "--clip")
 """Arguments that a report names."""
 PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat", "transformers")
 

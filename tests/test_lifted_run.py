@@ -257,7 +257,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     ):
         with pytest.raises(nl.InputError):
             run.ask("red", **wrong)  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="NUL"):
+    with pytest.raises(nl.InputError, match="valid characters"):
         run.ask("red\0")
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be"):

@@ -234,27 +234,37 @@ def mean_directions(
 
 
 def best_words(
-    directions: Float64[Tensor, "m d"], scene: Float[Tensor, "k d"], vectors: Float[Tensor, "w d"], *, by_chance: float
+    directions: Float64[Tensor, "m d"],
+    scene: Float[Tensor, "k d"],
+    vectors: Float[Tensor, "w d"],
+    *,
+    by_chance: float,
+    count: int,
 ) -> list[int | None]:
     """Return the best word of every object; None where many words are as likely to be the best by chance.
 
     Some words are near to everything. So the cosines of each word are standardized over the scene, and then those of
-    each object over the words. The best word must stay the best, and must exceed the value that `by_chance` of all
-    pairs of an object and a word would exceed if they were normally distributed.
+    each object over the words beyond the names. The best name must exceed the value that `by_chance` of all pairs of
+    an object and a name would exceed if they were normally distributed. If all words are names, the cosines are
+    standardized over these, and the best one must stay the best.
 
     Args:
         directions: of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
-        vectors: one unit row per word.
-        by_chance: number of pairs that may exceed the limit; inf: no limit, and the best word need not stay the best.
+        vectors: one unit row per word, names first.
+        by_chance: number of pairs that may exceed the limit; inf: no limit, and the best name need not stay the best.
+        count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T
-    best = cosine.argmax(dim=1)
+    best = cosine[:, :count].argmax(dim=1)
     if by_chance == float("inf") or len(best) == 0:
         return best.tolist()
     usual = scene.to(directions) @ vectors.to(directions).T
     score = (cosine - usual.mean(dim=0)) / usual.std(dim=0).clamp(min=1e-9)
-    score = (score - score.mean(dim=1, keepdim=True)) / score.std(dim=1, keepdim=True).clamp(min=1e-9)
-    limit = float(torch.special.ndtri(torch.tensor(1 - by_chance / (MAX_OBJECTS * len(vectors)), dtype=torch.float64)))
-    clear = (score.argmax(dim=1) == best) & (score.amax(dim=1) > limit)
+    others = score[:, count:] if count < len(vectors) else score
+    score = ((score - others.mean(dim=1, keepdim=True)) / others.std(dim=1, keepdim=True).clamp(min=1e-9))[:, :count]
+    limit = float(torch.special.ndtri(torch.tensor(1 - by_chance / (MAX_OBJECTS * count), dtype=torch.float64)))
+    clear = score.gather(1, best[:, None])[:, 0] > limit
+    if count == len(vectors):
+        clear &= score.argmax(dim=1) == best
     return [word if stands_out else None for word, stands_out in zip(best.tolist(), clear.tolist())]

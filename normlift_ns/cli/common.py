@@ -30,6 +30,7 @@ from rich.text import Text
 import normlift_ns
 from normlift_ns.errors import EXIT_USER_ERROR, InputError, OutputError, describe_error, escape_unprintable
 from normlift_ns.io.guard import forget_inputs, open_regular, protect_inputs, refuse_inputs
+from normlift_ns.io.memory import check_free_memory
 from normlift_ns.options import VOTE_FLAGS, RefineConfig, named_as_flags, rename_flags, renamed_flags
 
 _CORNERS = ("╭", "┏")
@@ -221,6 +222,8 @@ ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
 
 _OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it elsewhere."
 _PACKAGE = str(Path(normlift_ns.__file__).parent)
+_MIN_MEMORY = 2**28
+"""Least memory of any command that does more than to print its help."""
 
 
 class CommandProtocol(Protocol):
@@ -296,7 +299,9 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
                 info(f"normlift_ns {normlift_ns.__version__}")
             else:
                 tyro.extras.set_accent_color("bright_yellow")
-                parse_flags(command, words).main()
+                parsed = parse_flags(command, words)
+                check_free_memory(_MIN_MEMORY, "A command")
+                parsed.main()
     except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:

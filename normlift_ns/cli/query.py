@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from rich.table import Table
 
 from normlift_ns.cli import common
-from normlift_ns.cli.preflight import check_lifted_run, check_new_files, check_writable_folder, refuse_unused
+from normlift_ns.cli.preflight import (
+    check_lifted_run,
+    check_new_files,
+    check_readable_file,
+    check_writable_folder,
+    refuse_unused,
+)
 from normlift_ns.errors import InputError, user_state_folder
 from normlift_ns.io.atomic import atomic_file, atomic_files, refuse_existing, safe_file_name, write_text_file
 from normlift_ns.io.guard import read_text
@@ -307,9 +313,14 @@ class NormLiftQuery(CheckedOptions):
             check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.explain_dir, "--explain-dir")
-        if self.objects_dir is not None:
-            files = (self.objects_dir / name for name in CATALOG_FILES)
-            check_new_files(*files, overwrite=self.overwrite, flags="--objects-dir")
+        tables = [] if self.objects_dir is None else [self.objects_dir / name for name in CATALOG_FILES]
+        check_new_files(*tables, overwrite=self.overwrite, flags="--objects-dir")
+        written = {Path(os.path.realpath(path)) for _, path in files if path is not None}
+        written.update(Path(os.path.realpath(path)) for path in tables)
+        for folder in filter(None, (self.render_dir, self.explain_dir, self.objects_dir)):
+            place = Path(os.path.realpath(folder))
+            if written & {place, *place.parents}:
+                raise InputError(f"{folder} is named as a folder and as a file; give another path for one of them")
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
@@ -355,11 +366,10 @@ def read_vocabulary(path: Path) -> list[str]:
     """Read the words of a text file, one per line; empty lines are skipped.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        OSError, ValueError: as `check_readable_file`.
         ValueError: It is not a text file in UTF-8, or has no word.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"--vocabulary {path} does not exist; give a text file with one word per line")
+    check_readable_file(path, "--vocabulary")
     try:
         lines = read_text(path, "utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -455,10 +465,12 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
-    """Print the table of an answer, and a note for each prompt that is not found."""
+    """Print the table of an answer, and a note for each prompt that is not found, or of which only words count."""
     rule = f"{question.rule} > {question.threshold:.4g}"
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
+        if row["read_as"] is not None:
+            common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the other words.')
         if row["verdict"] in ("weak match", "probably not here"):
             top = row["histogram"]["top"]
             position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"

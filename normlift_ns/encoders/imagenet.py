@@ -37,18 +37,37 @@ def find_classes(prompt: str) -> list[int]:
     Raises:
         InputError: If it names none.
     """
+    _, word = _find_words(prompt)
+    if word is not None:
+        return list(_vocabulary()[word])
+    text = _normalized(prompt)
+    near = [name for name in _vocabulary() if not set(text.split()).isdisjoint(name.split())]
+    near += [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
+    suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
+    raise InputError(
+        f"text {truncate_text(prompt)!r} names none of the 1,000 classes of ImageNet, nor a group of them; words "
+        f"spelled like it are {suggestions}: use one that means it, or lift with --encoder open_clip for other words"
+    )
+
+
+def known_words(prompt: str) -> str:
+    """Return the words of a prompt that count, see `find_classes`; "" if it names no class.
+
+    >>> known_words("A red fox"), known_words("blue fox that sleeps")
+    ('red fox', 'fox')
+    """
+    return _find_words(prompt)[0]
+
+
+def _find_words(prompt: str) -> tuple[str, str | None]:
+    """Return the words of a prompt that count, and the word of the vocabulary that they are; "" and None: none."""
     text = _normalized(prompt)
     head = _AFTER_HEAD.sub("", text).split()
     for phrase in (text, *(" ".join(head[start:]) for start in range(len(head)))):
         for word in _singulars(phrase):
             if word in _vocabulary():
-                return list(_vocabulary()[word])
-    near = [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
-    suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
-    raise InputError(
-        f"text {truncate_text(prompt)!r} names none of the 1,000 classes of ImageNet, nor a group of them; close words "
-        f"are {suggestions}: use one of them, or lift with --encoder open_clip for other words"
-    )
+                return phrase, word
+    return "", None
 
 
 def _normalized(text: str) -> str:

@@ -70,6 +70,8 @@ class EncoderKind:
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     has_null_words: bool = True
     """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
+    known_words: Callable[[str], str] = str
+    """Returns the words of a prompt that count; "" if there are none. The encoder ignores all others."""
     words: Callable[[], Sequence[str]] = tuple
     """Returns the words that an inventory names objects by; (): none."""
     suggested: float = 0.6
@@ -214,8 +216,15 @@ def _imagenet_words() -> Sequence[str]:
     return tuple(dict.fromkeys(class_names()))
 
 
+def _known_to_imagenet(prompt: str) -> str:
+    from normlift_ns.encoders.imagenet import known_words  # noqa: PLC0415 (a file to read)
+
+    return known_words(prompt)
+
+
 IMAGENET_CLASSES = EncoderKind(
     _make_imagenet_encoder,
+    known_words=_known_to_imagenet,
     words=_imagenet_words,
     rule="cosine",
     negatives=(),
@@ -242,8 +251,16 @@ def _color_words() -> Sequence[str]:
     return [name for name in xkcd_colors() if "/" not in name]
 
 
+def _known_to_color(prompt: str) -> str:
+    from normlift_ns.encoders.color import find_color_names  # noqa: PLC0415 (needs numpy)
+
+    names = ", ".join(find_color_names(prompt))
+    return names.replace("grey", "gray") if "gray" in prompt.lower() else names
+
+
 COLOR = EncoderKind(
     _make_color_encoder,
+    known_words=_known_to_color,
     words=_color_words,
     rule="cosine",
     negatives=(),
@@ -274,7 +291,7 @@ ENCODERS = Registry(
 
 
 _PREFERENCE = ("open_clip", "siglip2", "siglip", "metaclip2", "imagenet", "color")
-"""Encoders of `--encoder auto`, the best first; the last is on every machine."""
+"""Encoders of `--encoder auto`, the preferred first; the last is on every machine."""
 
 
 def _options_of_clip(options: SourceOptions) -> list[str]:
@@ -284,7 +301,7 @@ def _options_of_clip(options: SourceOptions) -> list[str]:
 
 
 def with_encoder(options: SourceOptions) -> SourceOptions:
-    """Return the options with an encoder in place of "auto": the best that is on this machine.
+    """Return the options with an encoder in place of "auto": the preferred one on this machine.
 
     Options of OpenCLIP, and features of LangSplat, which are OpenCLIP's, stand for `open_clip`.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -67,8 +68,8 @@ def check_prompts(prompts: Sequence[str]) -> None:
     if len(prompts) == 0:
         raise InputError('no text given; name at least one object to search for, such as --text "orange"')
     for prompt in prompts:
-        if not isinstance(prompt, str) or "\0" in prompt:
-            raise InputError(f"a text must be a str without NUL characters, got {prompt!r:.60}")
+        if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
+            raise InputError(f"a text must be a str of valid characters, got {prompt!r:.60}")
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(

@@ -23,6 +23,7 @@ from xxhash import xxh3_128
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.io.guard import check_regular, open_regular
+from normlift_ns.io.memory import check_free_memory
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number allowed in a file."""
@@ -161,7 +162,9 @@ def load_arrays(
     """
     try:
         check_regular(path)
+        size = path.stat().st_size
         with safe_open(path, framework=framework) as file:
+            check_free_memory(size, f"Reading {path}", {"ulimit -v": 2 * size})  # safetensors panics without memory
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
         expected = facts.pop(DIGEST_KEY, None)

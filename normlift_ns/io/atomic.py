@@ -471,6 +471,7 @@ def deferred_signals() -> Iterator[None]:
 def _draft_folder(*paths: Path) -> Iterator[Path]:
     """Yield a temporary folder next to the paths; error messages name these paths, not the temporary ones."""
     folder, temporary = paths[0].parent, None
+    new_folders = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         complete_interrupted_writes(folder)
@@ -495,6 +496,10 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
             reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
+    finally:
+        for place in new_folders:
+            with suppress(OSError):  # it has content
+                place.rmdir()
 
 
 def _discard(temporary: Path | None) -> None:

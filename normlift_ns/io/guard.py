@@ -10,6 +10,7 @@ import stat
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from io import BufferedReader
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,8 @@ def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callabl
     for kind, parent, names in owners(folder):
         if (exists or kind == "run") and names.fullmatch(Path(path).relative_to(parent).parts[0]):
             return f"the {kind} {parent}"
-    if exists and ".cache" in Path(folder).parts:
+    parts = Path(folder).parts
+    if (exists and ".cache" in parts) or ("normlift", ".cache") in pairwise(parts):
         return f"the cache {folder}"
     statuses = map(os.stat, (path, *Path(path).parents) if exists else ())
     name = next(filter(None, (inputs().get((status.st_dev, status.st_ino)) for status in statuses)), None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -55,6 +55,25 @@ def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
                 yield folder / names[0], folder / names[1]
 
 
+def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int] | None = None) -> None:
+    """Raise if a limit leaves less memory than needed.
+
+    Args:
+        needed: Number of bytes.
+        what: What needs them, for the message.
+        needed_by_limit: Numbers of bytes that replace `needed` for some limits, by their names in `free_memory`.
+    Raises:
+        MemoryError: A limit leaves less; the message has both numbers.
+    """
+    for name, free in free_memory().items():
+        least = (needed_by_limit or {}).get(name, needed)
+        if free < least:
+            raise MemoryError(
+                f"{what} needs at least {least / 2**30:.2f} GiB of memory, but {name} leaves "
+                f"{max(0, free) / 2**30:.2f} GiB. Raise the limit, close other programs, or use a smaller scene."
+            )
+
+
 def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = True) -> None:
     """Raise if a lift of so many Gaussians and pixels of a view certainly does not fit into memory.
 
@@ -66,14 +85,10 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
         MemoryError: The lift does not fit; the message has the estimate.
     """
     needed = gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
-    for name, free in free_memory().items():
-        start = 0 if loaded else _library_bytes() if name == "ulimit -v" else _LIFT_BYTES
-        bytes_needed = start + needed
-        if free < bytes_needed:
-            raise MemoryError(
-                f"The lift needs at least {bytes_needed / 2**30:.2f} GiB of memory, but {name} leaves "
-                f"{max(0, free) / 2**30:.2f} GiB. Raise the limit, close other programs, or lift a smaller scene."
-            )
+    if loaded:
+        check_free_memory(needed, "The lift")
+    else:
+        check_free_memory(needed + _LIFT_BYTES, "The lift", {"ulimit -v": needed + _library_bytes()})
 
 
 def _library_bytes() -> int:

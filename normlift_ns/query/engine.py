@@ -7,6 +7,7 @@ command line (`query.arrays.ArrayField`). This module does not need torch.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -217,6 +218,14 @@ class Finding:
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
+    def read_as(self) -> str | None:
+        """The words of the prompt that count, if the encoder ignores others than articles; None: all count."""
+        kind = find_encoder_kind(encoder_name(self.answer.field))
+        known = "" if kind is None else kind.known_words(self.text)
+        ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
+        return known if known and not ignored <= {"a", "an", "the"} else None
+
+    @property
     def nearest(self) -> list[float] | None:
         """Position that is most similar to the prompt, whether selected or not.
 
@@ -240,7 +249,7 @@ class Finding:
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as plain Python types."""
-        names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest")
+        names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest", "read_as")
         values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
         return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}
 

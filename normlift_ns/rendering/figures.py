@@ -554,6 +554,7 @@ def save_inventory(
     values = torch.nn.functional.one_hot(inventory.instance_id.long(), count + 1)[:, 1:].to(scene.gaussians.means)
     weights, alpha = render(scene.gaussians, camera, values, rasterize_mode=mode, settings=settings)
     masks = (pixel_relevancy(weights, alpha) > 0.5).permute(2, 0, 1)
+    masks &= (shares[:, view] >= MIN_VIEW_SHARE).to(masks.device)[:, None, None]  # no numbers on specks
     drawn = _numbered(image, masks, [item.text for item in inventory.catalog.objects])
     with atomic_file(path, overwrite=overwrite) as draft:
         drawn.save(draft, format="PNG")

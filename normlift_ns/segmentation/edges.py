@@ -45,6 +45,8 @@ _MARGIN = 16
 """Pixels of mirrored image around the image. Without them, the network finds edges along the border."""
 _HEIGHTS = 256
 """Number of values of an edge map. Few values hide the rounding errors of devices."""
+ALGORITHM = 2
+"""Part of the key of cached regions. Raise it with every change of this module that changes a region."""
 
 
 class EdgeNetwork(nn.Module):
@@ -194,7 +196,8 @@ class EdgeRegions(RegionDefaults):
     @property
     def identity(self) -> dict[str, Any]:
         weights = f"{EDGES.package} {EDGES.version}"
-        return {"kind": "edges", "weights": weights, "pixels": self.pixels, "counts": list(self.counts)}
+        settings = {"weights": weights, "pixels": self.pixels, "counts": list(self.counts)}
+        return {"kind": "edges", "algorithm": ALGORITHM, **settings}
 
     @property
     def counts(self) -> tuple[int, ...]:

@@ -216,20 +216,21 @@ def requested_regions(options: SourceOptions) -> str:
 
 _PACKAGES = {"sam": "transformers", "edges": "h5py"}
 """Packages of the extras that regions need."""
-_NEXT_ENCODER = {"color": "imagenet", "imagenet": "open_clip"}
-"""The encoder to recommend to those who have only this one."""
+_NEXT_ENCODER = {"color": ("imagenet", "names of things"), "imagenet": ("open_clip", "words it does not know")}
+"""The encoder to recommend to those who have only this one, and what for."""
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
-    """Return the regions of the options, with "auto" resolved: the best that are on this machine."""
+    """Return the regions of the options, with "auto" resolved: the preferred ones on this machine."""
     name = requested_regions(options)
     return name if name != "auto" else next(filter(_is_here, _preferred_regions(with_encoder(options), device)))
 
 
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
-    """Return the regions of "auto" for the encoder, the best first, whether their weights are here or not.
+    """Return the regions of "auto" for the encoder, the preferred first, whether their weights are here or not.
 
-    On a CPU, SAM takes minutes per image, and crops of edges far longer than patches.
+    On a CPU, SAM is left out, and so are crops of edges: twelve crops through CLIP take longer than all patches of an
+    image (`python -m research.edges --clip`).
     """
     kind, on_gpu = encoder_kind(options.encoder), device.startswith("cuda")
     if not kind.learned:
@@ -253,21 +254,23 @@ def resolve_source(options: SourceOptions, device: str = "cpu") -> SourceOptions
 
 
 def describe_choice(options: SourceOptions, device: str) -> str | None:
-    """Describe in one line what "auto" stands for on this machine, and the command that gets the next better weights;
+    """Describe in one line what "auto" stands for on this machine, and the command that gets the weights it prefers;
     None if neither the encoder nor the regions of a network are automatic."""
     any_encoder, any_regions = options.encoder == "auto", requested_regions(options) == "auto"
     named = not any_encoder and not (any_regions and encoder_kind(options.encoder).learned)
     if named or options.features != "none":
         return None
     chosen = resolve_source(options, device)
-    better = [_NEXT_ENCODER[chosen.encoder]] if any_encoder and chosen.encoder in _NEXT_ENCODER else []
+    wanted = dict([_NEXT_ENCODER[chosen.encoder]]) if any_encoder and chosen.encoder in _NEXT_ENCODER else {}
     if any_regions:
-        encoder = "imagenet" if better == ["imagenet"] else chosen.encoder
+        encoder = "imagenet" if "imagenet" in wanted else chosen.encoder
         preferred = _preferred_regions(replace(chosen, encoder=encoder), device)
-        better += list(takewhile(lambda name: not _is_here(name), preferred))[-1:]
-    packages = [name for regions, name in _PACKAGES.items() if regions in better and find_spec(name) is None]
+        missing = list(takewhile(lambda name: not _is_here(name), preferred))
+        wanted |= dict.fromkeys(missing[-1:], "regions along outlines")
+    packages = [name for regions, name in _PACKAGES.items() if regions in wanted and find_spec(name) is None]
     install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
-    advice = f"; for better ones: {install}ns-normlift-weights --get {' '.join(better)}" if len(better) > 0 else ""
+    purposes = " and ".join(wanted.values())
+    advice = f"; for {purposes}: {install}ns-normlift-weights --get {' '.join(wanted)}" if len(wanted) > 0 else ""
     return f"2D features: --encoder {chosen.encoder} --regions {chosen.regions}, chosen automatically{advice}"
 
 

@@ -32,8 +32,8 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Verdict on a prompt that is not found, or warning that nothing reaches the threshold, with the nearest match;
-    empty otherwise."""
+    """The words that count, if the encoder ignores others, and the verdict on a prompt that is not found, or a warning
+    that nothing reaches the threshold, with the nearest match; empty otherwise."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
@@ -60,11 +60,13 @@ def _warning(finding: Finding, histogram: Histogram) -> str:
     if is_click(finding.text):
         return ""
     position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
+    read_as = "" if finding.read_as is None else f'{finding.text}: read as "{finding.read_as}". '
     if finding.verdict in ("weak match", "probably not here"):
-        return f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {histogram.top:.2f}."
+        verdict = f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {histogram.top:.2f}."
+        return read_as + verdict
     if finding.peak is None or bool(finding.mask.any()):
-        return ""
-    return (
+        return read_as.strip()
+    return read_as + (
         f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
         f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
     )

@@ -68,8 +68,10 @@ def test_a_name_must_stand_out_from_those_that_are_best_by_chance() -> None:
     words, scene = (torch.nn.functional.normalize(torch.randn(n, 64, generator=generator), dim=1) for n in (400, 500))
     scene = torch.nn.functional.normalize(scene + words[7], dim=1)  # a word that is near to everything
     things = torch.stack([scene[:9].mean(0), words[3] + 0.5 * words[7], scene[0]]).double()
-    assert best_words(things, scene, words, by_chance=0.25) == [None, 3, None]
-    assert best_words(things, scene, words, by_chance=float("inf"))[:2] == [7, 3]
+    assert best_words(things, scene, words, by_chance=0.25, count=400) == [None, 3, None]
+    assert best_words(things, scene, words, by_chance=float("inf"), count=400)[:2] == [7, 3]
+    assert best_words(things, scene, words, by_chance=0.25, count=9) == [None, 3, None]  # the others only compared with
+    assert best_words(things, scene, words, by_chance=0.25, count=3) == [None] * 3
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +104,9 @@ def test_command_writes_a_list_and_a_picture(
         assert image.size == (160, 120)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     assert "exists" in said(capsys)
+    words.write_text("fork\nred\nknife\n", encoding="utf8")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", True) == 1
+    assert "2 of the 3 words" in (message := said(capsys)) and "fork, knife" in message
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ HOSTILE = [
 ]  # fmt: skip
 NUMBERS = {
     "fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None,
-    "suggested_threshold": None, "histogram": None, "verdict": "probably not here",
+    "suggested_threshold": None, "histogram": None, "verdict": "probably not here", "read_as": "[/red]",
 }  # fmt: skip
 OBJECT = {
     "instance_id": 1, "size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3},

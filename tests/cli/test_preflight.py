@@ -114,6 +114,7 @@ QUERY = [
     ("--text a --output-json room", "room exists", "--output-json"),
     ("--text a --output-json room --overwrite True", "room, given with --output-json", "not a regular file"),
     ("--text a --output-json file/x", "--output-json is"),
+    ("--text a --output-json n --render-dir n/b", "n/b", "folder and as a file"),
     ("--text a --output-json n --output-npz n", "--output-json and --output-npz", ", n"),
     ("--text a --render-dir file", "file, named with --render-dir"),
     ("--text a --explain --explain-dir file", "file, named with --explain-dir"),

@@ -45,7 +45,7 @@ VOTE = (
     0,
 )
 """Of version 0.1, which knew no consensus."""
-SINCE = {"verdict", "nearest", "suggested_threshold", "histogram"}
+SINCE = {"verdict", "nearest", "suggested_threshold", "histogram", "read_as"}
 """What an answer tells since."""
 NUMBERS = {"class_id", "instance_id"}
 """What exports tell since, in place of `label`, which is `class_id` - 1."""

@@ -127,8 +127,16 @@ def test_no_output_replaces_a_part_of_a_run_a_data_set_or_a_cache(markers: tuple
                 with pytest.raises(InputError, match="part of the"), atomic_file(path, overwrite=overwrite):
                     pytest.fail("nothing is computed")
         assert (home / name).read_bytes() == CONTENT.get(f"a{Path(name).suffix}", b"")
-    for name in ("answers.json", "exports/a.ply"):
+    for name in ("answers.json", "exports/a.ply", ".cache/new.json"):
         refuse_existing(home / name, overwrite=True, flags="--flag")
+    with pytest.raises(InputError, match="part of the"):
+        guard.refuse_inputs([tmp_path / "normlift" / ".cache" / "new.json"])
+
+
+def test_folders_made_for_a_file_that_is_not_written_go(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), atomic_file(tmp_path / "a" / "b" / "c.json"):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_output_replaces_an_input_by_whatever_name(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Regions between learned edges."""
 
+from hashlib import sha256
 from itertools import pairwise
 
 import h5py
@@ -13,9 +14,11 @@ from scipy.ndimage import label
 
 from normlift_ns.cli.preflight import check_source_options
 from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.package_files import EDGES
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.edges import (
+    ALGORITHM,
     EDGE_COUNTS,
     WORKING_PIXELS,
     EdgeNetwork,
@@ -128,6 +131,22 @@ def test_options_choose_a_level_or_a_number(monkeypatch, tmp_path):
     refused(lambda: make_source(options(level="s", region_count=9)), "--level s", "--region-count 9")
     for call in (lambda: check_source_options(options(), ()), lambda: EdgeRegions().labels(noise(3, 4), "a.png")):
         refused(call, str(tmp_path), "ns-normlift-weights --get edges", error=FileNotFoundError)
+
+
+def test_regions_of_another_algorithm_are_not_reused(monkeypatch, tmp_path):
+    """With integers in place of the network, which is compared with Keras above, regions repeat on every machine."""
+    source, image = EdgeRegions(count=20), noise(9, 11).repeat_interleave(80, 0).repeat_interleave(80, 1)
+    vars(source)["network"] = lambda x: (x.int() - x.roll((3, 5), (0, 1)).int()).abs().amax(dim=2) / 255
+    kept = CachedRegions(source, tmp_path)
+    labels = kept.labels(image, "a.png")
+    digest = sha256(labels.numpy().tobytes()).hexdigest()[:16]
+    assert (ALGORITHM, digest) == (2, "5c1926ec108e096b"), (
+        "other regions need another number, which is part of the cache's key"
+    )
+    path = kept.path(image, "a.png")
+    assert path.exists()
+    monkeypatch.setattr("normlift_ns.segmentation.edges.ALGORITHM", ALGORITHM + 1)
+    assert kept.path(image, "a.png") != path
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import torch
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import SourceOptions
+from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import encoder_settings
 from normlift_ns.session import actions
 from normlift_ns.session.actions import carry_threshold, diagnose_prompts, threshold_suggestion
@@ -47,6 +48,28 @@ def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     (verdict,) = diagnose_prompts(actions.set_threshold(state, 1.0))  # that nothing reaches
     assert verdict.warning.startswith("red: ") and verdict.warning.count("1.00") == 2
     assert "Suggested" in verdict.warning and verdict.nearest_position is not None
+
+
+@pytest.mark.parametrize(
+    ("encoder", "prompt", "known"),
+    [
+        ("color", "The red", None),
+        ("color", "gray", None),
+        ("color", "gray wall", "gray"),
+        ("color", "dark red shoes on a blue floor", "dark red, blue"),
+        ("imagenet", "a red fox", None),
+        ("imagenet", "blue fox", "fox"),
+        ("imagenet", "not two foxes in the snow", "foxes"),
+        ("open_clip", "blue fox", None),
+    ],
+)
+def test_words_that_do_not_count_are_said(encoder: str, prompt: str, known: str | None) -> None:
+    manifest = {**world().field.manifest, "encoder": encoder_settings(SourceOptions(encoder=encoder))}
+    field = replace(world().field, manifest=manifest)
+    state = State(SelectionContext(field, world().means), query=Query((prompt,), np.eye(3, dtype=np.float32)[:1]))
+    assert state.answer is not None and state.answer[prompt].read_as == known == state.answer.to_json()[0]["read_as"]
+    (verdict,) = diagnose_prompts(state)
+    assert (f'read as "{known}"' in verdict.warning) == (known is not None)
 
 
 def test_histograms_are_of_the_prompts_that_select():
