@@ -95,9 +95,9 @@ class SelectionContext:
 
         Growing adds Gaussians within as many steps on the graph, and those that are connected to the selection and
         similar to its mean direction. Their cosine is at least 0.95 at the first step, and 0.05 less at each further
-        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
-        the first step, and 1/11 less at each further step. The results are nested: more steps of growth never remove
-        a Gaussian, and more steps of shrinking never add one.
+        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph
+        distance from the middle. The fraction is 10/11 at the first step, and 1/11 less at each further step. The
+        results are nested: more steps of growth never remove a Gaussian, and more steps of shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected

@@ -1,5 +1,6 @@
 """The HTTP API of a small lifted run, its client, and what the server refuses."""
 
+import io
 import json
 import socket
 import threading
@@ -50,7 +51,9 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
     assert [one.count for one in objects[:1]] == [one.size for one in local["yellow"].objects[:1]]
     assert remote.select(answer.mask).count == int(local.mask.sum())
     assert remote.select(Selection(answer.question, object=1)).count == remote.objects(answer).objects[0].count
-    assert remote.select(Selection(floaters=True)).count == int(run.floaters().mask.sum()) == int(remote.floaters().sum())
+    assert (
+        remote.select(Selection(floaters=True)).count == int(run.floaters().mask.sum()) == int(remote.floaters().sum())
+    )
     assert remote.select(Selection(answer.question, invert=True)).count == len(run.field) - int(local.mask.sum())
     why, expected = remote.why(answer["red"]), run.why(local["red"])
     assert why.effective_views == pytest.approx(expected.n_eff)
@@ -69,8 +72,14 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
         remote.export(path)
     masks = remote.masks(tmp_path / "masks", answer["red"])
     assert len(masks) == len(run.scene.train) and masks[0].read_bytes()[:4] == b"\x89PNG"
-    for wrong in (lambda: remote.ask("zzyzx"), lambda: remote.ask(""), lambda: remote.why(torch.zeros(3, dtype=torch.bool)),
-                  lambda: remote.camera("none"), lambda: remote.select("red"), lambda: connect(remote.address, "other")):  # fmt: skip
+    for wrong in (
+        lambda: remote.ask("zzyzx"),
+        lambda: remote.ask(""),
+        lambda: remote.why(torch.zeros(3, dtype=torch.bool)),
+        lambda: remote.camera("none"),
+        lambda: remote.select("red"),
+        lambda: connect(remote.address, "other"),
+    ):
         with pytest.raises(InputError):
             wrong()
     with pytest.raises(OSError, match="does not answer"):
@@ -115,11 +124,13 @@ def test_answers_of_the_small_world(client):
     ray = {"origin": [101.0, 1.0, 9.0], "direction": [0, 0, -1]}
     assert client.post(f"{RUN}/select", json={"ray": ray}).json()["count"] == 64
     mask = client.post(f"{RUN}/select", json={"ray": ray, "arrays": "npy"}).content
-    assert np.load(__import__("io").BytesIO(mask)).sum() == 64
+    assert np.load(io.BytesIO(mask)).sum() == 64
     for verb, request, words in (
-        ("query", {"texts": ["zebra"]}, "unknown"), ("query", {"texts": []}, "length"), ("query", {"texts": ["red"], "x": 1}, "x"),
+        ("query", {"texts": ["zebra"]}, "unknown"), ("query", {"texts": []}, "length"),
+        ("query", {"texts": ["red"], "x": 1}, "x"),
         ("query", {"texts": ["red"], "min_reliability": 2}, "<= 1"), ("select", {"mask": "AAAA"}, "bytes"),
-        ("objects", {"question": body, "object": 9}, "no object 9"), ("export", {"question": body, "format": "exe"}, "exe"),
+        ("objects", {"question": body, "object": 9}, "no object 9"),
+        ("export", {"question": body, "format": "exe"}, "exe"),
         ("render", {"page_view": {"position": [0, 0, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 1}}, "look"),
     ):  # fmt: skip
         answer = client.post(f"{RUN}/{verb}", json=request)
@@ -153,7 +164,7 @@ def test_other_hosts_and_origins_are_refused(client, host, origin, status):
         expected = 404 if status == 200 and path.startswith("/assets") else status
         assert client.get(path, headers=headers).status_code == expected
     if status == 403:
-        with pytest.raises(Exception), client.websocket_connect(f"{RUN}/session", headers=headers):  # noqa: B017, PT011
+        with pytest.raises(Exception), client.websocket_connect(f"{RUN}/session", headers=headers):  # noqa: B017
             pytest.fail("accepted")
 
 
@@ -170,8 +181,14 @@ def test_bodies_are_bounded_headers_are_strict_and_no_file_outside_is_served(cli
     assert "build" in client.get("/").text
     monkeypatch.setattr(app_module, "PAGE_FOLDER", tmp_path / "page")
     assert client.get("/").text == "<p>the page" and client.get("/assets/a.js").text == "1"
-    for path in ("/assets/../../secret", "/assets/%2e%2e/%2e%2e/secret", "/assets//etc/passwd", "/assets/link", "/assets/"):
-        assert client.get(path).status_code == 404, path
+    for path in (
+        "/assets/../../secret",
+        "/assets/%2e%2e/%2e%2e/secret",
+        "/assets//etc/passwd",
+        "/assets/link",
+        "/assets/",
+    ):
+        assert client.get(f"/assets/{path}").status_code == 404, path
 
 
 def test_a_slow_body_and_slow_work_end(monkeypatch, tmp_path):
