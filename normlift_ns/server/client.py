@@ -291,26 +291,34 @@ class RemoteRun:
         return self._send("GET", path, None)
 
     def _send(self, method: str, path: str, body: bytes | None) -> bytes:
-        headers = {"Content-Type": "application/json"}
-        headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
         with self._lock:
-            for attempt in range(2):
+            try:
                 try:
-                    if self._connection is None:
-                        self._connection = _connect(self.address)
-                    self._connection.request(method, path, body, headers)
-                    response = self._connection.getresponse()
-                    content = response.read(_MAX_ANSWER)
-                    break
-                except (http.client.HTTPException, OSError) as error:
-                    if self._connection is not None:
-                        self._connection.close()
-                    self._connection = None
-                    if attempt == 1 or isinstance(error, TimeoutError):
-                        raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
-        if response.status != 200:
+                    status, content = self._exchange(method, path, body)
+                except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
+                    self._close()  # the server closes connections that are idle
+                    status, content = self._exchange(method, path, body)
+            except (http.client.HTTPException, OSError) as error:
+                self._close()
+                raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
+        if status != 200:
             raise InputError(f"The server at {self.address} refuses the request: {_reason(content)}")
         return content
+
+    def _exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Send a request; return the status and the content of the answer."""
+        headers = {"Content-Type": "application/json"}
+        headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
+        if self._connection is None:
+            self._connection = _connect(self.address)
+        self._connection.request(method, path, body, headers)
+        response = self._connection.getresponse()
+        return response.status, response.read(_MAX_ANSWER)
+
+    def _close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
 
 
 def _connect(address: str) -> http.client.HTTPConnection:

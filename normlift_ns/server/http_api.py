@@ -136,8 +136,9 @@ def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
 def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
     """Find regions without reliable evidence."""
     least = query.get("min_reliability")
-    options = {} if least is None else {"min_reliability": _number("min_reliability", least)}
-    return coverage(served.run, **options).to_json()
+    if least is None:
+        return coverage(served.run).to_json()
+    return coverage(served.run, min_reliability=_number("min_reliability", least)).to_json()
 
 
 def features(served: ServedRun, query: Any) -> Content:

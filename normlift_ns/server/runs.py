@@ -161,8 +161,8 @@ class ServedRun:
         depth = (self.drawn_scene.means[::50].double().numpy() - position) @ ahead
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else self.frame[2]
         fov = float(np.clip(2 * np.arctan(cameras[0].height / 2 / float(cameras[0].K[1, 1])), *_FIELDS_OF_VIEW))
-        target = position + distance * ahead
-        return PageView(tuple(position.tolist()), tuple(target.tolist()), tuple(self.frame[0]), fov)
+        places = (position.tolist(), (position + distance * ahead).tolist(), self.frame[0])
+        return msgspec.convert(dict(zip(("position", "look_at", "up"), places)) | {"fov": fov}, PageView)
 
     @cached_property
     def examples(self) -> list[str]:
