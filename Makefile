@@ -7,7 +7,7 @@ WORKERS ?= 2
 export PYTHONDONTWRITEBYTECODE :=
 BESIDE := -n $(WORKERS) --dist worksteal
 
-.PHONY: check style changed-types quick-tests test test-slow test-all test-versions test-viser1 soak torture demo docs bench lint format clean
+.PHONY: check style changed-types quick-tests test test-slow test-all test-versions soak torture demo docs bench lint format clean
 
 # Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
 KERNELS = import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32, torch.float64).join()
@@ -61,10 +61,6 @@ test-all: lint
 	NORMLIFT_EXAMPLES=20 NORMLIFT_TORTURE=40 $(BIN)/pytest $(BESIDE) $(JUNIT) --ignore=tests/browser
 	$(BIN)/pytest tests/browser --ignore=tests/browser/test_monkey.py
 	$(MAKE) soak
-
-# The viewer with viser 1.x, in an environment of its own
-test-viser1: .venv/installed
-	$(BIN)/pytest -m extra tests/browser/test_viser1.py
 
 # A monkey before both viewers: make soak MINUTES=30 SEED=1
 soak: .venv/installed

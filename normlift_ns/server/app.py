@@ -28,10 +28,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import normlift_ns
 from normlift_ns.errors import InputError, describe_error
+from normlift_ns.server.host_check import accepted_names, refuse_request
 from normlift_ns.server.http_api import api_routes
 from normlift_ns.server.runs import RunStore, ServedRun, without_paths
 from normlift_ns.server.session import PageLimits, PageSession
-from normlift_ns.viewer.host_check import accepted_names, refuse_request
 
 PAGE_FOLDER = Path(normlift_ns.__file__).parent / "page"
 """Folder of the built page."""

@@ -189,11 +189,11 @@ class RemoteRun:
 
     @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
-        """List the objects of prompts with oriented boxes; the content of `Catalogue.to_json`."""
+        """List the objects of prompts with oriented boxes, as JSON types; see `LiftedRun.catalogue`."""
         return json.loads(self._post("catalog", _selection(part).question))
 
     def inventory(self) -> dict[str, Any]:
-        """List the objects of the scene without prompts; the content of `Catalogue.to_json`."""
+        """List the objects of the scene without prompts, as JSON types; see `LiftedRun.inventory`."""
         return json.loads(self._get(self._path("inventory")))
 
     @check_arguments

@@ -211,7 +211,7 @@ ENDPOINTS = (
 
 
 class Server(Protocol):
-    """What the routes need of `app.WarmServer`."""
+    """Part of `app.WarmServer` that the routes need."""
 
     async def run_of(self, name: str) -> ServedRun:
         """Return an open run, by its id."""
