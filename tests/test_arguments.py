@@ -73,6 +73,19 @@ METHODS: list[Row] = [
     (nl.LiftedRun.floaters, {"limit": ("number", 1.0)}),
     (nl.LiftedRun.camera, {"view": ("path|whole", 0)}),
     (nl.LiftedRun.render, {"view": ("path|whole|Camera", 0), "found": ("Answer|None", None)}),
+    (nl.RemoteRun.features, {"start": ("whole", 0), "stop": ("whole|None", None)}),
+    (nl.RemoteRun.coverage, {"min_reliability": ("number|None", None)}),
+    (nl.RemoteRun.camera, {"view": ("text|whole", 0)}),
+    (
+        nl.RemoteRun.ask,
+        {
+            "negatives": ("texts|None", None),
+            "relevancy": ("word", "auto"),
+            "threshold": ("number|word|None", None),
+            "min_reliability": ("number", 0.0),
+            "refined": ("bool", True),
+        },
+    ),
     (nl.Coverage.save, {"path": ("path", "a.json"), "overwrite": ("bool", False)}),
     (nl.Evidence.select_views, {"views": ("wholes|whole m", [0])}),
     (nl.Evidence.columns_of, {"views": ("wholes|whole m", [0])}),
@@ -146,6 +159,7 @@ TABLE: list[Row] = [
                      "load_step": ("whole|None", None)}),
     (nl.open_splat, {"path": ("path", "/nowhere"),
                      "options": ("SplatOptions", nl.SplatOptions(colmap=Path("/nowhere")))}),
+    (nl.connect, {"url": ("text", "http://127.0.0.1:9"), "run": ("text|None", None), "access_token": ("text", "")}),
     (nl.open_run, {"load_config": ("path", "/nowhere"), "data": ("path|None", None), "device": ("word", "cpu"),
                    "text_embeddings": ("path|None", None), "prompt_template": ("text|None", None)}),
     (nl.coverage, {"run": ("LiftedRun", None)}),
@@ -297,6 +311,7 @@ def test_numbers_of_gaussians_are_checked() -> None:
 
 def test_the_table_has_every_public_name():
     made = {"Answer", "Finding", "Histogram", "Why", "Coverage", "Consensus", "Scalars", "Evidence", "LiftedRun"}
+    made |= {"RemoteRun"}
     named = {getattr(function, "__name__", "") for function, _ in TABLE}
     rest = {name for name in nl.__all__ if callable(getattr(nl, name))} - made - {"Scene", "InputError"}
     assert rest - named - {"SemanticField"} == set()

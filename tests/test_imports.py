@@ -33,6 +33,7 @@ LAYERS = (
     ("method_configs", "plugin"),
     ("evaluation", "demo"),
     ("__init__",),
+    ("server",),
     ("cli",),
     ("scripts",),
 )
@@ -63,6 +64,7 @@ FOREIGN = {
     "lifted_run": TENSORS | {"numpy"},
     "planning": TENSORS,
     "viewer": TENSORS | {"numpy", "PIL", "msgspec", "viser", "matplotlib"},
+    "server": BASE | {"xxhash", "msgspec", "PIL", "anyio", "starlette", "uvicorn", "mcp", "pydantic"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
     "method_configs": {"nerfstudio"},
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib", "plyfile"},

@@ -28,9 +28,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import normlift_ns
 from normlift_ns.errors import InputError, describe_error
+from normlift_ns.server.host_check import accepted_names, refuse_request
+from normlift_ns.server.http_api import api_routes
 from normlift_ns.server.runs import RunStore, ServedRun, without_paths
 from normlift_ns.server.session import PageLimits, PageSession
-from normlift_ns.viewer.host_check import accepted_names, refuse_request
 
 PAGE_FOLDER = Path(normlift_ns.__file__).parent / "page"
 """Folder of the built page."""
@@ -182,8 +183,6 @@ class WarmServer:
             extra_routes: routes besides those of the page and of the API.
             lifespan: context of Starlette in which the application runs.
         """
-        from normlift_ns.server.http_api import api_routes  # noqa: PLC0415 (it imports this module)
-
         routes = [
             Route("/", self._page), Route("/assets/{path:path}", self._asset), Route("/favicon.ico", _no_icon),
             Route("/api/runs", self._list_runs), Route("/api/runs/{run}/geometry", self._geometry),
@@ -215,6 +214,10 @@ class WarmServer:
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Run slow work in a thread."""
         return await anyio.to_thread.run_sync(work, limiter=self.slow, abandon_on_cancel=True)
+
+    def may_write(self, access: str) -> bool:
+        """Return whether a request with this access token may write."""
+        return self.options.may_write(access)
 
     def offer(self, name: str, content: bytes) -> str:
         """Keep a file for a download, and return its address; the oldest files are dropped."""
@@ -286,7 +289,7 @@ class WarmServer:
             self._pages += 1
             try:
                 run = await self.run_of(websocket.path_params["run"])
-                limits = PageLimits(self.quick, self.slow, self.options.may_write, self.offer)
+                limits = PageLimits(self.quick, self.slow, self.may_write, self.offer)
                 await PageSession(run, websocket, limits).run()
             finally:
                 self._pages -= 1

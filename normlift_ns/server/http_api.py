@@ -6,7 +6,7 @@ import html
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -27,11 +27,9 @@ from normlift_ns.server.runs import ServedRun
 from normlift_ns.server.session import explanation_of
 from normlift_ns.session.state import State
 
-if TYPE_CHECKING:
-    from normlift_ns.server.app import WarmServer
-
 MAX_FEATURES = 2**17
 """Largest number of Gaussians of one request for features."""
+T = TypeVar("T")
 _BINARY = "application/octet-stream"
 
 
@@ -138,8 +136,9 @@ def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
 def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
     """Find regions without reliable evidence."""
     least = query.get("min_reliability")
-    options = {} if least is None else {"min_reliability": _number("min_reliability", least)}
-    return coverage(served.run, **options).to_json()
+    if least is None:
+        return coverage(served.run).to_json()
+    return coverage(served.run, min_reliability=_number("min_reliability", least)).to_json()
 
 
 def features(served: ServedRun, query: Any) -> Content:
@@ -211,12 +210,28 @@ ENDPOINTS = (
 """Endpoints of `/api/runs/{run}/`."""
 
 
-def api_routes(server: WarmServer) -> list[Route]:
+class Server(Protocol):
+    """Part of `app.WarmServer` that the routes need."""
+
+    async def run_of(self, name: str) -> ServedRun:
+        """Return an open run, by its id."""
+        ...
+
+    async def in_thread(self, work: Callable[[], T]) -> T:
+        """Run slow work in a thread."""
+        ...
+
+    def may_write(self, access: str) -> bool:
+        """Return whether a request with this access token may write."""
+        ...
+
+
+def api_routes(server: Server) -> list[Route]:
     """Return the routes of the API."""
 
     def route(endpoint: Endpoint) -> Route:
         async def handle(request: Request) -> Response:
-            if endpoint.writes and not server.options.may_write(_access(request)):
+            if endpoint.writes and not server.may_write(_access(request)):
                 return _json({"error": "This request writes; it needs the access token of the server."}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])

@@ -161,8 +161,8 @@ class ServedRun:
         depth = (self.drawn_scene.means[::50].double().numpy() - position) @ ahead
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else self.frame[2]
         fov = float(np.clip(2 * np.arctan(cameras[0].height / 2 / float(cameras[0].K[1, 1])), *_FIELDS_OF_VIEW))
-        target = position + distance * ahead
-        return PageView(tuple(position.tolist()), tuple(target.tolist()), tuple(self.frame[0]), fov)
+        places = (position.tolist(), (position + distance * ahead).tolist(), self.frame[0])
+        return msgspec.convert(dict(zip(("position", "look_at", "up"), places)) | {"fov": fov}, PageView)
 
     @cached_property
     def examples(self) -> list[str]:
@@ -182,7 +182,7 @@ class ServedRun:
         found, taken = [], self.space.empty_mask()
         for finding in run_query(self.space.field, self.space.means, query):
             size = int(finding.mask.sum())
-            if finding.verdict == "found" and 2 * int((finding.mask & taken).sum()) < size:
+            if size > 0 and finding.verdict in ("found", None) and 2 * int((finding.mask & taken).sum()) < size:
                 found.append(finding.text)
                 taken = taken | finding.mask
         return found[:_NUM_EXAMPLES]
@@ -431,4 +431,6 @@ def without_paths(text: str) -> str:
     """
     for root in _roots():
         text = text.replace(root + "/", "/") if len(root) > 1 else text
+    text = re.sub(r"(['\"])(?:/|[A-Za-z]:\\)[^'\"]*[/\\]([^'\"/\\]*)\1", r"\1\2\1", text)
+    text = re.sub(r"(?<!\w)[A-Za-z]:\\(?:[^\s\\'\"]+\\)*", "", text)
     return re.sub(r"(?<![\w:/.])/(?:[^\s/'\",;:()]+/)*([^\s/'\",;:()]*)", r"\1", text)

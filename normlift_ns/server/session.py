@@ -251,7 +251,7 @@ class PageSession:
 
     async def _change(self, pending: _Pending) -> None:
         """Apply an action that only changes the state."""
-        change = pending.value if callable(pending.value) else self._changes[pending.action]
+        change: Any = pending.value if callable(pending.value) else self._changes[pending.action]
         takes_value = not callable(pending.value) and protocol.VALUES[pending.action] is not Any
         arguments = (pending.value,) if takes_value else ()
 
