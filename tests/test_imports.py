@@ -63,7 +63,7 @@ FOREIGN = {
     "session": BASE,
     "lifted_run": TENSORS | {"numpy"},
     "planning": TENSORS,
-    "viewer": TENSORS | {"numpy", "PIL", "msgspec", "viser", "matplotlib"},
+    "viewer": TENSORS | {"numpy", "PIL"},
     "server": BASE | {"xxhash", "msgspec", "PIL", "anyio", "starlette", "uvicorn", "mcp", "pydantic"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
     "method_configs": {"nerfstudio"},

@@ -189,7 +189,7 @@ class RemoteRun:
 
     @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
-        """List the objects of prompts with oriented boxes, as JSON types; see `LiftedRun.catalogue`."""
+        """List the objects of prompts with oriented boxes, as JSON types."""
         return json.loads(self._post("catalog", _selection(part).question))
 
     def inventory(self) -> dict[str, Any]:

@@ -22,9 +22,9 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.coverage import coverage
 from normlift_ns.server import schema
 from normlift_ns.server.coloring import make_codes
+from normlift_ns.server.describe import explanation_of
 from normlift_ns.server.protocol import decode
 from normlift_ns.server.runs import ServedRun
-from normlift_ns.server.session import explanation_of
 from normlift_ns.session.state import State
 
 MAX_FEATURES = 2**17

@@ -49,7 +49,7 @@ class State:
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     additions: tuple[Bool[Tensor, " n"], ...] = ()
-    """Gaussians that each added object has added to the selection, the latest last. Removing the object removes them."""
+    """Gaussians that each added object has added to the selection, the latest last; removing it removes them."""
     grow_steps: int = 0
     """Number of steps of growth over the neighbor graph; negative: steps of shrinking."""
     hidden: Bool[Tensor, " n"] | None = None
