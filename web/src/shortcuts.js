@@ -12,6 +12,7 @@ const POINTER = [
   ["Ctrl or Alt + click", "Remove an object that was added"],
   ["Arrow keys", "Turn the focused scene"],
   ["+  −", "Zoom the focused scene"],
+  ["Enter", "Select in the middle of the focused scene"],
 ];
 
 /** @param {KeyboardEvent} event @returns {string} As shortcuts name it, such as "Ctrl+Shift+Z". */
