@@ -298,7 +298,7 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
     frames = page.frames()
     assert len(frames) > 10
     assert min(frame["splats"] for frame in frames) == max(frame["splats"] for frame in frames)
-    assert max(frame["unsorted"] for frame in frames) < 0.002
+    assert max(frame["unsorted"] for frame in frames) < 0.002 and min(frame["covered"] for frame in frames) > 0.02
     assert (
         page.page.evaluate(
             "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"

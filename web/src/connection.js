@@ -22,6 +22,7 @@ export class Connection extends EventTarget {
     this.run = run;
     this.greeting = greeting;
     this.seq = 0;
+    this.greeted = 0;
     this.attempts = 0;
     this.online = false;
     this.key = `normlift:${run}`;
@@ -44,7 +45,7 @@ export class Connection extends EventTarget {
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
       this.attempts = 0;
-      this.send("greet", this.greeting());
+      this.greeted = this.send("greet", this.greeting());
       this.report(true);
     };
     this.socket.onmessage = ({ data }) => this.receive(data);

@@ -53,7 +53,6 @@ class Page {
     /** @type {Map<number, (position: number[] | null) => void>} */
     this.probes = new Map();
     this.silent = new Set();
-    this.greeted = 0;
     this.webgl = hasWebGL();
     this.act = this.act.bind(this);
     this.stale = false;
@@ -185,7 +184,7 @@ class Page {
     on("message", ({ text, kind, seq }) => {
       if (kind !== "busy") this.search.setBusy(null);
       if (kind === "error" && seq === this.asked) this.setStale(true);
-      toast(text, { kind, anchor: this.anchors.get(seq) ?? (seq <= this.greeted ? $("ask") : null) });
+      toast(text, { kind, anchor: this.anchors.get(seq) ?? (seq === this.connection.greeted ? $("ask") : null) });
     });
     on("camera", (view, event) => this.moveCamera(view, event));
     on("hover", (message) => this.showHover(message));
@@ -309,7 +308,7 @@ class Page {
   /** @param {any} view @param {any} event */
   moveCamera(view, event) {
     const target = { ...view, fov: view.fov ? (180 / Math.PI) * view.fov : undefined };
-    const greeting = event.message.seq !== undefined && event.message.seq <= this.greeted;
+    const greeting = event.message.seq === this.connection.greeted;
     if (greeting && this.home) return this.sendCamera();
     if (!this.home) {
       this.home = { ...target, look_at: view.look_at };
@@ -333,7 +332,6 @@ class Page {
   /** @param {any} message */
   receiveToken({ token, link, seq }) {
     this.connection.remember({ ...(token ? { token } : {}), ...(link ? { link } : {}) });
-    if (token) this.greeted = seq;
     if (token || this.silent.delete(seq) || !link) return;
     const run = this.runs.length > 1 ? `run=${encodeURIComponent(this.run.id)}&` : "";
     history.replaceState(null, "", `?${run}${link}`);
