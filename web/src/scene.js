@@ -102,6 +102,7 @@ export class SceneRenderer extends EventTarget {
 
   /** @param {boolean} on */
   setOutline(on) {
+    if (on === this.outlined) return;
     this.outlined = on;
     this.invalidate("colors");
   }
