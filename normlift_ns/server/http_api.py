@@ -59,6 +59,8 @@ class Endpoint:
     """True if it writes into the run, which needs the access token unless the server listens on localhost only."""
     parameters: tuple[str, ...] = ()
     """Parameters of the query."""
+    slow: bool = True
+    """False: it is not slower than a question."""
 
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
@@ -185,15 +187,15 @@ def _number(name: str, text: str) -> float:
 
 ENDPOINTS = (
     Endpoint("query", "Answer prompts: relevancy and selection of every Gaussian.", schema.QueryRequest,
-             schema.QueryResult, query),
+             schema.QueryResult, query, slow=False),
     Endpoint("objects", "List the objects of a selection with their boxes.", schema.Selection, schema.ObjectsResult,
-             objects),
+             objects, slow=False),
     Endpoint("catalog", "List the objects of prompts with oriented boxes, in the coordinates of the capture too, and "
              "the images that show them. Takes seconds.", schema.Question, dict[str, Any], catalog),
     Endpoint("explain", "Explain a selection by the images that voted for it.", schema.Selection, schema.ExplainResult,
              explain),
     Endpoint("select", "Return size and position of a selection, or its mask.", schema.SelectRequest,
-             schema.SelectResult, select),
+             schema.SelectResult, select, slow=False),
     Endpoint("render", "Render the scene, a selection or an object as JPEG.", schema.RenderRequest, None, render),
     Endpoint("export", "Return a selection as a file: ply, or masks for a ZIP file of images.", schema.ExportRequest,
              None, export),
@@ -217,8 +219,8 @@ class Server(Protocol):
         """Return an open run, by its id."""
         ...
 
-    async def in_thread(self, work: Callable[[], T]) -> T:
-        """Run slow work in a thread."""
+    async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
+        """Run work in a thread."""
         ...
 
     def may_write(self, access: str) -> bool:
@@ -235,7 +237,7 @@ def api_routes(server: Server) -> list[Route]:
                 return _json({"error": "This request writes; it needs the access token of the server."}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])
-            result = await server.in_thread(lambda: endpoint.work(served, value))
+            result = await server.in_thread(lambda: endpoint.work(served, value), slow=endpoint.slow)
             if not isinstance(result, Content):
                 return _json(result)
             given = {} if result.name is None else {"Content-Disposition": f'attachment; filename="{result.name}"'}

@@ -224,7 +224,11 @@ def answer(served: ServedRun, question: Question) -> Answer:
 
 def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
     """Return the answer to a question, as arrays and as JSON types; the latest ones are cached."""
-    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question))
+    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question), _answer_size)
+
+
+def _answer_size(answered: tuple[Answer, QueryResult]) -> int:
+    return answered[0].relevancy.nbytes + answered[0].selected.nbytes
 
 
 def _answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:

@@ -104,8 +104,10 @@ class PageLimits:
 
     quick: CapacityLimiter
     """For actions."""
+    asking: CapacityLimiter
+    """For questions, the first of which loads the text encoder."""
     slow: CapacityLimiter
-    """For text encoders, explanations, exports and images."""
+    """For explanations, exports and images."""
     may_write: Callable[[str], bool]
     """Returns whether a page with this access token may store prompts in a run."""
     offer: Callable[[str, bytes], str]
@@ -361,7 +363,7 @@ class PageSession:
 
         async def work() -> None:
             try:
-                change = await self._in_thread(compute, self._limits.slow)
+                change = await self._in_thread(compute, self._limits.asking)
                 if self._tokens.finish(token):
                     self._append(_Pending("apply", change, seq))
                     if done:
