@@ -14,11 +14,13 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from research.plots import DOCS
+from tests.browser.page import OnPage
 from tests.browser.person import PANEL, chromium, coloured
-from tests.browser.viewer import TITLE, Own, Tab, ns_viewer, own_viewer
+from tests.browser.server import OWN, Server
+from tests.browser.viewer import TITLE, Tab, ns_viewer
 
 CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
-OWN, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
+ASKED, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
 """Things that the first views of the two viewers show."""
 CLICKED = (0.35, 0.85)
 """Where the pumpkin is in the picture of the first view, as fractions of its width and height."""
@@ -28,7 +30,7 @@ def main(config: Path) -> None:
     """Draws the three pictures."""
     log = Path(tempfile.mkdtemp()) / "log"
     with chromium() as browser:
-        with own_viewer(config, log) as address:
+        with Server(OWN, config, log).running() as address:
             own(browser, address)
         with ns_viewer(config, log, cwd=config.parents[4]) as address:
             stock(browser, address)
@@ -36,16 +38,20 @@ def main(config: Path) -> None:
 
 def own(browser: Browser, address: str) -> None:
     """ns-normlift-view with an answer."""
-    page = Own(browser, address, size=(1200, 640), sharpness=1)
-    page.ask(OWN)
+    page = OnPage(browser, address, size=(1200, 720))
+    page.page.emulate_media(color_scheme="dark")
+    page.page.reload()
+    page.ready()
+    page.ask(ASKED)
     page.selects(lambda count: count > 0, "an answer")
     page.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
+    page.page.locator("#selected").hover()  # so that no button is marked
     shot(page.page, "viewer_own")
 
 
 def stock(browser: Browser, address: str) -> None:
     """ns-viewer with an answer, and with one thing alone."""
-    tab = Tab(browser, address, size=(1300, 947), sharpness=1)
+    tab = Tab(browser, address, size=(1300, 947))
     tab.fresh()
     tab.asks(STOCK, answered=2)
     tab.show("overlay")

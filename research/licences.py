@@ -16,6 +16,7 @@ _USES = {
     "sam": "extra `sam`",
     "siglip": "extra `siglip`",
     "imagenet": "extra `imagenet`",
+    "mcp": "extra `mcp`",
     "dev": "development",
 }
 _UNSTATED = {"gsplat": "Apache-2.0", "segment-anything": "Apache-2.0", "tomli": "MIT"}

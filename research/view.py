@@ -2,8 +2,8 @@
 
     python -m research.view --load-config outputs/room/normlift/demo/config.yml
 
-`python -m research.latency` measures the same on the fox capture. The answer is timed by a client that speaks viser's
-protocol, from the press to the last byte of the coloured Gaussians, least of 8 prompts after a first one (which loads
+`python -m research.latency` measures the same on the fox capture. The answer is timed by a client that speaks the
+protocol of sessions, from the press to the last byte of the colors, least of 8 prompts after a first one (which loads
 the text encoder). With Chromium installed, press_to_picture is timed in it until the picture changes; its unit names
 what drew.
 """
@@ -15,6 +15,7 @@ import json
 import os
 import shutil
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -23,11 +24,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
-import msgspec
 from websockets.sync.client import ClientConnection, connect
 
-from normlift_ns.viewer.shared import BYTES
 from research.report import RESULTS, Report
 from tests.captures import SHARED
 
@@ -36,10 +36,6 @@ PATIENCE = 180
 COLOURS = ("orange", "crimson", "teal", "purple", "dark green", "sky blue", "yellow", "brown", "grey")
 _PROGRAM = "from normlift_ns.cli.start import view; view()"
 _FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "fov": 1.0, "aspect": 1.0,
-    "look_at": [0, 0, 1], "up_direction": [0, 0, 1],
-}  # fmt: skip
 
 
 @contextmanager
@@ -71,40 +67,26 @@ def served(config: Path) -> Iterator[tuple[int, float, Callable[[], tuple[float,
 
 
 class Client:
-    """A browser without a page: it knows viser's protocol, and counts bytes."""
+    """A page without a browser: it knows the protocol of sessions, and counts bytes."""
 
     def __init__(self, line: ClientConnection) -> None:
-        self._line = line
-        self._ids: dict[str, str] = {}
-        self.bytes = 0
-        self.tell(_CAMERA)
-        while not {"Session", "Prompts", "Ask"} <= set(self._ids):
-            self.next()
-        self.set("Session", json.dumps({"token": "benchmark"}))
-        self.drawn = self.splats()
+        self._line, self._seq, self.bytes = line, 0, 0
+        self.act("greet", {"token": "benchmark"})
+        self.drawn = self.codes()
 
-    def tell(self, message: dict[str, Any]) -> None:
-        self._line.send(msgspec.msgpack.encode(message))
+    def act(self, action: str, value: Any) -> None:
+        self._seq += 1
+        self._line.send(json.dumps({"action": action, "value": value, "seq": self._seq}))
 
-    def set(self, label: str, value: Any) -> None:
-        self.tell({"type": "GuiUpdateMessage", "id": self._ids[label], "updates": {"value": value}})
-
-    def next(self) -> list[dict[str, Any]]:
-        raw = self._line.recv(timeout=PATIENCE)
-        assert isinstance(raw, bytes)
-        self.bytes += len(raw)
-        messages = msgspec.msgpack.decode(raw)
-        self._ids |= {x["label"]: x["id"] for x in messages if x["type"].startswith("GuiAdd") and "label" in x}
-        return messages
-
-    def splats(self) -> int:
-        """Waits for Gaussians; how many there are."""
+    def codes(self) -> int:
+        """Waits for the colors that answer the last action; how many there are."""
         while True:
-            for message in self.next():
-                if message["type"] == "GaussianSplatsMessage":
-                    count, rest = divmod(len(message["buffer"]), BYTES)
-                    assert rest == 0
-                    return count
+            raw = self._line.recv(timeout=PATIENCE)
+            self.bytes += len(raw)
+            if isinstance(raw, bytes):
+                (length,) = struct.unpack("<I", raw[:4])
+                if json.loads(raw[4 : 4 + length])["seq"] == self._seq:
+                    return len(raw) - 4 - length
 
     def rest(self, quiet: float = 0.5) -> None:
         """Reads what still comes, until nothing has for some seconds."""
@@ -116,11 +98,10 @@ class Client:
 
     def ask(self, prompt: str) -> tuple[float, int]:
         """Seconds from the press to the answer, and all bytes until then."""
-        self.set("Prompts", prompt)
         self.rest()
         self.bytes, start = 0, time.perf_counter()
-        self.set("Ask", True)
-        self.splats()
+        self.act("ask", {"line": prompt})
+        self.codes()
         return time.perf_counter() - start, self.bytes
 
 
@@ -134,20 +115,20 @@ def pictured(port: int, prompts: Sequence[str]) -> tuple[float, str]:
         page = browser.new_page(viewport={"width": 640, "height": 480})
         page.set_default_timeout(1e3 * PATIENCE)  # drawn in software a large scene takes seconds
         page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
-        page.get_by_role("button", name="Ask", exact=True).wait_for()
+        box_of_prompts = page.get_by_role("searchbox")
+        box_of_prompts.wait_for()
         page.wait_for_timeout(5000)
         name = page.evaluate(
             "() => { const gl = document.createElement('canvas').getContext('webgl2');"
             "const e = gl.getExtension('WEBGL_debug_renderer_info');"
             "return gl.getParameter(e ? e.UNMASKED_RENDERER_WEBGL : gl.RENDERER); }"
         )
-        row = page.locator('xpath=//label[text()="Prompts"]/ancestor::*[.//input][1]').locator("input").last
         seconds = []
         for prompt in prompts[:4]:
-            row.fill(prompt)
+            box_of_prompts.fill(prompt)
             page.wait_for_timeout(3000)
             before, start = page.screenshot(clip=box), time.perf_counter()
-            page.get_by_role("button", name="Ask", exact=True).click()
+            box_of_prompts.press("Enter")
             while page.screenshot(clip=box) == before and time.perf_counter() - start < PATIENCE:
                 pass
             seconds.append(time.perf_counter() - start)
@@ -164,7 +145,9 @@ def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, 
     """
     with served(config) as (port, seconds, spent):
         report.add("view.start_s", seconds, "s until the page can be opened")
-        with connect(f"ws://127.0.0.1:{port}", max_size=None) as line:
+        with urlopen(f"http://127.0.0.1:{port}/api/runs") as answer:
+            run = json.load(answer)["runs"][0]["id"]
+        with connect(f"ws://127.0.0.1:{port}/api/runs/{run}/session", max_size=None) as line:
             client = Client(line)
             shown, worked = spent()
             report.add("view.drawn_s", shown, "s from the start until its Gaussians are in a page that is open")
@@ -173,9 +156,9 @@ def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, 
             asked = [client.ask(prompt) for prompt in prompts[1:]]
         report.add("view.drawn", client.drawn, "Gaussians")
         report.add("view.press_to_bytes_s", min(x[0] for x in asked), "s")
-        report.add("view.bytes_per_answer", BYTES, "bytes per drawn Gaussian")
-        rest = max(x[1] for x in asked) - BYTES * client.drawn
-        report.add("view.other_bytes_per_answer", rest, "bytes of widgets and headers")
+        report.add("view.bytes_per_answer", 1, "byte per drawn Gaussian")
+        rest = max(x[1] for x in asked) - client.drawn
+        report.add("view.other_bytes_per_answer", rest, "bytes of state and headers")
         if picture and shutil.which("chromium"):
             pressed, name = pictured(port, prompts)
             report.add("view.press_to_picture_s", pressed, f"s, {name}")

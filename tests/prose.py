@@ -3,7 +3,7 @@
     python -m tests.prose [FILE …]
 
 It finds docstrings that begin with a question word, "is no X" for "is not an X", clauses that begin with "where" for
-"if", and British spelling. `ALLOWED` and `SKIPPED` list the exceptions with their reasons.
+"if", and British spelling. `ALLOWED` lists the exceptions with their reasons.
 """
 
 import ast
@@ -30,12 +30,7 @@ ALLOWED = {
     r"^((make|write)_catalogue|catalogue(_to_json)?|Catalogue(Object)?)$|\.catalogue\(|`catalogue`": "Python names",
     r'\bmetres_per_unit\b|"metre"': "old name of an option, and JSON value of the catalog of objects",
     r'^"?centre"?$': "JSON key of the coverage report",
-    r'^"colours"$': "value of the viewer's color mode, in links",
     r'"grey"|\bgrey[- ]green\b': "spelling of the XKCD color survey",
-}
-SKIPPED = {
-    "normlift_ns/viewer/person.py": "will be replaced",
-    "normlift_ns/viewer/shared.py": "will be replaced",
 }
 
 
@@ -76,7 +71,7 @@ def problems(source: str) -> Iterator[tuple[int, str]]:
 def main(arguments: Sequence[str]) -> int:
     """Print all findings; return the exit code, 1 if there are any."""
     files = [Path(word).resolve() for word in arguments] or sorted((ROOT / "normlift_ns").rglob("*.py"))
-    names = {name: ROOT / name for name in (str(file.relative_to(ROOT)) for file in files) if name not in SKIPPED}
+    names = {name: ROOT / name for name in (str(file.relative_to(ROOT)) for file in files)}
     found = [f"{name}:{line}: {x}" for name, file in names.items() for line, x in problems(file.read_text("utf8"))]
     print("\n".join(found), end="\n" if found else "")
     return 1 if found else 0

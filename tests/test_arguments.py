@@ -53,6 +53,11 @@ METHODS = [
     row(nl.LiftedRun.floaters, "limit number"),
     row(nl.LiftedRun.camera, "view path|whole"),
     row(nl.LiftedRun.render, "view path|whole|Camera; found None", 0),
+    row(nl.RemoteRun.ask, "negatives texts|None; relevancy word; threshold number|None; min_reliability number; "
+        "refined bool"),
+    row(nl.RemoteRun.features, "start whole; stop whole|None"),
+    row(nl.RemoteRun.coverage, "min_reliability number|None"),
+    row(nl.RemoteRun.camera, "view text|whole"),
     row(nl.Coverage.save, "path path; overwrite bool", "a.json"),
     row(nl.Evidence.select_views, "views wholes|whole m"),
     row(nl.Evidence.columns_of, "views wholes|whole m"),
@@ -107,6 +112,7 @@ TABLE = [
     row(nl.RasterSettings.recorded, "manifest dictionary"),
     row(nl.open_scene, "load_config path; data path|None; load_step whole|None", "/nowhere"),
     row(nl.open_splat, "path path; options SplatOptions", "/nowhere", nl.SplatOptions(colmap=Path("/nowhere"))),
+    row(nl.connect, "url text; run text|None; access_token text", "http://127.0.0.1:9"),
     row(nl.open_run, "load_config path; data path|None; device word; text_embeddings path|None; "
         "prompt_template text|None", "/nowhere"),
     row(nl.coverage, "run LiftedRun"),
@@ -284,6 +290,7 @@ def test_numbers_out_of_range_are_refused_by_name(tmp_path) -> None:
 
 def test_the_table_has_every_public_name():
     made = {"Answer", "Finding", "Histogram", "Why", "Coverage", "Consensus", "Scalars", "Evidence", "LiftedRun"}
+    made |= {"RemoteRun"}
     named = {getattr(function, "__name__", "") for function, *_ in TABLE}
     rest = {name for name in nl.__all__ if callable(getattr(nl, name))} - made - {"Scene", "InputError"}
     assert rest - named - {"SemanticField"} == set()

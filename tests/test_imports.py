@@ -33,6 +33,7 @@ LAYERS = (
     ("method_configs", "plugin"),
     ("evaluation", "demo"),
     ("__init__",),
+    ("server",),
     ("cli",),
     ("scripts",),
 )
@@ -62,7 +63,8 @@ FOREIGN = {
     "session": BASE,
     "lifted_run": TENSORS | {"numpy"},
     "planning": TENSORS,
-    "viewer": TENSORS | {"numpy", "PIL", "msgspec", "viser", "matplotlib"},
+    "viewer": TENSORS | {"numpy", "PIL"},
+    "server": BASE | {"xxhash", "msgspec", "PIL", "anyio", "starlette", "uvicorn", "mcp", "pydantic"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
     "method_configs": {"nerfstudio"},
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib", "plyfile"},

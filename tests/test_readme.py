@@ -190,7 +190,7 @@ def test_the_site_builds_with_examples_as_code_and_loads_nothing_from_elsewhere(
     assert text.count("&gt;&gt;&gt;") > 50 and "nearest_neighbors" in text
 
 
-OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
+OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b|\[config\]")
 
 
 @pytest.mark.parametrize("opens_a_run", [False, True])

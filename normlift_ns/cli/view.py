@@ -13,7 +13,7 @@ from normlift_ns.cli.common import TerminatedError, info, run_command, run_comma
 from normlift_ns.cli.preflight import check_lifted_run, check_readable_file
 from normlift_ns.errors import InputError
 from normlift_ns.options import CheckedOptions, check_device, renamed
-from normlift_ns.viewer.host_check import accepted_names
+from normlift_ns.server.host_check import accepted_names
 
 if TYPE_CHECKING:
     from normlift_ns.lifted_run import LiftedRun

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import html
 import ipaddress
+import os
 import secrets
 import socket
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -28,9 +32,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import normlift_ns
 from normlift_ns.errors import InputError, describe_error
+from normlift_ns.server.host_check import accepted_names, refuse_request
+from normlift_ns.server.http_api import api_routes
 from normlift_ns.server.runs import RunStore, ServedRun, without_paths
 from normlift_ns.server.session import PageLimits, PageSession
-from normlift_ns.viewer.host_check import accepted_names, refuse_request
 
 PAGE_FOLDER = Path(normlift_ns.__file__).parent / "page"
 """Folder of the built page."""
@@ -49,7 +54,10 @@ REQUEST_TIMEOUT = 120.0
 """Seconds after which a request is answered with status 504."""
 _BODY_TIMEOUT = 20.0
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
-_QUICK_THREADS, _SLOW_THREADS = 4, 4
+_TRIM_INTERVAL = 2.0
+_QUICK_THREADS = 4
+_THREADS = max(2, (os.cpu_count() or 2) // 2)
+"""Threads for questions, and for slower work such as explanations; each uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -169,10 +177,16 @@ class WarmServer:
 
     def __init__(self, runs: RunStore, options: ServerOptions) -> None:
         self.runs, self.options = runs, options
-        self.quick, self.slow = CapacityLimiter(_QUICK_THREADS), CapacityLimiter(_SLOW_THREADS)
+        self.limits = PageLimits(
+            CapacityLimiter(_QUICK_THREADS),
+            CapacityLimiter(_THREADS),
+            CapacityLimiter(_THREADS),
+            self.may_write,
+            self.offer,
+        )
         self._opening = CapacityLimiter(MAX_PAGES)
         self._downloads: OrderedDict[str, tuple[str, bytes]] = OrderedDict()
-        self._pages = 0
+        self._pages, self._next_trim = 0, 0.0
         self._server: uvicorn.Server | None = None
 
     def app(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> ASGIApp:
@@ -182,8 +196,6 @@ class WarmServer:
             extra_routes: routes besides those of the page and of the API.
             lifespan: context of Starlette in which the application runs.
         """
-        from normlift_ns.server.http_api import api_routes  # noqa: PLC0415 (it imports this module)
-
         routes = [
             Route("/", self._page), Route("/assets/{path:path}", self._asset), Route("/favicon.ico", _no_icon),
             Route("/api/runs", self._list_runs), Route("/api/runs/{run}/geometry", self._geometry),
@@ -212,9 +224,22 @@ class WarmServer:
             raise HTTPException(404, f"There is no run {name[:80]!r}. The runs are: {', '.join(self.runs.ids)}.")
         return await anyio.to_thread.run_sync(self.runs.get, name, limiter=self._opening, abandon_on_cancel=True)
 
-    async def in_thread(self, work: Callable[[], T]) -> T:
-        """Run slow work in a thread."""
-        return await anyio.to_thread.run_sync(work, limiter=self.slow, abandon_on_cancel=True)
+    async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
+        """Run work in a thread.
+
+        Args:
+            slow: False: the work is not slower than a question.
+        """
+        limiter = self.limits.slow if slow else self.limits.asking
+        result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
+        if time.monotonic() > self._next_trim:
+            self._next_trim = time.monotonic() + _TRIM_INTERVAL
+            await anyio.to_thread.run_sync(_trim_memory, limiter=self.limits.slow, abandon_on_cancel=True)
+        return result
+
+    def may_write(self, access: str) -> bool:
+        """Return whether a request with this access token may write."""
+        return self.options.may_write(access)
 
     def offer(self, name: str, content: bytes) -> str:
         """Keep a file for a download, and return its address; the oldest files are dropped."""
@@ -286,8 +311,7 @@ class WarmServer:
             self._pages += 1
             try:
                 run = await self.run_of(websocket.path_params["run"])
-                limits = PageLimits(self.quick, self.slow, self.options.may_write, self.offer)
-                await PageSession(run, websocket, limits).run()
+                await PageSession(run, websocket, self.limits).run()
             finally:
                 self._pages -= 1
         except (WebSocketDisconnect, anyio.BrokenResourceError):
@@ -314,6 +338,12 @@ class WarmServer:
         """Stop to serve."""
         if self._server is not None:
             self._server.should_exit = True
+
+
+def _trim_memory() -> None:
+    """Return free memory to the system, of which glibc otherwise keeps hundreds of megabytes between large arrays."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 async def _close(websocket: WebSocket, error: BaseException) -> None:

@@ -119,19 +119,23 @@ class RemoteFinding:
         return self.result.verdict
 
 
-Part = RemoteAnswer | RemoteFinding | Tensor
+Part = RemoteAnswer | RemoteFinding | Bool[Tensor, " n"]
+"""Part of a run: an answer of its server, a finding of one, or a mask."""
 
 
 @dataclass(eq=False, repr=False)
 class RemoteRun:
     """A lifted run on a server, with the verbs of `LiftedRun`. Methods may be called from any thread.
 
-    >>> run = connect(url)
+    >>> from normlift_ns import connect, open_run
+    >>> from normlift_ns.server.app import ServerOptions, WarmServer
+    >>> from normlift_ns.server.runs import RunStore
+    >>> server = WarmServer(RunStore([config], open_run), ServerOptions(port=0))  # as ns-normlift-serve makes it
+    >>> run = connect(f"http://127.0.0.1:{server.start()}")
     >>> answer = run.ask("red", "yellow")
-    >>> answer["red"].mask.shape, answer["red"].verdict
-    (torch.Size([6012]), 'found')
-    >>> run.render("0001", answer["red"]).shape
-    torch.Size([120, 160, 3])
+    >>> answer["red"].verdict, run.render("0001", answer["red"]).shape
+    ('found', torch.Size([120, 160, 3]))
+    >>> server.stop()
     """
 
     address: str
@@ -150,6 +154,7 @@ class RemoteRun:
         runs = json.loads(self._get("/api/runs"))["runs"]
         return next(run for run in runs if run["id"] == self.id)
 
+    @check_arguments
     def ask(
         self,
         *texts: str,
@@ -173,6 +178,7 @@ class RemoteRun:
         result = msgspec.json.decode(metadata["answer"], type=QueryResult)
         return RemoteAnswer(Question(list(texts), *settings), result, tensors["relevancy"], tensors["selected"])
 
+    @check_arguments
     def objects(self, part: Part) -> ObjectsResult:
         """List the objects of a selection with their boxes."""
         return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
@@ -181,14 +187,16 @@ class RemoteRun:
         """Return size and position of a selection, such as `Selection(ray=…)`."""
         return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
 
+    @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
-        """List the objects of prompts with oriented boxes; the content of `Catalogue.to_json`."""
+        """List the objects of prompts with oriented boxes, as JSON types."""
         return json.loads(self._post("catalog", _selection(part).question))
 
     def inventory(self) -> dict[str, Any]:
-        """List the objects of the scene without prompts; the content of `Catalogue.to_json`."""
+        """List the objects of the scene without prompts, as JSON types; see `LiftedRun.inventory`."""
         return json.loads(self._get(self._path("inventory")))
 
+    @check_arguments
     def why(self, part: Part) -> ExplainResult:
         """Explain a selection by the images that voted for it."""
         return msgspec.json.decode(self._post("explain", _selection(part)), type=ExplainResult)
@@ -197,16 +205,19 @@ class RemoteRun:
         """Return the mask of Gaussians that likely belong to no surface."""
         return torch.from_numpy(np.load(io.BytesIO(self._get(self._path("floaters?arrays=npy")))))
 
+    @check_arguments
     def coverage(self, min_reliability: float | None = None) -> dict[str, Any]:
         """Find regions without reliable evidence; the content of `Coverage.to_json`."""
         query = "" if min_reliability is None else f"?min_reliability={min_reliability}"
         return json.loads(self._get(self._path("coverage" + query)))
 
+    @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
         """Return the unit features of the Gaussians from `start` to before `stop`."""
         query = f"features?start={start}" + ("" if stop is None else f"&stop={stop}")
         return torch.from_numpy(np.load(io.BytesIO(self._get(self._path(query)))))
 
+    @check_arguments
     def render(
         self, view: str | int | Camera = 0, found: Part | None = None, *, max_size: int = 2048
     ) -> UInt8[Tensor, "h w 3"]:
@@ -222,6 +233,7 @@ class RemoteRun:
         with Image.open(io.BytesIO(self._post("render", request))) as image:
             return torch.from_numpy(np.array(image.convert("RGB")))
 
+    @check_arguments
     def export(self, path: str | Path, part: Part | None = None, *, overwrite: bool = False) -> Path:
         """Write Gaussians to a PLY file on this machine; None: the whole scene.
 
@@ -234,6 +246,7 @@ class RemoteRun:
             draft.write_bytes(self._post("export", {} if part is None else _selection(part)))
         return path
 
+    @check_arguments
     def masks(self, folder: str | Path, part: Part, *, overwrite: bool = False) -> list[Path]:
         """Write a PNG mask for each training image to a folder on this machine, and return the paths."""
         folder = check_path("folder", folder)
@@ -249,10 +262,12 @@ class RemoteRun:
                     draft.write_bytes(archive.read(name))
         return paths
 
+    @check_arguments
     def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
         """Store a question in the run; needs the access token unless the server is on this machine."""
         return json.loads(self._post("save", {"question": answer.question, "replace": replace}))["stored"]
 
+    @check_arguments
     def camera(self, view: str | int) -> Camera:
         """Return the camera of a training image, by its name or index."""
         cameras = json.loads(self._get(self._path("cameras")))["cameras"]
@@ -276,26 +291,34 @@ class RemoteRun:
         return self._send("GET", path, None)
 
     def _send(self, method: str, path: str, body: bytes | None) -> bytes:
-        headers = {"Content-Type": "application/json"}
-        headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
         with self._lock:
-            for attempt in range(2):
+            try:
                 try:
-                    if self._connection is None:
-                        self._connection = _connect(self.address)
-                    self._connection.request(method, path, body, headers)
-                    response = self._connection.getresponse()
-                    content = response.read(_MAX_ANSWER)
-                    break
-                except (http.client.HTTPException, OSError) as error:
-                    if self._connection is not None:
-                        self._connection.close()
-                    self._connection = None
-                    if attempt == 1 or isinstance(error, TimeoutError):
-                        raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
-        if response.status != 200:
+                    status, content = self._exchange(method, path, body)
+                except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
+                    self._close()  # the server closes connections that are idle
+                    status, content = self._exchange(method, path, body)
+            except (http.client.HTTPException, OSError) as error:
+                self._close()
+                raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
+        if status != 200:
             raise InputError(f"The server at {self.address} refuses the request: {_reason(content)}")
         return content
+
+    def _exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        """Send a request; return the status and the content of the answer."""
+        headers = {"Content-Type": "application/json"}
+        headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
+        if self._connection is None:
+            self._connection = _connect(self.address)
+        self._connection.request(method, path, body, headers)
+        response = self._connection.getresponse()
+        return response.status, response.read(_MAX_ANSWER)
+
+    def _close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
 
 
 def _connect(address: str) -> http.client.HTTPConnection:
@@ -343,9 +366,11 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
         ValueError: the address is not valid, or the server has no such run.
         OSError: the server does not answer.
 
-    >>> run = connect(url)
-    >>> 0.2 < run.ask("red")["red"].result.fraction < 0.3
-    False
+    >>> try:
+    ...     connect("ftp://localhost")
+    ... except ValueError as error:
+    ...     print(error)
+    url must be the address of a server such as http://localhost:7008, got 'ftp://localhost'
     """
     parts = urlsplit(url if "://" in url else f"http://{url}")
     if parts.scheme not in ("http", "https") or not parts.hostname:

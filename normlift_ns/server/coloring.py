@@ -160,7 +160,7 @@ def _lightened(color: RGB) -> RGB:
     """Mix a dark color with white until its luminance suffices.
 
     >>> [round(x, 2) for x in _lightened((0.2, 0.0, 0.25))]
-    [0.46, 0.33, 0.49]
+    [0.45, 0.31, 0.48]
     """
     luminance = sum(weight * x for weight, x in zip(_LUMINANCE, color))
     white = max(0.0, (_MIN_LUMINANCE - luminance) / (1 - luminance)) if luminance < _MIN_LUMINANCE else 0.0

@@ -6,7 +6,7 @@ import html
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -22,16 +22,14 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.coverage import coverage
 from normlift_ns.server import schema
 from normlift_ns.server.coloring import make_codes
+from normlift_ns.server.describe import explanation_of
 from normlift_ns.server.protocol import decode
 from normlift_ns.server.runs import ServedRun
-from normlift_ns.server.session import explanation_of
 from normlift_ns.session.state import State
-
-if TYPE_CHECKING:
-    from normlift_ns.server.app import WarmServer
 
 MAX_FEATURES = 2**17
 """Largest number of Gaussians of one request for features."""
+T = TypeVar("T")
 _BINARY = "application/octet-stream"
 
 
@@ -61,6 +59,8 @@ class Endpoint:
     """True if it writes into the run, which needs the access token unless the server listens on localhost only."""
     parameters: tuple[str, ...] = ()
     """Parameters of the query."""
+    slow: bool = True
+    """False: it is not slower than a question."""
 
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
@@ -138,8 +138,9 @@ def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
 def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
     """Find regions without reliable evidence."""
     least = query.get("min_reliability")
-    options = {} if least is None else {"min_reliability": _number("min_reliability", least)}
-    return coverage(served.run, **options).to_json()
+    if least is None:
+        return coverage(served.run).to_json()
+    return coverage(served.run, min_reliability=_number("min_reliability", least)).to_json()
 
 
 def features(served: ServedRun, query: Any) -> Content:
@@ -186,15 +187,15 @@ def _number(name: str, text: str) -> float:
 
 ENDPOINTS = (
     Endpoint("query", "Answer prompts: relevancy and selection of every Gaussian.", schema.QueryRequest,
-             schema.QueryResult, query),
+             schema.QueryResult, query, slow=False),
     Endpoint("objects", "List the objects of a selection with their boxes.", schema.Selection, schema.ObjectsResult,
-             objects),
+             objects, slow=False),
     Endpoint("catalog", "List the objects of prompts with oriented boxes, in the coordinates of the capture too, and "
              "the images that show them. Takes seconds.", schema.Question, dict[str, Any], catalog),
     Endpoint("explain", "Explain a selection by the images that voted for it.", schema.Selection, schema.ExplainResult,
              explain),
     Endpoint("select", "Return size and position of a selection, or its mask.", schema.SelectRequest,
-             schema.SelectResult, select),
+             schema.SelectResult, select, slow=False),
     Endpoint("render", "Render the scene, a selection or an object as JPEG.", schema.RenderRequest, None, render),
     Endpoint("export", "Return a selection as a file: ply, or masks for a ZIP file of images.", schema.ExportRequest,
              None, export),
@@ -211,16 +212,32 @@ ENDPOINTS = (
 """Endpoints of `/api/runs/{run}/`."""
 
 
-def api_routes(server: WarmServer) -> list[Route]:
+class Server(Protocol):
+    """Part of `app.WarmServer` that the routes need."""
+
+    async def run_of(self, name: str) -> ServedRun:
+        """Return an open run, by its id."""
+        ...
+
+    async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
+        """Run work in a thread."""
+        ...
+
+    def may_write(self, access: str) -> bool:
+        """Return whether a request with this access token may write."""
+        ...
+
+
+def api_routes(server: Server) -> list[Route]:
     """Return the routes of the API."""
 
     def route(endpoint: Endpoint) -> Route:
         async def handle(request: Request) -> Response:
-            if endpoint.writes and not server.options.may_write(_access(request)):
+            if endpoint.writes and not server.may_write(_access(request)):
                 return _json({"error": "This request writes; it needs the access token of the server."}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])
-            result = await server.in_thread(lambda: endpoint.work(served, value))
+            result = await server.in_thread(lambda: endpoint.work(served, value), slow=endpoint.slow)
             if not isinstance(result, Content):
                 return _json(result)
             given = {} if result.name is None else {"Content-Disposition": f'attachment; filename="{result.name}"'}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import anyio
 import msgspec
@@ -27,9 +27,10 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 import normlift_ns
-from normlift_ns.io.atomic import atomic_file, numbered_paths, safe_file_name
+from normlift_ns.io.atomic import atomic_file, numbered_paths
 from normlift_ns.server import http_api, schema
 from normlift_ns.server.app import WarmServer
+from normlift_ns.server.coloring import ColorMode
 from normlift_ns.server.protocol import decode
 from normlift_ns.server.runs import ServedRun, without_paths
 
@@ -39,6 +40,7 @@ answers say which words it does not know. A verdict tells whether a prompt is in
 probably not here. list_objects counts and places objects; render shows them; explain shows the photos that are the
 evidence. Positions are in units of the scene."""
 _READS = ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
+_WRITES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 _MAX_RESULT = 60_000
 """Largest number of characters of a result."""
 
@@ -48,6 +50,104 @@ ObjectNumber = Annotated[int | None, Field(description="Number of an object from
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
+class Tools:
+    """Tools of some runs; the docstring of a method is the description that agents read."""
+
+    def __init__(self, server: WarmServer, export_dir: Path | None) -> None:
+        self._server, self._export_dir = server, export_dir
+
+    def list_runs(self) -> str:
+        """List the scenes that can be searched, with their encoders, sizes, saved prompts and example prompts."""
+        return _text([self._facts(name) for name in self._server.runs.ids])
+
+    def find(self, run: Run, prompts: Prompts) -> str:
+        """Search a scene for prompts. Returns for each prompt a verdict (found, weak match, probably not here), the
+        number of Gaussians, the position and size of what matches, the highest relevancy (0..1), and the position of
+        the nearest match."""
+        rows = msgspec.to_builtins(schema.answered(self._run(run), _question(prompts))[1])
+        for row in rows["results"]:
+            row.pop("histogram")
+        return _text(rows)
+
+    def list_objects(self, run: Run, prompts: Prompts) -> str:
+        """List and count the separate objects that match prompts, the largest first, each with number, box (min and
+        max corner), center, number of Gaussians and strength of evidence. Without prompts, list the main objects of the
+        scene, which takes up to a minute."""
+        if len(prompts) == 0:
+            return _text(self.inventory(run))
+        return _text(schema.objects_result(schema.select_state(self._run(run), _selection(prompts, None))))
+
+    def explain(self, run: Run, prompts: Prompts, object_number: ObjectNumber = None) -> list[Any]:
+        """Explain why a scene matches prompts: how many photos agree, with up to three photos in which the regions that
+        are the evidence are outlined."""
+        result = http_api.explain(self._run(run), _selection(prompts, object_number))
+        images = [Image(data=_data(vote.url), format="jpeg") for vote in result.support if vote.url is not None]
+        facts = msgspec.to_builtins(result)
+        for row in (*facts["support"], *facts["disagreement"]):
+            row.pop("url")
+        return [_text(facts), *images]
+
+    def render(
+        self,
+        run: Run,
+        view: Annotated[str | int, Field(description="Name or index of a training photo whose camera to use")] = 0,
+        prompts: Prompts = [],  # noqa: B006 (read only)
+        object_number: ObjectNumber = None,
+        isolate: Annotated[bool, Field(description="Draw only what matches")] = False,
+        mode: ColorMode = "overlay",
+    ) -> Image:
+        """Render a scene as an image. With prompts, what matches is highlighted; with object_number, the camera looks
+        at that object."""
+        served = self._run(run)
+        chosen = _selection(prompts, object_number) if len(prompts) > 0 else None
+        look_at = None if chosen is None or object_number is None else _view_of(served, chosen)
+        request = schema.RenderRequest(view, None, look_at, chosen, mode, isolate)
+        return Image(data=http_api.render(served, request).body, format="jpeg")
+
+    def find_floaters(self, run: Run) -> str:
+        """Count the Gaussians of a scene that likely belong to no surface, and say where they are."""
+        return _text(http_api.floaters(self._run(run), {}))
+
+    def measure(self, run: Run, start: Point, end: Point) -> str:
+        """Measure the distance of two positions (scene units), also in units of the original capture. Take positions
+        from the centers and boxes of list_objects."""
+        distance = float(np.linalg.norm(np.subtract(start, end)))
+        scale = self._run(run).run.to_capture.scale
+        return _text({"distance": distance, "distance_in_capture_units": distance * scale})
+
+    def export(
+        self,
+        run: Run,
+        prompts: Prompts,
+        object_number: ObjectNumber = None,
+        format: Annotated[str, Field(description="ply, or masks for a ZIP file of images")] = "ply",
+    ) -> str:
+        """Write what matches prompts, or one object of it, to a new file in the export folder of the server; returns
+        the name of the file. No file is ever replaced."""
+        if self._export_dir is None:
+            raise InputError("This server exports no files; start it with --export-dir.")
+        request = schema.ExportRequest(_question(prompts), object=object_number, format=format)
+        content = http_api.export(self._run(run), request)
+        name = Path(content.name or "selection").name
+        path = next(path for path in numbered_paths(self._export_dir / name) if not path.exists())
+        with atomic_file(path) as draft:
+            draft.write_bytes(content.body)
+        return _text({"file": path.name, "bytes": len(content.body)})
+
+    def inventory(self, run: str) -> dict[str, Any]:
+        """Return the main objects of a scene."""
+        served = self._run(run)
+        return served.cached(b"inventory", lambda: http_api.inventory(served, {}))
+
+    def _run(self, name: str) -> ServedRun:
+        return self._server.runs.get(name)
+
+    def _facts(self, name: str) -> dict[str, Any]:
+        facts = self._run(name).describe(read_only=True)
+        return {key: facts[key] for key in ("id", "name", "encoder", "num_gaussians", "num_views", "saved_prompts",
+                                            "examples", "center", "radius", "up")}  # fmt: skip
+
+
 def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
     """Return the MCP server of some runs.
 
@@ -55,133 +155,35 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
         export_dir: folder below which the tool export writes; None: there is no such tool.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
-
-    def tool(annotations: ToolAnnotations = _READS) -> Callable[[Callable[..., Any]], None]:
-        """Register a function as a tool that runs in a thread."""
-
-        def register(function: Callable[..., Any]) -> None:
-            @wraps(function)
-            async def run(**arguments: Any) -> Any:
-                return await _guarded(server, lambda: function(**arguments))
-
-            mcp.add_tool(run, annotations=annotations, structured_output=False)
-
-        return register
-
-    @tool()
-    def list_runs() -> str:
-        """List the scenes that can be searched, with their encoders, sizes, saved prompts and example prompts."""
-        runs = [server.runs.get(name).describe(read_only=True) for name in server.runs.ids]
-        hidden = ("read_only", "digest", "num_drawn", "num_left_out")
-        return _text([{key: value for key, value in run.items() if key not in hidden} for run in runs])
-
-    @tool()
-    def find(run: Run, prompts: Prompts) -> str:
-        """Search a scene for prompts. Returns for each prompt a verdict (found, weak match, probably not here), the
-        number of Gaussians, the position and size of what matches, the highest relevancy (0..1), and the position of
-        the nearest match."""
-        served = server.runs.get(run)
-        rows = msgspec.to_builtins(schema.answered(served, _question(prompts))[1])
-        for row in rows["results"]:
-            row.pop("histogram")
-        return _text(rows)
-
-    @tool()
-    def list_objects(run: Run, prompts: Prompts) -> str:
-        """List and count the separate objects that match prompts, the largest first, each with number, box (min and
-        max corner), center, number of Gaussians and strength of evidence. Without prompts, list the main objects of the
-        scene, which takes up to a minute."""
-        served = server.runs.get(run)
-        if len(prompts) == 0:
-            return _text(_inventory(served))
-        return _text(schema.objects_result(schema.select_state(served, _selection(prompts, None))))
-
-    @tool()
-    def explain(run: Run, prompts: Prompts, object_number: ObjectNumber = None) -> list[Any]:
-        """Explain why a scene matches prompts: how many photos agree, with up to three photos in which the regions that
-        are the evidence are outlined."""
-        result = http_api.explain(server.runs.get(run), _selection(prompts, object_number))
-        images = [Image(data=_data(vote.url), format="jpeg") for vote in result.support if vote.url is not None]
-        facts = msgspec.to_builtins(result)
-        for row in (*facts["support"], *facts["disagreement"]):
-            row.pop("url")
-        return [_text(facts), *images]
-
-    @tool()
-    def render(
-        run: Run,
-        view: Annotated[str | int, Field(description="Name or index of a training photo whose camera to use")] = 0,
-        prompts: Prompts = [],  # noqa: B006 (read only)
-        object_number: ObjectNumber = None,
-        isolate: Annotated[bool, Field(description="Draw only what matches")] = False,
-        mode: Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"] = "overlay",
-    ) -> Image:
-        """Render a scene as an image. With prompts, what matches is highlighted; with object_number, the camera looks
-        at that object."""
-        served = server.runs.get(run)
-        chosen = _selection(prompts, object_number) if len(prompts) > 0 else None
-        look_at = None if chosen is None or object_number is None else _view_of(served, chosen)
-        request = schema.RenderRequest(view, None, look_at, chosen, mode, isolate)
-        return Image(data=http_api.render(served, request).body, format="jpeg")
-
-    @tool()
-    def find_floaters(run: Run) -> str:
-        """Count the Gaussians of a scene that likely belong to no surface, and say where they are."""
-        return _text(http_api.floaters(server.runs.get(run), {}))
-
-    @tool()
-    def measure(run: Run, start: Point, end: Point) -> str:
-        """Measure the distance of two positions (scene units), also in units of the original capture. Take positions
-        from the centers and boxes of list_objects."""
-        distance = float(np.linalg.norm(np.subtract(start, end)))
-        scale = server.runs.get(run).run.to_capture.scale
-        return _text({"distance": distance, "distance_in_capture_units": distance * scale})
-
+    tools = Tools(server, export_dir)
+    reading = (tools.list_runs, tools.find, tools.list_objects, tools.explain, tools.render, tools.find_floaters,
+               tools.measure)  # fmt: skip
+    for tool in reading:
+        mcp.add_tool(_guarded(server, tool), annotations=_READS, structured_output=False)
     if export_dir is not None and not server.options.read_only:
+        mcp.add_tool(_guarded(server, tools.export), annotations=_WRITES, structured_output=False)
+    json_type: dict[str, Any] = {"mime_type": "application/json"}
+    mcp.resource("normlift://runs", description="All scenes", **json_type)(_guarded(server, tools.list_runs))
 
-        @tool(ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False))
-        def export(
-            run: Run,
-            prompts: Prompts,
-            object_number: ObjectNumber = None,
-            format: Annotated[str, Field(description="ply, or masks for a ZIP file of images")] = "ply",
-        ) -> str:
-            """Write what matches prompts, or one object of it, to a new file in the export folder of the server;
-            returns the name of the file. No file is ever replaced."""
-            content = http_api.export(server.runs.get(run), _export_request(prompts, object_number, format))
-            name = safe_file_name(Path(content.name or "selection").stem) + Path(content.name or "").suffix
-            path = next(path for path in numbered_paths(export_dir / name) if not path.exists())
-            with atomic_file(path) as draft:
-                draft.write_bytes(content.body)
-            return _text({"file": path.name, "bytes": len(content.body)})
+    def catalog(run: str) -> str:
+        return _text(tools.inventory(run))
 
-    @mcp.resource("normlift://runs", mime_type="application/json", description="All scenes")
-    async def runs() -> str:
-        return await _guarded(server, lambda: _text([_facts(server.runs.get(name)) for name in server.runs.ids]))
-
-    @mcp.resource(
-        "normlift://runs/{run}/catalog", mime_type="application/json", description="Main objects of a scene with boxes"
-    )
-    async def catalog(run: str) -> str:
-        return await _guarded(server, lambda: _text(_inventory(server.runs.get(run))))
-
+    about = "Main objects of a scene with boxes"
+    mcp.resource("normlift://runs/{run}/catalog", description=about, **json_type)(_guarded(server, catalog))
     return mcp
 
 
-async def _guarded(server: WarmServer, work: Callable[[], Any]) -> Any:
-    """Run work in a thread; an error is reported without paths of this machine."""
-    try:
-        return await server.in_thread(work)
-    except Exception as error:
-        raise ToolError(without_paths(describe_error(error)[0])) from None
+def _guarded(server: WarmServer, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a coroutine function that runs a function in a thread; its errors name no paths of this machine."""
 
+    @wraps(function)
+    async def run(**arguments: Any) -> Any:
+        try:
+            return await server.in_thread(lambda: function(**arguments))
+        except Exception as error:
+            raise ToolError(without_paths(describe_error(error)[0])) from None
 
-def _facts(served: ServedRun) -> dict[str, Any]:
-    return served.describe(read_only=True)
-
-
-def _inventory(served: ServedRun) -> dict[str, Any]:
-    return served.cached(b"inventory", lambda: http_api.inventory(served, {}))
+    return run
 
 
 def _question(prompts: list[str]) -> schema.Question:
@@ -190,10 +192,6 @@ def _question(prompts: list[str]) -> schema.Question:
 
 def _selection(prompts: list[str], number: int | None) -> schema.Selection:
     return schema.Selection(_question(prompts), object=number)
-
-
-def _export_request(prompts: list[str], number: int | None, kind: str) -> schema.ExportRequest:
-    return schema.ExportRequest(_question(prompts), object=number, format=kind)
 
 
 def _view_of(served: ServedRun, selection: schema.Selection) -> Any:

@@ -129,15 +129,18 @@ class Still(msgspec.Struct, frozen=True):
 
 _Unit = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Step = Annotated[int, msgspec.Meta(ge=-100, le=100)]
+_COUNT: Any = Count
+_TEXTS: Any = Texts
+_IDS: Any = Annotated[list[Count], msgspec.Meta(max_length=1000)]
 VALUES: dict[str, Any] = {
     **dict.fromkeys(
         ("cancel", "undo", "redo", "clear", "suggested", "invert", "show_all", "remove_weak", "floaters", "explain",
          "link"), Any,
     ),
-    **dict.fromkeys(("hide", "isolate"), Annotated[list[Count], msgspec.Meta(max_length=1000)] | None),
+    **dict.fromkeys(("hide", "isolate"), _IDS | None),
     **dict.fromkeys(("layer_add", "layer_select", "layer_remove"), LayerName),
     "greet": Greeting, "ask": Ask, "go_to_step": Count, "threshold": Finite, "reliability": _Unit,
-    "show_prompt": Count | None, "rule": RelevancyRule | Literal["auto"], "negatives": Texts | None,
+    "show_prompt": _COUNT | None, "rule": RelevancyRule | Literal["auto"], "negatives": _TEXTS | None,
     "color_mode": ColorMode, "colormap": Colormap, "pick": Pick, "hover": Ray, "region": Region, "brush": Brush,
     "grow": _Step, "object": ObjectAction, "go_to": Target, "save_prompts": Save | None,
     "layer_visible": LayerVisibility, "export": Export, "camera": PageView, "still": Still,

@@ -42,7 +42,8 @@ from normlift_ns.session.state import History, State
 
 MAX_MEMORIES = 64
 """Number of pages that are remembered after they were closed."""
-_MAX_RESULTS = 8
+_MAX_RESULTS, _MAX_RESULT_BYTES = 256, 2**26
+"""Number and size of the results of a run that are kept."""
 _SAMPLE = 4096
 _NUM_EXAMPLES, _NUM_CANDIDATES = 4, 24
 _BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray")
@@ -92,7 +93,7 @@ class ServedRun:
     reading: threading.Lock = field(default_factory=threading.Lock)
     """Held while the text encoder or the votes are used, so that they are not loaded twice."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
-    _results: OrderedDict[bytes, Any] = field(default_factory=OrderedDict)
+    _results: OrderedDict[bytes, tuple[Any, int]] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
 
     @cached_property
@@ -161,8 +162,8 @@ class ServedRun:
         depth = (self.drawn_scene.means[::50].double().numpy() - position) @ ahead
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else self.frame[2]
         fov = float(np.clip(2 * np.arctan(cameras[0].height / 2 / float(cameras[0].K[1, 1])), *_FIELDS_OF_VIEW))
-        target = position + distance * ahead
-        return PageView(tuple(position.tolist()), tuple(target.tolist()), tuple(self.frame[0]), fov)
+        places = (position.tolist(), (position + distance * ahead).tolist(), self.frame[0])
+        return msgspec.convert(dict(zip(("position", "look_at", "up"), places)) | {"fov": fov}, PageView)
 
     @cached_property
     def examples(self) -> list[str]:
@@ -182,7 +183,7 @@ class ServedRun:
         found, taken = [], self.space.empty_mask()
         for finding in run_query(self.space.field, self.space.means, query):
             size = int(finding.mask.sum())
-            if finding.verdict == "found" and 2 * int((finding.mask & taken).sum()) < size:
+            if size > 0 and finding.verdict in ("found", None) and 2 * int((finding.mask & taken).sum()) < size:
                 found.append(finding.text)
                 taken = taken | finding.mask
         return found[:_NUM_EXAMPLES]
@@ -249,16 +250,23 @@ class ServedRun:
         note = f" {faint:,} Gaussians are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
         return file, content, f"Downloaded {file} with {int(mask.sum()) - faint:,} Gaussians.{note}"
 
-    def cached(self, key: bytes, compute: Callable[[], T]) -> T:
-        """Return a result of this run by its key; the latest ones are kept."""
+    def cached(self, key: bytes, compute: Callable[[], T], size: Callable[[T], int] = lambda result: 0) -> T:
+        """Return a result of this run by its key; the latest ones are kept.
+
+        Args:
+            size: returns the bytes of a result.
+        """
         with self._memory_lock:
             found = self._results.pop(key, None)
-        found = compute() if found is None else found
+        if found is None:
+            result = compute()
+            found = result, size(result)
         with self._memory_lock:
             self._results[key] = found
-            while len(self._results) > _MAX_RESULTS:
-                self._results.popitem(last=False)
-        return found
+            total = sum(count for _, count in self._results.values())
+            while len(self._results) > 1 and (total > _MAX_RESULT_BYTES or len(self._results) > _MAX_RESULTS):
+                total -= self._results.popitem(last=False)[1][1]
+        return found[0]
 
     def view_of(
         self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
@@ -431,4 +439,6 @@ def without_paths(text: str) -> str:
     """
     for root in _roots():
         text = text.replace(root + "/", "/") if len(root) > 1 else text
+    text = re.sub(r"(['\"])(?:/|[A-Za-z]:\\)[^'\"]*[/\\]([^'\"/\\]*)\1", r"\1\2\1", text)
+    text = re.sub(r"(?<!\w)[A-Za-z]:\\(?:[^\s\\'\"]+\\)*", "", text)
     return re.sub(r"(?<![\w:/.])/(?:[^\s/'\",;:()]+/)*([^\s/'\",;:()]*)", r"\1", text)

@@ -14,10 +14,10 @@ from normlift_ns.options import RelevancyRule
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query
 from normlift_ns.server.coloring import ColorMode
+from normlift_ns.server.describe import region_mask
 from normlift_ns.server.permalink import Finite, PageView
 from normlift_ns.server.protocol import CameraValue, Ray, Region
 from normlift_ns.server.runs import ServedRun
-from normlift_ns.server.session import region_mask
 from normlift_ns.session import actions
 from normlift_ns.session.objects import ObjectRow, list_objects
 from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts
@@ -224,7 +224,11 @@ def answer(served: ServedRun, question: Question) -> Answer:
 
 def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
     """Return the answer to a question, as arrays and as JSON types; the latest ones are cached."""
-    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question))
+    return served.cached(msgspec.json.encode(question), lambda: _answered(served, question), _answer_size)
+
+
+def _answer_size(answered: tuple[Answer, QueryResult]) -> int:
+    return answered[0].relevancy.nbytes + answered[0].selected.nbytes
 
 
 def _answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:

@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-import base64
 import struct
 from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 import anyio
 import msgspec
-import numpy as np
 import torch
 from anyio import CapacityLimiter, Event, Lock, create_task_group
 from anyio.abc import TaskGroup
 from jaxtyping import Bool
 from torch import Tensor
 
-from normlift_ns.analysis.explain import ViewVote
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError, describe_error
-from normlift_ns.query.engine import Finding
 from normlift_ns.server import protocol
-from normlift_ns.server.coloring import COLOR_MODES, Codes, legend, make_codes, prompt_display_colors
-from normlift_ns.server.permalink import Greeting, PageView, link_of, read_link, write_link
-from normlift_ns.server.runs import PageMemory, ServedRun, to_jpeg, without_paths
+from normlift_ns.server.coloring import COLOR_MODES, Codes, make_codes
+from normlift_ns.server.describe import (
+    MAX_OBJECTS,
+    describe_hover,
+    describe_state,
+    explanation_of,
+    object_json,
+    region_mask,
+)  # fmt: skip
+from normlift_ns.server.permalink import Greeting, Link, PageView, link_of, read_link, write_link
+from normlift_ns.server.runs import PageMemory, ServedRun, without_paths
 from normlift_ns.session import actions
-from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
-from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects
+from normlift_ns.session.objects import LookAtTarget, ObjectRow
 from normlift_ns.session.prompts import (
     build_query,
     click_name,
@@ -38,7 +40,6 @@ from normlift_ns.session.prompts import (
     is_click,
     join_prompts,
 )  # fmt: skip
-from normlift_ns.session.region import inside_polygon, near_path, project, visible_gaussians
 from normlift_ns.session.state import RequestTokens, State
 
 _MAX_PENDING = 256
@@ -46,17 +47,12 @@ _MAX_PENDING = 256
 _REST = 0.03
 """Seconds without a change after which objects and histograms are computed."""
 _GREETING_TIMEOUT = 20.0
-_MAX_OBJECTS = 24
-_MAX_IMAGES = 3
-"""Number of images of an explanation, of those with the largest weight and of those that disagree most."""
-_IMAGE_SIZE = 480
 _SPOT = 0.3
 """Size of what is shown around a position, in radii of the scene."""
 _SLIDERS = ("threshold", "reliability", "grow")
 """Actions of which only the last of several waiting ones counts, and which make one step of the history."""
 _LATEST = ("hover", "still", "camera")
 """Actions that do not wait for others, and of which only the latest counts."""
-_OVER_VIEWS = "Based on about {:.0f} images; {}."
 
 T = TypeVar("T")
 
@@ -108,8 +104,10 @@ class PageLimits:
 
     quick: CapacityLimiter
     """For actions."""
+    asking: CapacityLimiter
+    """For questions, the first of which loads the text encoder."""
     slow: CapacityLimiter
-    """For text encoders, explanations, exports and images."""
+    """For explanations, exports and images."""
     may_write: Callable[[str], bool]
     """Returns whether a page with this access token may store prompts in a run."""
     offer: Callable[[str, bytes], str]
@@ -251,7 +249,7 @@ class PageSession:
 
     async def _change(self, pending: _Pending) -> None:
         """Apply an action that only changes the state."""
-        change = pending.value if callable(pending.value) else self._changes[pending.action]
+        change: Any = pending.value if callable(pending.value) else self._changes[pending.action]
         takes_value = not callable(pending.value) and protocol.VALUES[pending.action] is not Any
         arguments = (pending.value,) if takes_value else ()
 
@@ -365,7 +363,7 @@ class PageSession:
 
         async def work() -> None:
             try:
-                change = await self._in_thread(compute, self._limits.slow)
+                change = await self._in_thread(compute, self._limits.asking)
                 if self._tokens.finish(token):
                     self._append(_Pending("apply", change, seq))
                     if done:
@@ -445,7 +443,23 @@ class PageSession:
         """Bring back what was lost with the connection, or follow a link."""
         memory = self._memory
         fresh = memory.view is None and len(memory.history.states) == 1
-        link = None
+        link = await self._follow(greeting, seq)
+        stored = await self._in_thread(lambda: list(self._run.stored()), self._limits.slow)
+        if fresh and len(stored) > 0 and (link is None or not link.prompts):
+            memory.line = join_prompts(stored)
+            await self._tell("Saved prompts for this scene: press Ask", "info", seq)
+        await self._send(type="token", token=token, link=memory.link, read_only=self._read_only, seq=seq)
+        view = memory.view or await self._in_thread(lambda: self._run.first_view, self._limits.slow)
+        if view is not None:
+            await self._send_camera(view, seq)
+        self._show(seq)
+        if link is not None and link.prompts:
+            memory.line, memory.min_reliability = link.prompts, link.min_reliability
+            await self._ask_line(seq, threshold=link.threshold)
+
+    async def _follow(self, greeting: Greeting, seq: int) -> Link | None:
+        """Take clicks, camera and color mode from the link of a page, unless it has followed this link before."""
+        memory, link = self._memory, None
         try:
             link = read_link(greeting.link) if greeting.link != memory.link else None
         except InputError as error:
@@ -456,20 +470,7 @@ class PageSession:
             memory.view = link.view if link.view is not None and link.view.is_valid else memory.view
             if link.look in COLOR_MODES:
                 memory.history = memory.history.do(actions.set_color_mode(self._state, link.look))
-        stored = [] if greeting.webgl is None else list(await self._in_thread(self._run.stored, self._limits.slow))
-        if fresh and (link is None or not link.prompts) and len(stored) > 0:
-            memory.line = join_prompts(stored)
-            await self._tell("Saved prompts for this scene: press Ask", "info", seq)
-        await self._send(type="token", token=token, link=memory.link, read_only=self._read_only, seq=seq)
-        view = memory.view or await self._in_thread(lambda: self._run.first_view, self._limits.slow)
-        if view is not None:
-            await self._send(
-                type="camera", position=view.position, look_at=view.look_at, up=view.up, fov=view.fov, seq=seq
-            )
-        self._show(seq)
-        if link is not None and link.prompts:
-            memory.line, memory.min_reliability = link.prompts, link.min_reliability
-            await self._ask_line(seq, threshold=link.threshold)
+        return link
 
     async def _paint(self) -> None:
         """Send colors and state after each change, and details after a rest."""
@@ -495,9 +496,9 @@ class PageSession:
             rows = range(self._next_object, self._next_object + len(objects))
             self._next_object += len(objects)
             self._objects.update(zip(rows, objects))
-            while len(self._objects) > 2 * _MAX_OBJECTS:
+            while len(self._objects) > 2 * MAX_OBJECTS:
                 self._objects.popitem(last=False)
-            content["objects"] = [_object_json(state, number, row) for number, row in zip(rows, objects)]
+            content["objects"] = [object_json(state, number, row) for number, row in zip(rows, objects)]
         content |= {
             "line": memory.line, "rule": memory.rule, "negatives": memory.negatives, "step": history.index,
             "history": [{"text": one.action or "Open"} for one in history.states], "busy": self._tokens.busy or None,
@@ -547,146 +548,3 @@ class PageSession:
         head = msgspec.json.encode(header)
         async with self._sending:
             await self._socket.send_bytes(struct.pack("<I", len(head)) + head + payload)
-
-
-def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:
-    """Return the mask of the visible Gaussians whose centers lie in a region of a view.
-
-    Raises:
-        ValueError: the camera is not valid, or there are none.
-    """
-    camera, scene = value.camera.camera(), served.run.scene
-    pixels, inside = project(scene.gaussians.means, camera)
-    rows = np.flatnonzero(inside)
-    if isinstance(value, protocol.Brush):
-        hit = near_path(pixels[rows], np.array(value.points), value.radius)
-    else:
-        hit = inside_polygon(pixels[rows], np.array(value.polygon))
-    mask = served.space.empty_mask()
-    mask[torch.from_numpy(rows[hit])] = True
-    drawn = state.drawn & served.visible
-    mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
-    if not bool(mask.any()):
-        raise InputError("There are no visible Gaussians in this region.")
-    return mask
-
-
-def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[dict[str, Any], tuple[ObjectRow, ...]]:
-    """Return the content of the message `state`, and the listed objects.
-
-    Args:
-        rows: rows of the drawn Gaussians.
-        details: list objects and histograms, which takes longer.
-    """
-    selection, answer, query = state.selection, state.answer, state.query
-    content: dict[str, Any] = {
-        "prompts": _prompts_json(state),
-        "threshold": None if query is None else query.threshold,
-        "suggested": threshold_suggestion(state) if details else None,
-        "reliability": 0.0 if query is None else query.min_reliability,
-        "used_rule": None if query is None else query.rule,
-        "used_negatives": [] if query is None else list(query.negatives),
-        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap, "legend": legend(state),
-        "selected": int(selection.sum()),
-        "selected_visible": int((selection & state.drawn).cpu().numpy()[rows].sum()),
-        "hidden": int((~state.drawn).sum()), "total": len(state.space),
-        "layers": [{"name": x.name, "count": int(x.mask.sum()), "visible": x.visible} for x in state.layers],
-        "grow": state.grow_steps, "by_hand": not state.prompts_select, "warning": state.warning,
-        "details": details, "histogram": None, "objects": None, "more_objects": 0,
-    }  # fmt: skip
-    if not details:
-        return content, ()
-    if answer is not None and state.prompts_select:
-        colors = dict(zip(answer.texts, prompt_display_colors(state)))
-        content["histogram"] = [
-            {
-                "text": one.text, "color": colors[one.text], "warning": one.warning, "nearest": one.nearest_position,
-                "threshold": one.histogram.threshold, "suggested": one.histogram.suggested, **one.histogram.to_json(),
-            }
-            for one in diagnose_prompts(state, max_prompts=8)
-        ]  # fmt: skip
-    found = list_objects(state, max_objects=_MAX_OBJECTS)
-    content["more_objects"], content["in_smaller_parts"] = found.left_out, found.in_smaller_parts
-    return content, found.objects
-
-
-def _prompts_json(state: State) -> list[dict[str, Any]]:
-    """Return a row for each prompt, with its error or with the result for it."""
-    answer = state.answer
-    colors = prompt_display_colors(state)
-    rows = []
-    for prompt in state.prompts:
-        row: dict[str, Any] = dict.fromkeys(("color", "verdict", "relevancy", "threshold", "count"))
-        if answer is not None and prompt.error == "" and prompt.text in answer:
-            finding = Finding(answer, answer.texts.index(prompt.text))
-            row = {
-                "color": colors[finding.index], "verdict": finding.verdict, "threshold": answer.question.threshold,
-                "relevancy": None if finding.peak is None else min(1.0, finding.peak),
-                "count": int(finding.mask.sum()),
-            }  # fmt: skip
-        rows.append({"text": prompt.text, "error": prompt.error or None, **row})
-    return rows
-
-
-def _object_json(state: State, number: int, row: ObjectRow) -> dict[str, Any]:
-    means, answer = state.space.means[row.mask].double(), state.answer
-    ends = torch.quantile(means, means.new_tensor([0.01, 0.99]), dim=0).tolist()
-    relevancy = None
-    if answer is not None and state.prompts_select and row.text in answer:
-        relevancy = min(1.0, float(answer[row.text].relevancy[row.mask].max()))
-    return {
-        "id": number, "name": row.name, "text": row.text, "count": row.size, "center": row.center, "color": row.color,
-        "box": {"min": ends[0], "max": ends[1]}, "relevancy": relevancy, "reliability": row.reliability,
-        "evidence": row.evidence, "views": row.mean_views,
-    }  # fmt: skip
-
-
-def describe_hover(
-    served: ServedRun, state: State, value: protocol.Ray, objects: Sequence[tuple[int, ObjectRow]]
-) -> dict[str, Any] | None:
-    """Return what lies under the pointer: the nearest Gaussian with the largest weight; None if there is none."""
-    with suppress(InputError):
-        gaussian = actions.pick_gaussian(state, served.weights(value.origin, value.direction))
-        position, answer = state.space.means[gaussian].double().cpu(), state.answer
-        row = next(((number, one) for number, one in reversed(objects) if bool(one.mask[gaussian])), None)
-        label, relevancy = None, None
-        if answer is not None:
-            best = int(answer.relevancy[gaussian].argmax()) if state.shown is None else state.shown
-            relevancy = min(1.0, float(answer.relevancy[gaussian, best]))
-            label = answer.texts[best] if bool(answer.selected[gaussian, best]) else None
-        return {
-            "gaussian": gaussian, "label": label, "relevancy": relevancy,
-            "reliability": float(state.space.field.scalars.reliability[gaussian]),
-            "object": None if row is None else {"id": row[0], "name": row[1].name},
-            "position": position.tolist(), "selected": bool(state.selection[gaussian]),
-            "distance": float((position - torch.tensor(value.origin, dtype=torch.float64)).norm()),
-        }  # fmt: skip
-    return None
-
-
-def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the images that voted for the selection, and those that disagree most, as a message.
-
-    Raises:
-        ValueError: nothing is selected, or the votes are no longer known.
-    """
-    with served.reading:
-        votes = served.run.votes
-        why = votes.explain(state.selection.cpu(), refined=state.refined)
-        groups = {"support": why.views[:_MAX_IMAGES], "disagreement": why.most_different[:_MAX_IMAGES]}
-        images, problem = {}, None
-        try:
-            for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):
-                jpeg = to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE)
-                images[picture.vote.view] = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
-        except (InputError, OSError) as error:
-            problem = without_paths(f"The images cannot be shown: {error}")
-
-    def entry(vote: ViewVote) -> dict[str, Any]:
-        facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
-        return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
-
-    smoothed = f"{why.copied / why.gaussians:.0%} was smoothed from neighbors"
-    facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
-    votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
-    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}

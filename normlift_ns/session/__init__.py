@@ -17,9 +17,11 @@ A viewer keeps one `SelectionContext` per run, and one `History` per user::
 Slow work runs with a token from `RequestTokens`: the viewer shows that it is busy, and drops stale results.
 
 * `prompts`: prompts and clicks as rows, each with its vector or its error, and the queries made of them.
-* `selection`: the field and the centers of its Gaussians; connected objects, growing and shrinking, boxes.
-* `state`: what is asked, selected and hidden; undo and redo; tokens of requests; job queue.
+* `selection`: the field and the centers of its Gaussians; connected objects, growing and shrinking.
+* `region`: visible Gaussians inside a polygon or the trace of a brush in a view.
+* `state`: what is asked, selected and hidden; layers; undo and redo; tokens of requests.
 * `actions`: functions from one state to the next; histograms, suggested thresholds, and prompts that are probably not
   in the scene.
 * `objects`: objects of a selection, and camera positions to look at them from.
+* `outputs`: files of a selection, and storage of prompts in a run.
 """

@@ -17,7 +17,6 @@ from normlift_ns.query.engine import Finding, Histogram
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click, join_prompts
-from normlift_ns.session.selection import SelectionBox
 from normlift_ns.session.state import Layer, State
 
 
@@ -117,7 +116,7 @@ FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
-    """Answer a query. Hidden Gaussians stay hidden; selections by click and cuts are dropped.
+    """Answer a query. Hidden Gaussians stay hidden; selections by click are dropped.
 
     Args:
         prompts: all rows, from `pose`.
@@ -130,7 +129,7 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
-    """Answer the same prompts with another rule or other features. Selections by click and cuts are kept."""
+    """Answer the same prompts with another rule or other features. Selections by click are kept."""
     return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
@@ -149,7 +148,7 @@ def clear(state: State) -> State:
 def _unasked(state: State) -> State:
     """Return the state without query and selection."""
     state = replace(state, prompts=(), query=None, shown=None, prompts_select=True)
-    return replace(state, added=None, removed=None, additions=(), grow_steps=0, box=None)
+    return replace(state, added=None, removed=None, additions=(), grow_steps=0)
 
 
 def set_threshold(state: State, value: float) -> State:
@@ -271,13 +270,13 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
 
 def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> State:
     """Select these Gaussians and no others."""
-    change: dict[str, Any] = {"prompts_select": False, "removed": None, "grow_steps": 0, "box": None}
+    change: dict[str, Any] = {"prompts_select": False, "removed": None, "grow_steps": 0}
     return replace(state, added=chosen, additions=(), action=did, **change)
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown, shrunk or cut."""
-    if state.grow_steps != 0 or state.box is not None:
+    """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
+    if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
     added = chosen if state.added is None else state.added | chosen
@@ -315,13 +314,6 @@ def resize(state: State, steps: int) -> State:
     """Set how far the selection is grown (steps > 0) or shrunk (steps < 0), from part to whole, clamped to -10..10."""
     steps = max(-MAX_GROW_STEPS, min(MAX_GROW_STEPS, int(steps)))
     return state if steps == state.grow_steps else replace(state, grow_steps=steps, action=f"Grow {steps:+d}")
-
-
-def set_box(state: State, box: SelectionBox | None) -> State:
-    """Cut the selection with a box; None: remove the box."""
-    if box == state.box:
-        return state
-    return replace(state, box=box, action="Remove the box" if box is None else "Cut with the box")
 
 
 def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:

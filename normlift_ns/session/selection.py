@@ -1,4 +1,4 @@
-"""Selection in space: the field, the centers of its Gaussians, their neighbor graph, and boxes to cut with."""
+"""Selection in space: the field, the centers of its Gaussians, and their neighbor graph."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.options import OBJECT_MAX_GAP
 from normlift_ns.query.engine import Answer, apply_threshold, run_query
 from normlift_ns.query.question import Query
-from normlift_ns.rasterization.rasterize import to_axes
 from normlift_ns.session.prompts import CLICK_THRESHOLD
 
 _NEIGHBORS = 8
@@ -95,9 +94,9 @@ class SelectionContext:
 
         Growing adds Gaussians within as many steps on the graph, and those that are connected to the selection and
         similar to its mean direction. Their cosine is at least 0.95 at the first step, and 0.05 less at each further
-        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
-        the first step, and 1/11 less at each further step. The results are nested: more steps of growth never remove
-        a Gaussian, and more steps of shrinking never add one.
+        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph
+        distance from the middle. The fraction is 10/11 at the first step, and 1/11 less at each further step. The
+        results are nested: more steps of growth never remove a Gaussian, and more steps of shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected
@@ -159,40 +158,3 @@ class SelectionContext:
         near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
         first, slot = np.nonzero(near)
         return first.astype(np.int32), neighbors.index.numpy()[first, slot]
-
-
-@dataclass(frozen=True)
-class SelectionBox:
-    """Box that cuts a selection, in scene units."""
-
-    center: tuple[float, float, float]
-    size: tuple[float, float, float]
-    """Side lengths, > 0."""
-    wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Rotation as a quaternion."""
-    keeps_inside: bool = True
-    """True if Gaussians inside the box stay selected; False: those outside."""
-
-    @property
-    def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Corners. Bit i of a corner's index says on which side it lies along axis i of the box.
-
-        >>> SelectionBox((0, 0, 0), (2, 4, 6)).corners[[0, 1, 7]].tolist()
-        [[-1.0, -2.0, -3.0], [1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
-        """
-        signs = np.array([[1 if number >> axis & 1 else -1 for axis in range(3)] for number in range(8)])
-        w, *imaginary = np.array(self.wxyz) / np.linalg.norm(self.wxyz)
-        local, axis = signs * np.array(self.size) / 2, np.array(imaginary)
-        turn = 2 * np.cross(axis, local)
-        return np.array(self.center) + local + w * turn + np.cross(axis, turn)
-
-    def mask(self, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Return the mask of Gaussians whose centers the box keeps.
-
-        >>> SelectionBox((0, 0, 0), (2, 2, 2)).mask(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
-        [True, False]
-        """
-        center, size, quat = (means.new_tensor(x, dtype=torch.float64) for x in (self.center, self.size, self.wxyz))
-        quats = torch.nn.functional.normalize(quat, dim=0).expand(len(means), 4)
-        inside = (to_axes(means.double() - center, quats).abs() <= size / 2).all(dim=1)
-        return inside if self.keeps_inside else ~inside

@@ -1,9 +1,7 @@
-"""State of a session, its history, and the jobs that change it."""
+"""State of a session, its history, and tokens of its requests."""
 
 from __future__ import annotations
 
-import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +16,7 @@ from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import Colormap
 from normlift_ns.session.prompts import Prompt, join_prompts
-from normlift_ns.session.selection import SelectionBox, SelectionContext
+from normlift_ns.session.selection import SelectionContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +34,7 @@ class State:
     """Everything that one user sees, except the camera. Neither the state nor its masks are ever changed.
 
     The selection starts with the Gaussians that the prompts select, unless `from_answer` is False. `added` is added to
-    it and `removed` is removed; the result is grown or shrunk, then cut by the box.
+    it and `removed` is removed; the result is grown or shrunk.
     """
 
     space: SelectionContext
@@ -51,10 +49,9 @@ class State:
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     additions: tuple[Bool[Tensor, " n"], ...] = ()
-    """What each addition has added to the selection, the latest last; removing an object removes the whole addition."""
+    """Gaussians that each added object has added to the selection, the latest last; removing it removes them."""
     grow_steps: int = 0
     """Number of steps of growth over the neighbor graph; negative: steps of shrinking."""
-    box: SelectionBox | None = None
     hidden: Bool[Tensor, " n"] | None = None
     """Gaussians that are not drawn."""
     layers: tuple[Layer, ...] = ()
@@ -72,7 +69,7 @@ class State:
 
     @cached_property
     def selection_before_resize(self) -> Bool[Tensor, " n"]:
-        """Gaussians selected by prompts and clicks, before growing and cutting."""
+        """Gaussians selected by prompts and clicks, before growing."""
         mask = self.space.empty_mask()
         if self.answer is not None and self.prompts_select:
             mask = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]
@@ -82,8 +79,7 @@ class State:
     @cached_property
     def selection(self) -> Bool[Tensor, " n"]:
         """Selected Gaussians, whether hidden or not."""
-        mask = self.space.grow_or_shrink(self.selection_before_resize, self.grow_steps, refined=self.refined)
-        return mask if self.box is None else mask & self.box.mask(self.space.means)
+        return self.space.grow_or_shrink(self.selection_before_resize, self.grow_steps, refined=self.refined)
 
     @property
     def drawn(self) -> Bool[Tensor, " n"]:
@@ -121,7 +117,7 @@ class State:
     def warning(self) -> str:
         """Warning if at least a quarter of the selection has weak evidence, else empty.
 
-        `actions.leave_out_poor` removes the Gaussians in question.
+        `actions.remove_weak` removes the Gaussians in question.
         """
         if self.weak_fraction < 0.25:
             return ""
@@ -248,58 +244,3 @@ class RequestTokens:
         """Description of the running request; empty if there is none."""
         running = self._running
         return "" if running is None else running.description
-
-
-# Job queue that keeps slow work out of viser's few threads, which serve all pages.
-
-
-class JobQueue:
-    """Queue that runs jobs one after another, in a thread that ends when the queue is empty.
-
-    >>> event, worker = threading.Event(), JobQueue()
-    >>> worker.submit(event.set)
-    >>> event.wait(5)
-    True
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._jobs: deque[tuple[str, Callable[[], None]]] = deque()
-        self._running = self._ended = False
-
-    def submit(self, job: Callable[[], None], key: str = "") -> None:
-        """Add a job to the end of the queue.
-
-        Args:
-            job: must not raise.
-            key: of successive waiting jobs with the same key, only the last one runs; empty: all run.
-        """
-        with self._lock:
-            if self._ended:
-                return
-            if key and self._jobs and self._jobs[-1][0] == key:
-                self._jobs.pop()
-            self._jobs.append((key, job))
-            if self._running:
-                return
-            self._running = True
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def clear(self) -> None:
-        """Discard the waiting jobs; the running one continues."""
-        with self._lock:
-            self._jobs.clear()
-
-    def close(self) -> None:
-        """Discard the waiting jobs and accept no further ones."""
-        self._ended = True
-        self.clear()
-
-    def _run(self) -> None:
-        while True:
-            with self._lock:
-                if not self._jobs:
-                    self._running = False
-                    return
-                _, job = self._jobs.popleft()
-            job()

@@ -48,7 +48,7 @@ _CHANGES: dict[Action, Callable[..., State]] = {
     Action.REFINED: _use_refined,
 }
 """Actions that only change the state. Those of sliders and choices take a value, those of objects a row."""
-_UNLOCKED = (Action.ASK, Action.SELECT_FLOATERS, Action.EXPLAIN, Action.GREET)
+_UNLOCKED = (Action.ASK, Action.SELECT_FLOATERS, Action.EXPLAIN)
 """Actions that must not hold the lock, because they are slow or send other actions."""
 
 

@@ -56,9 +56,6 @@ class Action(Enum):
     SAVE = "Save prompts in run"
     REPLACE = "Replace the saved prompts"
     COLORS = "colors"
-    BOX = "box"
-    LINK = "Link"
-    GREET = "greet"
 
 
 Act = Callable[[Action, Any, Any], None]

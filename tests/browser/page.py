@@ -62,7 +62,6 @@ class OnPage(Person):
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1000, 640), **how: Any) -> None:
         super().__init__(browser, address, size, **how)
-        self.page.add_style_tag(content=_BARE)
         self.ready()
 
     def prepare(self) -> None:
@@ -76,6 +75,7 @@ class OnPage(Person):
     def ready(self) -> None:
         """Waits until the scene is drawn."""
         self.until(lambda: self.page.evaluate("window.page?.state?.details ?? false"), "a state")
+        self.page.add_style_tag(content=_BARE)
         self.calm()
 
     def calm(self) -> None:

@@ -2,11 +2,11 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -152,22 +152,20 @@ def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> Non
 
 
 def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
-    doors: list[tuple[str, int]] = []
-
-    def interrupted(*_: object) -> None:
+    def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    def door(host: str, port: int, _: object) -> SimpleNamespace:
-        doors.append((host, port))
-        return SimpleNamespace(server=SimpleNamespace(port=7010))
-
-    monkeypatch.setattr("normlift_ns.viewer.adapter.Door", door)
     monkeypatch.setattr(view, "check_lifted_run", lambda *_: None)
-    monkeypatch.setattr(view.NormLiftView, "open", interrupted)
-    for host, port in (("127.0.0.1", 7008), ("0.0.0.0", 7010)):
-        view.NormLiftView(Path("config.yml"), host=host, port=port).main()
-    taken, *lines = capsys.readouterr().out.splitlines()
-    assert "7008" in taken and len(lines) == 4
-    assert "http://127.0.0.1:7010" in lines[0] and lines[:2] == lines[2:]
-    assert doors == [("127.0.0.1", 7008), ("0.0.0.0", 7010)]
+    monkeypatch.setattr(view, "open_all", interrupted)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        for host in ("127.0.0.1", "0.0.0.0"):
+            view.NormLiftView(Path("config.yml"), host=host, port=port).main()
+    lines = capsys.readouterr().out.splitlines()
+    assert str(port) in lines[0] and len(lines) == 7
+    for line in (lines[1], lines[4]):
+        assert f"http://127.0.0.1:{port} " not in line and "http://127.0.0.1:" in line
+    assert lines[2] == lines[6] == "Stopped." and "?access=" in lines[5]
     assert view.NormLiftView(Path("config.yml")).host == "127.0.0.1"

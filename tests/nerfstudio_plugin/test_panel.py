@@ -357,7 +357,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     first, camera = objects[0], browser.camera
     press_row(groups[0], "go to", browser)
     assert camera.look_at == pytest.approx(10 * np.array(first.center))
-    assert np.linalg.norm(camera.position - camera.look_at) == pytest.approx(10 * first.extent / np.tan(0.5))
+    assert np.linalg.norm(camera.position - camera.look_at) == pytest.approx(10 * first.extent / (1.6 * np.tan(0.5)))
     press_row(groups[0], "export", browser)
     assert 0 < PlyData.read(io.BytesIO(browser.files["left_1.ply"]))["vertex"].count <= first.size
     press_row(groups[0], "only", browser)

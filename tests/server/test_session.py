@@ -276,7 +276,8 @@ def test_saved_prompts(client, served, tmp_path):
             page.do("ask", {"line": "blue"})
             answer = page.do("save_prompts", {"replace": True}, until="message")
             assert (answer["kind"] == "done") == allowed
-    assert load_query(tmp_path / FIELD_FOLDER).texts == ("blue",)
+    stored = load_query(tmp_path / FIELD_FOLDER)
+    assert stored is not None and stored.texts == ("blue",)
 
 
 def test_a_late_answer_is_dropped_and_errors_name_no_path(page, served):

@@ -10,7 +10,6 @@ from normlift_ns.errors import InputError
 from normlift_ns.session import actions
 from normlift_ns.session.objects import list_objects
 from normlift_ns.session.prompts import Prompt, build_query, click_name, encode_prompts
-from normlift_ns.session.selection import SelectionBox
 from normlift_ns.session.state import MAX_STATES, History, RequestTokens, State
 from tests.session.worlds import BLOCK, ray, read, rows, world
 
@@ -104,28 +103,12 @@ def test_every_step_of_growth_holds_the_one_before(some, steps):
     assert steps < 0 or not bool((selected & ~more).any())
 
 
-def test_a_box_cuts_inside_outside_and_turned():
-    state = asked("red")
-    box = SelectionBox((1.5, 1.5, 1.5), (10, 10, 10))
-    assert chosen(actions.set_box(state, box), 0)
-    assert chosen(actions.set_box(state, SelectionBox(box.center, box.size, keeps_inside=False)), 2)
-    assert chosen(actions.add(actions.set_box(state, box), rows(1)), 0, 1)
-    assert chosen(actions.set_box(actions.set_box(state, box), None), 0, 2)
-    half = 0.5**0.5
-    turned = SelectionBox((1, 2, 3), (2, 4, 6), (0.5, 0.1, -0.7, 0.2))
-    inside = torch.from_numpy(np.array(turned.center) + 0.999 * (turned.corners - turned.center))
-    outside = torch.from_numpy(np.array(turned.center) + 1.001 * (turned.corners - turned.center))
-    assert bool(turned.mask(inside).all()) and not bool(turned.mask(outside).any())
-    turned = SelectionBox((101.5, 1.5, 1.5), (10, 300, 10), (half, 0, 0, half))  # y of the box is x of the world
-    assert torch.equal(turned.mask(world().means), rows(0, 1, 2))
-
-
 def test_every_deed_is_undone_and_done_again():
     deeds = (
         asked_red := lambda s: asked("red", s),
         lambda s: actions.click(s, ray(0), "add"),
         lambda s: actions.click(s, ray(BLOCK), "add"),
-        lambda s: actions.set_box(s, SelectionBox((0, 0, 0), (50, 50, 50))),
+        lambda s: actions.add_layer(s, "both"),
         actions.hide,
         asked_red,
         lambda s: actions.set_threshold(s, 0.95),

@@ -3,17 +3,12 @@
 import socket
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import torch
 
 from normlift_ns import Camera, GaussianScene
-from normlift_ns.io.run_dir import FIELD_FOLDER
-from normlift_ns.session.selection import SelectionContext
-from normlift_ns.viewer.shared import Run, make_records
-from tests.session.worlds import read
 
 
 def camera() -> Camera:
@@ -38,13 +33,6 @@ def scene_of(gaussians: GaussianScene, rgb: torch.Tensor | None = None, cameras:
         gaussians=gaussians, parameters=parameters, has_harmonics=True, rasterize_mode="classic",
         train=SimpleNamespace(cameras=cameras),
     )  # fmt: skip
-
-
-def run_of(folder: Path, space: SelectionContext, scene: Any = None) -> Run:
-    """A run whose encoder knows three words."""
-    scene = scene_of(spheres(space.means, 0.3), cameras=(camera(),)) if scene is None else scene
-    (folder / FIELD_FOLDER).mkdir(exist_ok=True)
-    return Run(folder, scene, space, make_records(scene), lambda: SimpleNamespace(rows=read))
 
 
 def until(true: Callable[[], Any], said: Callable[[], Any] = str) -> None:

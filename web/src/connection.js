@@ -1,7 +1,7 @@
 /**
  * Connection to the server's session of this page.
  *
- * It comes back by itself, with the last question. Dispatches `status` with `online`, and an event per type of message.
+ * It comes back by itself, with the last question. Dispatches `status` with `online` and `reason`, and an event per type of message.
  */
 
 /** @typedef {{type: string, seq?: number, [name: string]: any}} Message */
@@ -22,6 +22,7 @@ export class Connection extends EventTarget {
     this.run = run;
     this.greeting = greeting;
     this.seq = 0;
+    this.greeted = 0;
     this.attempts = 0;
     this.online = false;
     this.key = `normlift:${run}`;
@@ -44,21 +45,21 @@ export class Connection extends EventTarget {
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
       this.attempts = 0;
-      this.send("greet", this.greeting());
+      this.greeted = this.send("greet", this.greeting());
       this.report(true);
     };
     this.socket.onmessage = ({ data }) => this.receive(data);
-    this.socket.onclose = () => {
-      this.report(false);
+    this.socket.onclose = ({ reason }) => {
+      this.report(false, reason);
       const delay = DELAYS[Math.min(this.attempts++, DELAYS.length - 1)];
       setTimeout(() => this.open(), delay);
     };
   }
 
-  /** @param {boolean} online */
-  report(online) {
+  /** @param {boolean} online @param {string} [reason] */
+  report(online, reason = "") {
     this.online = online;
-    this.dispatchEvent(Object.assign(new Event("status"), { online }));
+    this.dispatchEvent(Object.assign(new Event("status"), { online, reason }));
   }
 
   /** @param {string | ArrayBuffer} data */

@@ -53,7 +53,6 @@ class Page {
     /** @type {Map<number, (position: number[] | null) => void>} */
     this.probes = new Map();
     this.silent = new Set();
-    this.greeted = 0;
     this.webgl = hasWebGL();
     this.act = this.act.bind(this);
     this.stale = false;
@@ -178,22 +177,24 @@ class Page {
       this.connection.addEventListener(type, (/** @type {any} */ event) => handle(event.message, event));
     on("state", (state) => this.show(state));
     on("codes", (header, { payload }) => this.paint(header, payload));
-    on("still", (header, { payload }) => header.revision >= this.revision && this.stills.show(payload));
+    on("still", (header, { payload }) => {
+      if (header.revision >= this.revision && (!this.scene || this.painted)) this.stills.show(payload);
+    });
     on("busy", ({ text }) => this.search.setBusy(text));
     on("message", ({ text, kind, seq }) => {
       if (kind !== "busy") this.search.setBusy(null);
       if (kind === "error" && seq === this.asked) this.setStale(true);
-      toast(text, { kind, anchor: this.anchors.get(seq) ?? (seq <= this.greeted ? $("ask") : null) });
+      toast(text, { kind, anchor: this.anchors.get(seq) ?? (seq === this.connection.greeted ? $("ask") : null) });
     });
     on("camera", (view, event) => this.moveCamera(view, event));
     on("hover", (message) => this.showHover(message));
     on("explanation", (message) => showExplanation(message, () => this.view.resize()));
     on("download", ({ name, url, text, seq }) => {
       h("a", { href: url, download: name }).click();
-      toast(`Downloaded ${name}. ${text ?? ""}`, { kind: "done", anchor: this.anchors.get(seq) });
+      toast(text || `Downloaded ${name}`, { kind: "done", anchor: this.anchors.get(seq) });
     });
     on("token", (message) => this.receiveToken(message));
-    this.connection.addEventListener("status", (/** @type {any} */ event) => this.showStatus(event.online));
+    this.connection.addEventListener("status", (/** @type {any} */ event) => this.showStatus(event.online, event.reason));
     this.tools.addEventListener("hover", (/** @type {any} */ event) => {
       this.pointed = event.ray && this.state ? this.connection.send("hover", event.ray) : 0;
       if (!event.ray) $("hover").hidden = true;
@@ -203,7 +204,8 @@ class Page {
     this.view.addEventListener("move", () => {
       $("hover").hidden = true;
       rest();
-      if (!this.webgl) this.stills.request(true);
+      if (this.webgl) this.stills.hide();
+      else this.stills.request(true);
     });
     new ResizeObserver(() => this.view.resize()).observe($("stage"));
     $("canvas").addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => this.steer(event));
@@ -212,7 +214,9 @@ class Page {
     });
     this.listenDivider();
     this.scene?.addEventListener("frame", (/** @type {any} */ event) => this.drawn(event.full));
-    this.scene?.addEventListener("lost", () => location.reload());
+    this.scene?.addEventListener("lost", () => {
+      toast("The graphics driver has stopped. Reload the page to see the scene again.", { kind: "error", seconds: 60 });
+    });
   }
 
   async open() {
@@ -304,7 +308,7 @@ class Page {
   /** @param {any} view @param {any} event */
   moveCamera(view, event) {
     const target = { ...view, fov: view.fov ? (180 / Math.PI) * view.fov : undefined };
-    const greeting = event.message.seq !== undefined && event.message.seq <= this.greeted;
+    const greeting = event.message.seq === this.connection.greeted;
     if (greeting && this.home) return this.sendCamera();
     if (!this.home) {
       this.home = { ...target, look_at: view.look_at };
@@ -328,7 +332,6 @@ class Page {
   /** @param {any} message */
   receiveToken({ token, link, seq }) {
     this.connection.remember({ ...(token ? { token } : {}), ...(link ? { link } : {}) });
-    if (token) this.greeted = seq;
     if (token || this.silent.delete(seq) || !link) return;
     const run = this.runs.length > 1 ? `run=${encodeURIComponent(this.run.id)}&` : "";
     history.replaceState(null, "", `?${run}${link}`);
@@ -354,8 +357,8 @@ class Page {
     toast(`Downloaded ${name}`, { kind: "done", anchor });
   }
 
-  /** @param {boolean} online */
-  showStatus(online) {
+  /** @param {boolean} online @param {string} reason Of the server, if it has closed the connection. */
+  showStatus(online, reason) {
     clearTimeout(this.offlineTimer);
     if (online) {
       $("offline").hidden = true;
@@ -363,7 +366,7 @@ class Page {
     }
     this.search.setBusy(null);
     this.offlineTimer = setTimeout(() => {
-      $("offline").textContent = "Connection lost. Reconnecting …";
+      $("offline").textContent = reason ? `Connection closed: ${reason}` : "Connection lost. Reconnecting …";
       $("offline").hidden = false;
     }, 600);
   }
@@ -392,19 +395,21 @@ class Page {
     divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => divider.setPointerCapture(event.pointerId));
     divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => divider.hasPointerCapture(event.pointerId) && move(event.clientX));
     divider.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
-      const step = { ArrowLeft: -0.02, ArrowRight: 0.02 }[event.key];
-      if (step) this.setDivider(Math.min(1, Math.max(0, Number(divider.getAttribute("aria-valuenow")) / 100 + step)));
+      const step = event.key === "ArrowLeft" ? -0.02 : event.key === "ArrowRight" ? 0.02 : 0;
+      if (step !== 0) this.setDivider(Math.min(1, Math.max(0, Number(divider.getAttribute("aria-valuenow")) / 100 + step)));
     });
   }
 
   /** @param {KeyboardEvent} event */
   steer(event) {
     if (event.ctrlKey || event.metaKey) return;
+    /** @type {Record<string, number[]>} */
     const turns = { ArrowLeft: [0.12, 0], ArrowRight: [-0.12, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
-    const turn = turns[/** @type {keyof typeof turns} */ (event.key)];
+    const turn = turns[event.key];
     if (turn) this.view.turn(turn[0], turn[1]);
     else if (event.key === "+" || event.key === "=") this.view.zoom(1 / 1.15);
     else if (event.key === "-") this.view.zoom(1.15);
+    else if (event.key === "Enter") this.tools.pickMiddle(event);
     else return;
     event.preventDefault();
   }

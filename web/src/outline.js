@@ -1,5 +1,6 @@
 /** Draws the edge of what an answer selects, so that it stands out whatever its color. */
 import * as THREE from "three";
+import { fullScreenPass } from "./passes.js";
 
 const FRAGMENT = `
 precision highp float;
@@ -28,30 +29,13 @@ void main() {
 export class Outline {
   constructor() {
     this.target = new THREE.WebGLRenderTarget(1, 1, { depthBuffer: false });
-    const uniforms = {
+    this.uniforms = {
       mask: { value: this.target.texture },
       texel: { value: new THREE.Vector2() },
       scale: { value: 1 },
       width: { value: 1 },
     };
-    this.material = new THREE.RawShaderMaterial({
-      glslVersion: THREE.GLSL3,
-      vertexShader: "in vec3 position; void main() { gl_Position = vec4(position.xy, 0.0, 1.0); }",
-      fragmentShader: FRAGMENT,
-      uniforms,
-      transparent: true,
-      premultipliedAlpha: true,
-      blending: THREE.CustomBlending,
-      blendSrc: THREE.OneFactor,
-      blendDst: THREE.OneMinusSrcAlphaFactor,
-      depthTest: false,
-      depthWrite: false,
-    });
-    const triangle = new THREE.BufferGeometry();
-    triangle.setAttribute("position", new THREE.BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
-    this.quad = new THREE.Mesh(triangle, this.material);
-    this.quad.frustumCulled = false;
-    this.scene = new THREE.Scene().add(this.quad);
+    this.pass = fullScreenPass(FRAGMENT, this.uniforms, THREE.CustomBlending);
   }
 
   /**
@@ -71,12 +55,12 @@ export class Outline {
     renderer.setClearColor(background, opacity);
     renderer.setRenderTarget(null);
     splats.uniforms.masked.value = false;
-    const { uniforms } = this.material;
+    const { uniforms } = this;
     uniforms.texel.value.set(1 / width, 1 / height);
     uniforms.scale.value = size.x / width;
     uniforms.width.value = Math.max(0.7, 0.6 * renderer.getPixelRatio());
     renderer.autoClear = false;
-    renderer.render(this.scene, camera);
+    renderer.render(this.pass, camera);
     renderer.autoClear = true;
   }
 }

@@ -2,6 +2,7 @@
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { Outline } from "./outline.js";
+import { Preview } from "./preview.js";
 import { Splats } from "./splats.js";
 
 /** Milliseconds per frame from which on a moving camera gets coarser frames. */
@@ -52,6 +53,7 @@ export class SceneRenderer extends EventTarget {
     this.scene.add(this.spark);
     this.outline = new Outline();
     this.outlined = false;
+    this.preview = new Preview();
     /** @type {Splats | null} */
     this.splats = null;
     this.costs = { full: 0, coarse: 0 };
@@ -84,8 +86,8 @@ export class SceneRenderer extends EventTarget {
 
   /** @param {Uint8Array} codes @param {number[][]} palette */
   paint(codes, palette) {
-    this.splats?.paint(codes, palette);
-    this.invalidate("colors");
+    const hidden = this.splats?.paint(codes, palette);
+    this.invalidate(hidden ? "order" : "colors");
   }
 
   /** @param {number} position In -1..1; what is left of it keeps its own colors. -2: nothing. */
@@ -102,6 +104,7 @@ export class SceneRenderer extends EventTarget {
 
   /** @param {boolean} on */
   setOutline(on) {
+    if (on === this.outlined) return;
     this.outlined = on;
     this.invalidate("colors");
   }
@@ -113,6 +116,7 @@ export class SceneRenderer extends EventTarget {
   /** Draws soon. @param {"camera" | "colors" | "order"} what Has changed. */
   invalidate(what) {
     this.changed = { what, when: performance.now() };
+    if (what !== "colors") this.preview.ready = false;
     clearTimeout(this.timer);
     if (!this.waiting) {
       this.waiting = true;
@@ -128,23 +132,29 @@ export class SceneRenderer extends EventTarget {
     this.busy = true;
     const still = performance.now() - this.changed.when > REST || this.changed.what !== "camera";
     const known = this.frames > 0;  // the first frame is coarse: it may take long
-    const full = known && (!this.slow || (still && (this.costs.full < VERY_SLOW || this.coarse)));
-    const milliseconds = await this.render(full);
+    const quick = this.costs.full < VERY_SLOW && !this.preview.ready;
+    const full = known && (!this.slow || (still && (quick || this.coarse)));
+    const milliseconds = await (this.preview.ready && !full ? this.renderPreview() : this.render(full));
     this.coarse = !full;
     this.busy = false;
     this.dispatchEvent(Object.assign(new Event("frame"), { full, milliseconds }));
     if (this.waiting) requestAnimationFrame(() => this.draw());
     else if (!full) this.timer = setTimeout(() => this.finish(), this.changed.what === "camera" ? REST : 0);
-    else if (this.plain) this.timer = setTimeout(() => this.addOutline(), LONG_REST);
+    else if (this.slow) this.timer = setTimeout(() => this.rest(), LONG_REST);
   }
 
-  /** Adds the outline to a fine frame of a slow renderer, which would otherwise come later. */
-  async addOutline() {
-    if (this.busy || this.waiting || !this.splats) return;
+  /** Adds the outline to a fine frame of a slow renderer, which would otherwise come later; prepares the next colors. */
+  async rest() {
+    const { renderer, scene, splats, view } = this;
+    if (this.busy || this.waiting || !splats) return;
     this.busy = true;
+    if (this.plain) this.outline.draw(renderer, scene, view.camera, splats);
     this.plain = false;
-    this.outline.draw(this.renderer, this.scene, this.view.camera, this.splats);
-    await drawn(this.renderer);
+    if (!this.preview.ready) {
+      await drawn(renderer);
+      if (!this.waiting) this.preview.capture(renderer, scene, view.camera, splats);
+    }
+    await drawn(renderer);
     this.busy = false;
     if (this.waiting) requestAnimationFrame(() => this.draw());
   }
@@ -154,6 +164,14 @@ export class SceneRenderer extends EventTarget {
     if (this.waiting) return;
     this.waiting = true;
     requestAnimationFrame(() => this.draw());
+  }
+
+  /** Shows new colors at once. @returns {Promise<number>} Milliseconds that the GPU took. */
+  async renderPreview() {
+    const start = performance.now();
+    this.preview.draw(this.renderer, this.view.camera);
+    await drawn(this.renderer);
+    return performance.now() - start;
   }
 
   /** @param {boolean} full @returns {Promise<number>} Milliseconds that the GPU took. */

@@ -12,6 +12,7 @@ const POINTER = [
   ["Ctrl or Alt + click", "Remove an object that was added"],
   ["Arrow keys", "Turn the focused scene"],
   ["+  −", "Zoom the focused scene"],
+  ["Enter", "Select in the middle of the focused scene"],
 ];
 
 /** @param {KeyboardEvent} event @returns {string} As shortcuts name it, such as "Ctrl+Shift+Z". */
@@ -41,7 +42,8 @@ export function startShortcuts(shortcuts) {
   ];
   const close = h("button.btn", { type: "button", onclick: () => $("help").close() }, "Close");
   $("help").replaceChildren(
-    h("h2", { id: "help-title" }, "Shortcuts"), h("ul.keys", {}, ...rows), h("p", {}, "\u00a0"), close,
+    h("div.row.spread", {}, h("h2", { id: "help-title" }, "Shortcuts"), close), h("ul.keys", {}, ...rows),
+    h("p.small", {}, h("a", { href: "/assets/licenses.txt", target: "_blank" }, "Licenses of the packages in this page")),
   );
   closesOutside($("help"));
 }

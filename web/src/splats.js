@@ -12,11 +12,13 @@ import * as THREE from "three";
 /** Gaussians per instance. */
 const BATCH = 256;
 /** Width of the texture of codes. */
-const WIDTH = 2048;
+export const WIDTH = 2048;
 /** Brightness of what is not selected, relative to its own gray. */
-const GRAY_LEVEL = 0.8;
+export const GRAY_LEVEL = 0.8;
+/** Opacity from which on a Gaussian counts as the nearest one of a pixel. */
+const OPAQUE = 0.3;
 /** Code of Gaussians that are not drawn. */
-export const HIDDEN = 255;
+const HIDDEN = 255;
 
 const UNIFORMS = `
 uniform int lastSplat;
@@ -42,13 +44,18 @@ const COLOR = `
         rgba.rgb = mix(mix(rgba.rgb, level, gray * blend), tint.rgb, tint.a * blend);
     }
     vRgba = rgba;`;
-/** A quad reaches to where its Gaussian falls below the least opacity that is drawn. */
+/** A triangle reaches to where its Gaussian falls below the least opacity that is drawn. */
 const TIGHT = `
     vRgba.a = rgba.a;
     if (rgba.a <= 1.0) {
         adjustedStdDev = min(adjustedStdDev, sqrt(2.0 * log(rgba.a / minAlpha)));
         vSplatUv = position.xy * adjustedStdDev;
     }`;
+
+/** Nearest Gaussian of each pixel, if a second target is drawn to: blending with opacity 1 replaces, with 0 keeps. */
+const NEAREST = `fragColor = vec4(rgba.rgb * rgba.a, rgba.a);
+    uvec3 bytes = uvec3(vSplatIndex, vSplatIndex >> 8, vSplatIndex >> 16) & 255u;
+    nearest = rgba.a > ${OPAQUE} ? vec4(vec3(bytes) / 255.0, 1.0) : vec4(0.0);`;
 
 /** @param {string} shader @param {[string, string][]} changes @returns {string} */
 function patched(shader, changes) {
@@ -58,18 +65,13 @@ function patched(shader, changes) {
   }, shader);
 }
 
-/** @returns {THREE.InstancedBufferGeometry} Quads, with the number of each within its batch as z. */
+/** @returns {THREE.InstancedBufferGeometry} Triangles around the unit circle; z is the number within the batch. */
 function batchGeometry() {
-  const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]];
-  const position = new Float32Array(12 * BATCH);
-  const index = new Uint16Array(6 * BATCH);
-  for (let quad = 0; quad < BATCH; quad++) {
-    corners.forEach(([x, y], corner) => position.set([x, y, quad], 12 * quad + 3 * corner));
-    index.set([0, 1, 2, 0, 2, 3].map((corner) => 4 * quad + corner), 6 * quad);
-  }
+  const corners = [[0, 2], [-Math.sqrt(3), -1], [Math.sqrt(3), -1]];
+  const position = new Float32Array(9 * BATCH);
+  for (let i = 0; i < BATCH; i++) corners.forEach(([x, y], corner) => position.set([x, y, i], 9 * i + 3 * corner));
   const geometry = new THREE.InstancedBufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
-  geometry.setIndex(new THREE.BufferAttribute(index, 1));
   return geometry;
 }
 
@@ -109,6 +111,10 @@ export class Splats {
       ["vRgba = rgba;", COLOR],
       ["vRgba.a = rgba.a;", TIGHT],
     ]);
+    spark.material.fragmentShader = patched(spark.material.fragmentShader, [
+      ["out vec4 fragColor;", "layout(location = 0) out vec4 fragColor;\nlayout(location = 1) out vec4 nearest;"],
+      ["fragColor = vec4(rgba.rgb * rgba.a, rgba.a);", NEAREST],
+    ]);
     const geometry = batchGeometry();
     spark.geometry = geometry;
     const prepare = spark.onBeforeRender;
@@ -124,9 +130,13 @@ export class Splats {
    * Changes the colors of the next frame.
    * @param {Uint8Array} codes One per Gaussian.
    * @param {number[][]} palette Rows of red, green and blue in 0..255, and of share and gray in 0..1.
+   * @returns {boolean} True if other Gaussians are hidden now.
    */
   paint(codes, palette) {
-    this.codes.image.data.set(codes.subarray(0, this.count));
+    const old = this.codes.image.data;
+    let changed = false;
+    for (let i = 0; i < this.count && !changed; i++) changed = (codes[i] === HIDDEN) !== (old[i] === HIDDEN);
+    old.set(codes.subarray(0, this.count));
     this.codes.needsUpdate = true;
     const data = this.palette.image.data;
     palette.forEach(([red, green, blue, share, gray], i) => {
@@ -134,5 +144,6 @@ export class Splats {
       data[4 * (256 + i)] = gray;
     });
     this.palette.needsUpdate = true;
+    return changed;
   }
 }

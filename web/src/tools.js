@@ -143,7 +143,12 @@ export class Tools extends EventTarget {
     this.view.addEventListener("move", () => this.ends.length > 0 && this.draw());
   }
 
-  /** @param {PointerEvent} event @param {number[]} point */
+  /** Does what a click in the middle of the scene does. @param {KeyboardEvent} event */
+  pickMiddle(event) {
+    this.click(event, [this.view.width / 2, this.view.height / 2]);
+  }
+
+  /** @param {PointerEvent | KeyboardEvent} event @param {number[]} point */
   click(event, [x, y]) {
     const ray = this.view.ray(x, y);
     if (this.tool === "measure") {

@@ -1,14 +1,11 @@
 """Who may speak to a server: names, pages of other sites, DNS rebinding, tunnels, odd headers."""
 
 import socket
-from importlib.metadata import version
-from importlib.util import find_spec
 
 import pytest
 
 from normlift_ns.errors import InputError
-from normlift_ns.viewer.host_check import accepted_names, refuse_request
-from tests.viewer.scenes import free_port
+from normlift_ns.server.host_check import accepted_names, refuse_request
 
 LOCAL, EVERY = accepted_names("127.0.0.1", ["Splats.Example.org", "fd00::7"]), accepted_names("0.0.0.0")
 OWN = socket.gethostname().lower()
@@ -73,28 +70,3 @@ def test_other_names_and_pages_are_refused(names, hosts, origins):
 def test_an_allowed_host_is_the_name_of_a_machine(name):
     with pytest.raises(InputError, match="--allowed-hosts"):
         accepted_names("127.0.0.1", [name])
-
-
-@pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
-def test_the_viewer_checks_pages_and_websockets():
-    from normlift_ns.viewer.adapter import ViserServer  # noqa: PLC0415
-    from tests.viewer.wire import ONE  # noqa: PLC0415
-
-    server = ViserServer("127.0.0.1", free_port(), "label", lambda _: None, lambda _: None, ["proxy.example"])
-    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-    upgrade += "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
-    upgrade += f"Sec-WebSocket-Protocol: viser-v{version('viser')}\r\n" if ONE else ""
-    try:
-        for host, origin, accepted in [
-            ("localhost:7008", "http://localhost:7008", True),
-            ("proxy.example", "https://proxy.example", True),
-            ("localhost:7008", "https://evil.example", False),
-            ("evil.example", "http://evil.example", False),
-        ]:
-            for extra, code in (("", b"200"), (upgrade, b"101")):
-                with socket.create_connection(("127.0.0.1", server.port), 60) as line:
-                    line.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: {origin}\r\n{extra}\r\n".encode())
-                    answer = line.recv(65536)
-                assert answer.split()[1] == (code if accepted else b"403"), (host, origin, answer)
-    finally:
-        server.stop()
