@@ -130,7 +130,7 @@ def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3
     return (
         f"{name} holds rounded numbers: 99 % of the positions within {most:.2g} and all "
         f"within {float(errors[-1]):.2g}, logarithms of scales within {float(scales.max()) / steps:.2g}, "
-        "rotations within 0.003 radians, opacities within 0.002."
+        "rotations within 0.005 radians, opacities within 0.002."
     )
 
 

@@ -11,7 +11,7 @@ import json
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parame
 from normlift_ns.data.spz import decode_spz
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import MAX_TEXT_BYTES, open_regular, read_file
+from normlift_ns.options import RasterizeMode
 
 GLB_MAGIC = b"glTF"
 _EXTENSION = "KHR_gaussian_splatting"
@@ -69,6 +70,7 @@ class _Primitive(msgspec.Struct, rename="camel"):
 
 class _Mesh(msgspec.Struct, rename="camel"):
     primitives: list[_Primitive]
+    extras: Any = None
 
 
 class _Node(msgspec.Struct, rename="camel"):
@@ -109,7 +111,7 @@ def read_gltf(path: Path) -> SplatFile:
     if not path.is_file():
         raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")
     gltf = _open_gltf(path)
-    primitive = _find_splat(gltf)
+    mesh, primitive = _find_splat(gltf)
     extension = primitive.extensions[_EXTENSION]
     for name, expected in _SETTINGS.items():
         found = extension.get(name, expected)
@@ -127,7 +129,8 @@ def read_gltf(path: Path) -> SplatFile:
         return file._replace(remarks=(*file.remarks, *remarks))
     splat = _read_attributes(gltf, primitive)
     validate_splat(splat, path)
-    return SplatFile(splat, remarks=remarks)
+    mode = mesh.extras.get("rasterize_mode") if isinstance(mesh.extras, dict) else None  # as `encode_glb` is given it
+    return SplatFile(splat, mode if mode in get_args(RasterizeMode) else None, remarks=remarks)
 
 
 def _nested(extension: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -179,9 +182,9 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
     return chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
 
 
-def _find_splat(gltf: _Gltf) -> _Primitive:
-    primitives = [primitive for mesh in gltf.document.meshes for primitive in mesh.primitives]
-    splats = [primitive for primitive in primitives if _EXTENSION in primitive.extensions]
+def _find_splat(gltf: _Gltf) -> tuple[_Mesh, _Primitive]:
+    primitives = [(mesh, primitive) for mesh in gltf.document.meshes for primitive in mesh.primitives]
+    splats = [(mesh, primitive) for mesh, primitive in primitives if _EXTENSION in primitive.extensions]
     if len(splats) != 1:
         raise InputError(
             f"{gltf.path} has {len(splats)} splats ({_EXTENSION}) among its {len(primitives)} primitives, expected "
@@ -280,7 +283,7 @@ def encode_glb(
     Args:
         splat: finite Gaussians whose colors are spherical harmonics; those of degree 4 are left out.
         columns: further attributes, whose names begin with an underscore.
-        extras: `extras` of the mesh, with JSON types only.
+        extras: `extras` of the mesh, with JSON types only; "rasterize_mode" is read again.
     """
     values = {name: value.detach().cpu().double() for name, value in splat.parameters.items()}
     colors = (values["features_dc"] * SH_C0 + 0.5).clamp(0, 1)

@@ -132,10 +132,10 @@ def decode_spz(data: bytes, path: Path) -> SplatFile:
 
 def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:
     """Return a sentence about the rounding errors of an SPZ file."""
-    turn = "0.01" if version == 2 else "0.002"
+    turn = "0.1" if version == 2 else "0.004"
     return (
         f"{name} holds rounded numbers: positions within {0.5 ** (fractional_bits + 1):.2g}, logarithms of scales "
-        f"within 0.03, rotations within {turn} radians, opacities within 0.002."
+        f"within 0.03 of -10 to 5.9, rotations within {turn} radians, opacities within 0.002."
     )
 
 
