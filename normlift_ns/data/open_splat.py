@@ -12,6 +12,7 @@ from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.cameras import adjust_poses, candidate_worlds, read_camera_file
 from normlift_ns.data.frames import WorldTransform, transform_frames
 from normlift_ns.data.gltf import GLB_MAGIC
+from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names
 from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, validate_splat
@@ -54,7 +55,7 @@ def open_splat(
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _read(path)
-    held_out = _held_out(options, cameras)
+    held_out = _held_out(options, cameras, file.test_every)
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
 
@@ -95,12 +96,14 @@ def open_splat(
     return scene
 
 
-def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
-    """Return the names of the images that the training did not use."""
+def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
+    """Return the names of the images that the training did not use, by the options, else by its cfg.yml."""
     held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.eval_images) > 0:
+        test_every = options.test_every
+    if test_every is not None or len(options.eval_images) > 0:
         names = [frame.name for frame in frames]
-        held_out = held_out_names(names, test_every=options.test_every, eval_images=options.eval_images)
+        held_out = held_out_names(names, test_every=test_every, eval_images=options.eval_images)
     if len(held_out) == len(frames) and options.views == "train":
         raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
     return held_out
@@ -139,6 +142,8 @@ def _read(path: Path) -> SplatFile:
     protect_inputs(path)
     name = _format(path)
     read = SPLAT_READERS.load(name)
+    if name in ("ply", "pt"):
+        return _with_gsplat_config(read(path), path)
     if name in SPLAT_READERS.built_in:
         return read(path)
     try:
@@ -153,6 +158,20 @@ def _read(path: Path) -> SplatFile:
         raise InputError(f"the installed reader of the format {name!r} returned {kind}, expected a SplatFile")
     validate_splat(file.splat, path)
     return file
+
+
+def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
+    """Return a checkpoint or PLY file with the settings in the cfg.yml of its training run."""
+    config = find_gsplat_config(path)
+    if config is None:
+        return file
+    normalized, mode = config.normalize_world_space, config.rasterize_mode
+    return file._replace(
+        rasterize_mode=mode or file.rasterize_mode,
+        by_gsplat=file.by_gsplat if normalized is None else normalized,
+        test_every=config.test_every,
+        remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
+    )
 
 
 def _format(path: Path) -> str:
@@ -214,7 +233,8 @@ def _assumptions(
     texts, mode, frames = list(file.remarks), file.rasterize_mode, cameras.frames
     if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
         texts.append(
-            f"{path.name} has SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} is used instead."
+            f"{path.name} was trained with rasterize mode {mode}; --rasterize-mode {options.rasterize_mode} is used "
+            "instead."
         )
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")

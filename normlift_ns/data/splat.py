@@ -162,6 +162,8 @@ class SplatFile(NamedTuple):
     """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
     by_gsplat: bool = False
     """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
+    test_every: int | None = None
+    """Interval of the images that the training held out; None if the file does not name it."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
 
