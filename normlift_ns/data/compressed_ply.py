@@ -36,7 +36,6 @@ _POSITION_BITS = (11, 10, 11)
 _MAX_LOG_SCALE = 20.0
 _SH_RANGE = 8.0
 """Spherical harmonics are clamped to half of it on both sides of 0."""
-_MORTON_BITS = 10
 
 
 class CompressedPly(NamedTuple):
@@ -79,7 +78,7 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
 
 
 def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
-    """Return Gaussians as a compressed PLY file, sorted along a Morton curve, so that chunks are small.
+    """Return Gaussians as a compressed PLY file, in an order that makes chunks small.
 
     Opacities and colors have 8 bits, spherical harmonics 1/32 between -4 and 4, rotations 10 bits per component, and
     positions and logarithms of scales 10 or 11 bits of their range in a chunk.
@@ -89,7 +88,7 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
         name: name of the file, for the message.
         comments: comments for its header.
     """
-    rows = _morton_order(parameters["means"])
+    rows = _chunk_order(parameters["means"].detach().cpu().numpy())
     values = {key: value.detach().cpu().double()[rows] for key, value in parameters.items()}
     colors = values["features_dc"] * SH_C0 + 0.5
     scales = values["scales"].clamp(-_MAX_LOG_SCALE, _MAX_LOG_SCALE)
@@ -119,7 +118,7 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
         elements.append(_element("sh", {f"f_rest_{i}": packed[:, i] for i in range(rest.shape[1])}, "u1"))
     buffer = io.BytesIO()
     PlyData(elements, byte_order="<", comments=list(comments)).write(buffer)
-    return CompressedPly(buffer.getvalue(), rows.numpy(), _rounding(name, *ranges[:2]))
+    return CompressedPly(buffer.getvalue(), rows, _rounding(name, *ranges[:2]))
 
 
 def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> str:
@@ -202,12 +201,17 @@ def _element(name: str, columns: Mapping[str, np.ndarray], kind: str) -> PlyElem
     return PlyElement.describe(table, name)
 
 
-def _morton_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
-    """Sort positions along a space-filling curve; cells are fractions of ranks, so that outliers do not matter."""
-    ranks = means.detach().cpu().argsort(dim=0, stable=True).argsort(dim=0)
-    cells = ranks * 2**_MORTON_BITS // max(1, len(means))
-    key = torch.zeros(len(means), dtype=torch.int64)
-    for bit in range(_MORTON_BITS):
-        for axis in range(3):
-            key |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return key.argsort(stable=True)
+def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """Return an order of the rows in which chunks are small boxes: those of a k-d tree."""
+    weights = 1 / (2.0 ** np.array(_POSITION_BITS) - 1)
+    chunks, boxes = [], [np.arange(len(means))]
+    while len(boxes) > 0:
+        rows = boxes.pop()
+        if len(rows) <= _CHUNK_ROWS:
+            chunks.append(rows)
+            continue
+        axis = int((np.ptp(means[rows], axis=0) * weights).argmax())
+        middle = -(-len(rows) // _CHUNK_ROWS) // 2 * _CHUNK_ROWS  # all chunks but the last one are full
+        rows = rows[np.argpartition(means[rows, axis], middle)]
+        boxes += [rows[middle:], rows[:middle]]
+    return np.concatenate(chunks)
