@@ -111,6 +111,8 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
 
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
+_SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
+"""Formats whose files are recognized whatever their suffix, except for splat, which has no first bytes of its own."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of formats that are not read."""
 _BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
@@ -180,9 +182,10 @@ def _format(path: Path) -> str:
     Raises:
         ValueError: if it is a splat in a format that is not read; the message has the command that converts it.
     """
-    suffix = path.suffix.lower().removeprefix(".")
-    if path.suffix.removeprefix(".") in SPLAT_READERS.names() and suffix not in SPLAT_READERS.built_in:
-        return path.suffix.removeprefix(".")
+    suffix = path.suffix.removeprefix(".")
+    if suffix in SPLAT_READERS.names() and suffix not in _SNIFFED:
+        return suffix
+    suffix = suffix.lower()
     head = b""
     if path.is_file():
         with open_regular(path) as file:
@@ -197,7 +200,7 @@ def _format(path: Path) -> str:
         raise _unread(path, suffix.upper() if suffix in _UNREAD else "SOG")
     if head.lstrip()[:1] == b"{":
         return "gltf"
-    return suffix if suffix in SPLAT_READERS.built_in else "ply"
+    return suffix if suffix in _SNIFFED else "ply"
 
 
 def _refuse_archive(path: Path) -> None:

@@ -60,8 +60,8 @@ def node(made_once: Callable[..., Path]) -> Callable[..., str]:
     def install(folder: Path) -> None:
         command = [program, str(npm)] if npm is not None and npm.exists() else [shutil.which("npm") or "npm"]
         flags = ("install", "--ignore-scripts", "--no-audit", "--no-fund", "--prefix", str(folder))
-        how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 170, "check": False}
-        done = subprocess.run([*command, *flags, *PACKAGES], cwd=folder, **how)
+        words = [*command, *flags, *PACKAGES]
+        done = subprocess.run(words, capture_output=True, text=True, cwd=folder, timeout=170, check=False)
         if done.returncode != 0:
             pytest.skip(f"the packages cannot be had: {done.stderr[-300:]}")
         for name, text in (("three.mjs", THREE), ("validator.mjs", VALIDATOR)):
