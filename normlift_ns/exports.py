@@ -41,6 +41,7 @@ SplatFormat = Literal["ply", "compressed_ply", "glb", "spz", "spz4"]
 """Format of an exported splat; spz is version 3 of SPZ, which more programs read, and spz4 version 4."""
 _FORMATS: dict[str, SplatFormat] = {".compressed.ply": "compressed_ply", ".glb": "glb", ".spz": "spz"}
 """Formats by the end of a file name; all other names are those of PLY files."""
+_UNWRITTEN = (".splat", ".sog", ".ksplat", ".gltf")
 MIN_OPACITY_LOGIT = -5.5373
 """Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
@@ -171,7 +172,7 @@ def write_splat(
         raise InputError(f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}")
     if labels.answer is not None and labels.instances is None:
         labels = labels._replace(instances=answer_instances(labels.answer))
-    kind = file_format or _named_format(path.name.lower())
+    kind = file_format or _named_format(path)
     if kind == "ply":
         content, remarks = _to_ply(columns, rows, splat.rasterize_mode, labels), ()
     else:
@@ -196,9 +197,11 @@ def write_splat(
     return WrittenSplat(rows, remarks)
 
 
-def _named_format(name: str) -> SplatFormat:
+def _named_format(path: Path) -> SplatFormat:
+    if path.suffix.lower() in _UNWRITTEN:
+        raise InputError(f"{path} is not written: expected a name ending with .ply, {', '.join(_FORMATS)}")
     for end, kind in _FORMATS.items():
-        if name.endswith(end):
+        if path.name.lower().endswith(end):
             return kind
     return "ply"
 

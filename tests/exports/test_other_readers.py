@@ -110,7 +110,7 @@ def test_what_splat_transform_writes_is_read(node: Callable[..., str], tmp_path:
         expected = rows_of(splat, row)  # type: ignore[arg-type]
         assert float((found.opacities.sigmoid() - expected.opacities.sigmoid()).abs().max()) < 0.003
         assert float((found.scales - expected.scales).abs().max()) < 0.04
-    node("-w", plain, tmp_path / "a.sog")  # which the message advises to convert
+    node("-w", "-g", "cpu", plain, tmp_path / "a.sog")  # which the message advises to convert
     node("-w", tmp_path / "a.sog", tmp_path / "converted.ply")
     assert len(read_ply(tmp_path / "converted.ply").splat) == 700
 

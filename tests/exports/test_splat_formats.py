@@ -11,6 +11,7 @@ from normlift_ns import open_run
 from normlift_ns.cli import export
 from normlift_ns.data.gltf import _open_gltf, _read_accessor
 from normlift_ns.data.open_splat import _read
+from normlift_ns.errors import InputError
 from tests.cli.conftest import run_entry, said
 
 
@@ -29,6 +30,8 @@ def test_every_format_has_the_gaussians_of_the_run(lifted: Path, tmp_path: Path,
         if name[0] != "a":
             rows = run.export(tmp_path / name, answer)
             assert np.array_equal(rows, np.load(_beside(tmp_path / name, "rows.npy")))
+    with pytest.raises(InputError, match=r"e\.sog is not written: .* \.glb, \.spz"):
+        run.export(tmp_path / "e.sog", answer)
     with pytest.raises(FileExistsError):
         run.export(tmp_path / "b.spz", answer)
     run.export(tmp_path / "b.spz", answer, overwrite=True)
