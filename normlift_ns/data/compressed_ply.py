@@ -34,6 +34,8 @@ _BOUNDS = {
 }
 _POSITION_BITS = (11, 10, 11)
 _MAX_LOG_SCALE = 20.0
+_MAX_HARMONICS = 15
+"""Number of coefficients of degrees 1 to 3."""
 _SH_RANGE = 8.0
 """Spherical harmonics are clamped to half of it on both sides of 0."""
 
@@ -84,7 +86,8 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
     positions and logarithms of scales 10 or 11 bits of their range in a chunk.
 
     Args:
-        parameters: finite parameters by splatfacto's names; colors are spherical harmonics of degree 0 to 3.
+        parameters: finite parameters by splatfacto's names; colors are spherical harmonics, of which those of degree 4
+            are left out.
         name: name of the file, for the message.
         comments: comments for its header.
     """
@@ -112,7 +115,9 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
         _element("chunk", {key: value.numpy() for key, value in chunk.items()}, "<f4"),
         _element("vertex", {key: word.numpy() for key, word in zip(_VERTEX, words)}, "<u4"),
     ]
-    rest = values["features_rest"].transpose(1, 2).reshape(len(rows), -1)  # all of red, then green, then blue
+    rest = (
+        values["features_rest"][:, :_MAX_HARMONICS].transpose(1, 2).reshape(len(rows), -1)
+    )  # all of red, then green, then blue
     if rest.shape[1] > 0:
         packed = to_bytes(((rest / _SH_RANGE + 0.5) * 256).floor())
         elements.append(_element("sh", {f"f_rest_{i}": packed[:, i] for i in range(rest.shape[1])}, "u1"))

@@ -75,7 +75,7 @@ PRECISION = {
 
 
 @pytest.mark.parametrize("kind", ["spz", "spz4", "splat", "glb", "ply"])
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, kind: str, degree: int) -> None:
     made = random_splat(N, degree)
     splat = replace(made, features_rest=made.features_rest.clamp(-1, 1), features_dc=made.features_dc.clamp(-1.7, 1.7))
@@ -94,7 +94,9 @@ def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, k
     if limits["rest"] is None:
         assert ours.degree == 0
     elif degree > 0:
-        errors["rest"] = (ours.features_rest - theirs.features_rest).abs().max()
+        assert ours.degree == (degree if "spz" in kind else min(degree, 3))
+        kept = theirs.features_rest[:, : ours.features_rest.shape[1]]
+        errors["rest"] = (ours.features_rest - kept).abs().max()
     for name, error in errors.items():
         assert float(error) <= limits[name], (name, float(error))
     said = [re.search(r"positions within ([\d.e-]+)", text) for text in found.remarks]
