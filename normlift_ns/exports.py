@@ -1,4 +1,4 @@
-"""Exports of a lifted run: PLY files of Gaussians, masks, label arrays and labeled point clouds."""
+"""Exports of a lifted run: splats as PLY, GLB and SPZ files, masks, label arrays and labeled point clouds."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -21,7 +21,10 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.scene import Scene
-from normlift_ns.data.splat import check_ply_header
+from normlift_ns.data.compressed_ply import encode_compressed_ply
+from normlift_ns.data.gltf import encode_glb
+from normlift_ns.data.splat import SplatParameters, check_ply_header
+from normlift_ns.data.spz import decode_spz, encode_spz
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file, atomic_files
 from normlift_ns.options import LABEL_ARRAY_FILES, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, RasterizeMode
@@ -30,9 +33,15 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.registry import Registry
 from normlift_ns.rendering.figures import write_masks
 
-# Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties.
+# Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties, and as files in
+# other formats.
 
 
+SplatFormat = Literal["ply", "compressed_ply", "glb", "spz", "spz4"]
+"""Format of an exported splat; spz is version 3 of SPZ, which more programs read, and spz4 version 4."""
+_FORMATS: dict[str, SplatFormat] = {".compressed.ply": "compressed_ply", ".glb": "glb", ".spz": "spz"}
+"""Formats by the end of a file name; all other names are those of PLY files."""
+_UNWRITTEN = (".splat", ".sog", ".ksplat", ".gltf")
 MIN_OPACITY_LOGIT = -5.5373
 """Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
@@ -85,14 +94,22 @@ class TrainedSplat(NamedTuple):
         """Return the Gaussians of a scene."""
         return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
 
+    def with_harmonics(self) -> SplatParameters:
+        """Return the Gaussians on the CPU in float32, with spherical harmonics of degree 0 in place of plain colors."""
+        values = {name: value.detach().float().cpu() for name, value in self.parameters.items()}
+        if not self.spherical_harmonics:
+            values["features_dc"] = (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
+            values["features_rest"] = values["features_rest"][:, :0]
+        return SplatParameters(**values)
+
     def columns(self) -> dict[str, np.ndarray]:
         """Return the vertex properties of `ns-export gaussian-splat`, in its order.
 
         Opacities are logits and scales are logarithms, as splatfacto stores them.
         """
-        values = {name: value.detach().float().cpu() for name, value in self.parameters.items()}
-        means, colors, rest = values["means"], values["features_dc"], values["features_rest"]
-        colors = colors if self.spherical_harmonics else (torch.sigmoid(colors) - 0.5) / SH_C0
+        splat = self.with_harmonics()
+        values, rest = splat.parameters, splat.features_rest
+        means, colors = splat.means, splat.features_dc
         columns = {name: means[:, i] for i, name in enumerate("xyz")}
         columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
         columns |= {f"f_dc_{i}": colors[:, i] for i in range(3)}
@@ -105,33 +122,50 @@ class TrainedSplat(NamedTuple):
         return {name: value.numpy() for name, value in columns.items()}
 
 
-def write_splat_ply(
+class SplatLabels(NamedTuple):
+    """Semantics of all Gaussians, as far as a format has columns for them."""
+
+    field: SemanticField
+    answer: Answer | None = None
+    instances: Instances | None = None
+    """Classes and objects of the answer (default: those of `answer_instances`)."""
+    objects: Mapping[str, Any] | None = None
+    """Content of <stem>_objects.json. None: no such file, and `overwrite` removes that of an earlier export."""
+
+
+class WrittenSplat(NamedTuple):
+    """Summary of an exported splat."""
+
+    rows: Int64[np.ndarray, " m"]
+    """Scene indices in the order of the file."""
+    remarks: tuple[str, ...]
+    """Messages about rounding errors."""
+
+
+def write_splat(
     path: Path,
     splat: TrainedSplat,
-    field: SemanticField,
-    answer: Answer | None,
+    labels: SplatLabels,
     *,
     keep: Bool[Tensor, " n"],
-    instances: Instances | None = None,
-    objects: Mapping[str, Any] | None = None,
+    file_format: SplatFormat | None = None,
     overwrite: bool = False,
-) -> Int64[np.ndarray, " m"]:
-    """Write a PLY file and, next to it, the scene index of every vertex as <stem>_rows.npy.
+) -> WrittenSplat:
+    """Write a splat and, next to it, the scene index of every Gaussian in the order of the file as <stem>_rows.npy.
 
-    With an answer, also write the names of its classes and objects as <stem>_names.json.
+    With an answer, also write the names of its classes and objects as <stem>_names.json. PLY and GLB files contain
+    reliabilities, relevancies and labels; the other formats have no columns for them.
 
     Args:
-        path: path of the PLY file.
+        path: path of the file.
         splat: the Gaussians. The file records the mode "antialiased", because other tools assume "classic" by default.
         keep: Gaussians to write; those that ns-export would leave out are skipped, see `exportable_rows`.
-        instances: classes and objects of the answer (default: those of `answer_instances`).
-        objects: content of <stem>_objects.json. None: no such file, and `overwrite` removes that of an earlier export.
+        file_format: None: the format that the file name ends with, .glb, .spz or .compressed.ply, else PLY.
         overwrite: replace existing files.
-    Returns:
-        The scene indices.
     Raises:
         FileExistsError: a file exists, and `overwrite` is False.
-        ValueError: there is no Gaussian to write, or `objects` cannot be encoded as JSON.
+        ValueError: there is no Gaussian to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
+            from the origin for SPZ.
         OSError: a file cannot be written, for instance because the disk is full.
     """
     columns = splat.columns()
@@ -140,23 +174,70 @@ def write_splat_ply(
         count, why = int(keep.sum()), "opacity below 1/255, or parameters that are not finite"
         reason = f"all {count:,} selected Gaussians are invisible ({why})"
         raise InputError(f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}")
-    if answer is not None and instances is None:
-        instances = answer_instances(answer)
-    columns |= semantic_columns(field, answer, instances)
-    types = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
-    vertices = np.rec.fromarrays([column[rows] for column in columns.values()], dtype=types)
-    comments = _comments(splat.rasterize_mode, () if answer is None else answer.texts)
-    ply, indices, names_file, objects_file = export_paths(path)
-    contents = {names_file: None if instances is None else instances.to_json(), objects_file: objects}
+    if labels.answer is not None and labels.instances is None:
+        labels = labels._replace(instances=answer_instances(labels.answer))
+    kind = file_format or _named_format(path)
+    if kind == "ply":
+        content, remarks = _to_ply(columns, rows, splat.rasterize_mode, labels), ()
+    else:
+        content, order, remarks = _encode(path.name, kind, splat, labels, rows)
+        rows = rows[order]
+    file, indices, names_file, objects_file = export_paths(path)
+    contents = {
+        names_file: None if labels.instances is None else labels.instances.to_json(),
+        objects_file: labels.objects,
+    }
     documents = {file: _to_json(content) for file, content in contents.items() if content is not None}
     stale = [file for file in contents if file not in documents] if overwrite else []
-    with atomic_files(ply, indices, *documents, overwrite=overwrite, delete=stale) as drafts:
-        with drafts[0].open("wb") as file:
-            PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(file)
+    with atomic_files(file, indices, *documents, overwrite=overwrite, delete=stale) as drafts:
+        if isinstance(content, PlyData):
+            with drafts[0].open("wb") as draft:
+                content.write(draft)
+        else:
+            drafts[0].write_bytes(content)
         np.save(drafts[1], rows)
         for draft, text in zip(drafts[2:], documents.values()):
             draft.write_text(text, "utf8")
-    return rows
+    return WrittenSplat(rows, remarks)
+
+
+def _named_format(path: Path) -> SplatFormat:
+    if path.suffix.lower() in _UNWRITTEN:
+        raise InputError(f"{path} is not written: expected a name ending with .ply, {', '.join(_FORMATS)}")
+    for end, kind in _FORMATS.items():
+        if path.name.lower().endswith(end):
+            return kind
+    return "ply"
+
+
+def _to_ply(
+    columns: Mapping[str, np.ndarray], rows: Int64[np.ndarray, " m"], mode: RasterizeMode, labels: SplatLabels
+) -> PlyData:
+    columns = {**columns, **semantic_columns(labels.field, labels.answer, labels.instances)}
+    types = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    vertices = np.rec.fromarrays([column[rows] for column in columns.values()], dtype=types)
+    comments = _comments(mode, () if labels.answer is None else labels.answer.texts)
+    return PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+
+
+def _encode(
+    name: str, kind: SplatFormat, splat: TrainedSplat, labels: SplatLabels, rows: Int64[np.ndarray, " m"]
+) -> tuple[bytes, Int64[np.ndarray, " m"] | slice, tuple[str, ...]]:
+    """Return the bytes of a file, the order of the rows in it, and messages about rounding errors."""
+    values = {key: value[torch.from_numpy(rows)] for key, value in splat.with_harmonics().parameters.items()}
+    visible = SplatParameters(**values)
+    if kind == "compressed_ply":
+        comments = tuple(_comments(splat.rasterize_mode, ()))
+        data, order, rounding = encode_compressed_ply(values, name, comments)
+        return data, order, (rounding,)
+    if kind == "glb":
+        columns = semantic_columns(labels.field, labels.answer, labels.instances)
+        extras = {} if labels.instances is None else labels.instances.to_json()
+        extras |= {"rasterize_mode": splat.rasterize_mode}
+        attributes = {f"_{key.upper()}": column[rows] for key, column in columns.items()}
+        return encode_glb(visible, attributes, extras), slice(None), ()
+    data = encode_spz(visible, antialiased=splat.rasterize_mode == "antialiased", version=4 if kind == "spz4" else 3)
+    return data, slice(None), decode_spz(data, Path(name)).remarks
 
 
 def _comments(rasterize_mode: RasterizeMode, texts: Sequence[str]) -> list[str]:
@@ -397,10 +478,11 @@ def transfer_labels(
     return label_cloud(transfer, path, means, labels, overwrite=overwrite)
 
 
-def _export_ply(job: ExportJob, path: Path) -> list[str]:
-    kwargs = {name: getattr(job, name) for name in ("keep", "instances", "objects", "overwrite")}
-    rows = write_splat_ply(path, TrainedSplat.of(job.scene), job.field, job.answer, **kwargs)
-    return [f"{len(rows):,} of {len(job.field):,} Gaussians in {path}"]
+def _export_splat(job: ExportJob, path: Path, file_format: SplatFormat | None = None) -> list[str]:
+    labels = SplatLabels(job.field, job.answer, job.instances, job.objects)
+    splat, how = TrainedSplat.of(job.scene), {"keep": job.keep, "overwrite": job.overwrite}
+    written = write_splat(path, splat, labels, file_format=file_format, **how)
+    return [f"{len(written.rows):,} of {len(job.field):,} Gaussians in {path}", *written.remarks]
 
 
 def _export_masks(job: ExportJob, folder: Path) -> list[str]:
@@ -427,13 +509,17 @@ def _export_cloud(job: ExportJob, path: Path) -> list[str]:
     return [f"{labeled.points:,} points in {path}, {within}"]
 
 
-PLY = Exporter(_export_ply, ".ply", needs_answer=False)
+PLY = Exporter(_export_splat, ".ply", needs_answer=False)
+COMPRESSED_PLY = Exporter(partial(_export_splat, file_format="compressed_ply"), ".ply", needs_answer=False)
+GLB = Exporter(partial(_export_splat, file_format="glb"), ".glb", needs_answer=False)
+SPZ = Exporter(partial(_export_splat, file_format="spz"), ".spz", needs_answer=False)
+SPZ4 = Exporter(partial(_export_splat, file_format="spz4"), ".spz", needs_answer=False)
 MASKS = Exporter(_export_masks)
 ARRAYS = Exporter(_export_arrays)
 CLOUD = Exporter(_export_cloud, ".ply")
 EXPORTERS = Registry(
     "normlift_ns.exporters",
-    {name: f"normlift_ns.exports:{name.upper()}" for name in ("ply", "masks", "arrays", "cloud")},
+    {name: f"normlift_ns.exports:{name.upper()}" for name in (*get_args(SplatFormat), "masks", "arrays", "cloud")},
     Exporter,
     "exporter",
     "--exporters",

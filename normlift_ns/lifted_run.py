@@ -179,12 +179,14 @@ class LiftedRun:
         object_min_gaussians: int = OBJECT_MIN_GAUSSIANS,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
-        """Write Gaussians to a PLY file, and their row indices in the scene to <stem>_rows.npy next to it.
+        """Write Gaussians to a file, and their row indices in the scene to <stem>_rows.npy next to it.
 
-        With an answer, the names of its classes and objects are written to <stem>_names.json.
+        With an answer, the names of its classes and objects are written to <stem>_names.json. PLY and GLB files also
+        contain reliabilities, relevancies and labels.
 
         Args:
-            path: PLY file to write.
+            path: file to write: GLB, SPZ or compressed PLY if its name ends with .glb, .spz or .compressed.ply, else
+                PLY.
             part: Gaussians selected by an answer or finding, or a mask of Gaussians. If None, write the whole scene.
             answer: answer that provides relevancies, class_id and instance_id. If None, use that of `part`, if it has
                 one.
@@ -193,7 +195,7 @@ class LiftedRun:
             object_min_gaussians: minimum number of Gaussians in an object, as in `find_objects`.
             overwrite: replace files of these names. Without `objects`, also remove an earlier table of objects.
         Returns:
-            The row indices of the written Gaussians.
+            The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
             ValueError: no Gaussian of `part` is ever drawn, the mask has another type or length, the name is reserved
@@ -215,16 +217,9 @@ class LiftedRun:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
         instances = None if answer is None else exports.answer_instances(answer, *limits)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
-        return exports.write_splat_ply(
-            path,
-            exports.TrainedSplat.of(self.scene),
-            self.field,
-            answer,
-            keep=keep,
-            instances=instances,
-            objects=objects,
-            overwrite=overwrite,
-        )
+        labels = exports.SplatLabels(self.field, answer, instances, objects)
+        splat = exports.TrainedSplat.of(self.scene)
+        return exports.write_splat(path, splat, labels, keep=keep, overwrite=overwrite).rows
 
     @check_arguments
     def masks(

@@ -579,12 +579,14 @@ class SplatOptions:
     """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None
     """Interval n of held-out images: training left out every n-th image, starting with the first. It is 8 in gsplat's
-    trainer, and in Inria's with --eval. Default: no held-out images, or those that transforms.json lists."""
+    trainer, and in Inria's with --eval. Default: as in the cfg.yml of gsplat's trainer, else those that
+    transforms.json lists."""
     eval_images: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1 (the default of ns-train)."""
     rasterize_mode: RasterizeMode | None = None
-    """Rasterization mode that the splat was trained with. Default: as recorded in the PLY file, else classic."""
+    """Rasterization mode that the splat was trained with. Default: as recorded in the file or in the cfg.yml of
+    gsplat's trainer, else classic."""
     background: Background = "black"
     """Background color behind the splat, and behind images with an alpha channel."""
 

@@ -33,6 +33,7 @@ TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
 OTHERS = {"--app_opt", "--eval", "--filter-value", "--no-deps", "--no-normalize-world-space", "--normalize-world-space"}
 OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--viewer"}
 OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
+OTHERS |= {"--keep-crs"}  # OpenSplat
 """Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""
 
 

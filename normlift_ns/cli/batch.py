@@ -37,9 +37,9 @@ from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
 from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
 _PREFIX = "batch_"
-_SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
+_SOURCES = {".pt": "load_gsplat", **dict.fromkeys((".ply", ".spz", ".splat", ".glb", ".gltf"), "load_ply")}
 """Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
-_SOURCE_NAMES = ("load_config", *_SOURCES.values())
+_SOURCE_NAMES = ("load_config", "load_ply", "load_gsplat")
 _NOT_IN_KEY = ("device", "timestamp", "output_dir")
 """Options that do not change what is lifted, only where it is computed or stored."""
 _KEY_LENGTH = 16

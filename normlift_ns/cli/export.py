@@ -1,4 +1,4 @@
-"""ns-normlift-export: write a lifted run as a PLY file of Gaussians and a table of objects."""
+"""ns-normlift-export: write a lifted run as a file of Gaussians and a table of objects."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ class NormLiftExport(options.CheckedOptions):
     likely floaters, which are Gaussians floating in front of the cameras."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
-    class_id and instance_id values, and <name>_objects.json the objects."""
+    """Name of the file, in the format that it ends with: .ply, .compressed.ply, .glb or .spz. <name>_rows.npy has the
+    index of each Gaussian in the run, <name>_names.json the names of class_id and instance_id values, and
+    <name>_objects.json the objects."""
     masks_dir: Path | None = None
     """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --select rest,
     the values are swapped. Masks fit the undistorted images that the scene was trained with."""
@@ -53,8 +54,8 @@ class NormLiftExport(options.CheckedOptions):
     """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
     Gaussians) and names.json."""
     exporters: tuple[str, ...] = ()
-    """Exporters of other packages to run, by name. Each writes <name of the PLY file>_<exporter>, with a suffix of its
-    own, to the output folder."""
+    """Further outputs, by name: ply, compressed_ply, glb, spz, spz4 (version 4), or exporters of other packages. Each
+    writes <name of the file>_<exporter>, with a suffix of its own, to the output folder."""
     transfer: Path | None = None
     """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
     relevancies of the nearest visible Gaussian; 0 if none is near enough."""
@@ -79,7 +80,7 @@ class NormLiftExport(options.CheckedOptions):
     """Device for the text encoder: auto, cpu or cuda."""
 
     def main(self) -> Path:
-        """Write the files and return the path of the PLY file."""
+        """Write the files and return the path of the file of Gaussians."""
         options.check_device(self.device)
         options.check_prompt_list("text", self.text)
         preflight.check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)

@@ -64,7 +64,8 @@ class NormLift(CheckedOptions):
     load_config: Path | None = None
     """Path to config YAML file of the trained run."""
     load_ply: Path | None = None
-    """PLY file of a splat, instead of --load-config; needs --colmap or --transforms."""
+    """PLY, compressed PLY, SPZ, .splat, GLB or glTF file of a splat, instead of --load-config; needs --colmap or
+    --transforms."""
     load_gsplat: Path | None = None
     """Checkpoint of gsplat's simple_trainer, ckpt_<step>_rank0.pt, instead of --load-config; needs --colmap."""
     splat: SplatOptions = field(default_factory=SplatOptions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
@@ -10,9 +11,12 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.cameras import adjust_poses, candidate_worlds, read_camera_file
 from normlift_ns.data.frames import WorldTransform, transform_frames
+from normlift_ns.data.gltf import GLB_MAGIC
+from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names
 from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, validate_splat
+from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
 from normlift_ns.data.transforms import CameraFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
@@ -27,8 +31,8 @@ def open_splat(
     """Open a trained splat and its images.
 
     Args:
-        path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer;
-            the first bytes of the file distinguish the two. Installed packages may add other formats by suffix.
+        path: a PLY file, also compressed, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
+            simple_trainer; its first bytes tell its format. Installed packages may add other formats by suffix.
         options: locations of its cameras and images.
         say: function that is called with one sentence per assumption, for example `print`.
     Raises:
@@ -51,7 +55,7 @@ def open_splat(
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _read(path)
-    held_out = _held_out(options, cameras)
+    held_out = _held_out(options, cameras, file.test_every)
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
 
@@ -92,22 +96,35 @@ def open_splat(
     return scene
 
 
-def _held_out(options: SplatOptions, cameras: CameraFile) -> frozenset[str]:
-    """Return the names of the images that the training did not use."""
+def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
+    """Return the names of the images that the training did not use, by the options, else by its cfg.yml."""
     held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.eval_images) > 0:
+        test_every = options.test_every
+    if test_every is not None or len(options.eval_images) > 0:
         names = [frame.name for frame in frames]
-        held_out = held_out_names(names, test_every=options.test_every, eval_images=options.eval_images)
+        held_out = held_out_names(names, test_every=test_every, eval_images=options.eval_images)
     if len(held_out) == len(frames) and options.views == "train":
         raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
     return held_out
 
 
+_HEAD_BYTES = 64
+_MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
+_SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
+"""Formats whose files are recognized whatever their suffix, except for splat, which has no first bytes of its own."""
+_UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
+"""Suffixes of formats that are not read."""
+_BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
         "ply": "normlift_ns.data.splat:read_ply",
         "pt": "normlift_ns.data.checkpoint:read_gsplat_checkpoint",
+        "spz": "normlift_ns.data.spz:read_spz",
+        "splat": "normlift_ns.data.antimatter:read_antimatter",
+        "glb": "normlift_ns.data.gltf:read_gltf",
+        "gltf": "normlift_ns.data.gltf:read_gltf",
     },
     plugin=FunctionType,
     noun="splat format",
@@ -127,6 +144,8 @@ def _read(path: Path) -> SplatFile:
     protect_inputs(path)
     name = _format(path)
     read = SPLAT_READERS.load(name)
+    if name in ("ply", "pt"):
+        return _with_gsplat_config(read(path), path)
     if name in SPLAT_READERS.built_in:
         return read(path)
     try:
@@ -143,25 +162,82 @@ def _read(path: Path) -> SplatFile:
     return file
 
 
+def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
+    """Return a checkpoint or PLY file with the settings in the cfg.yml of its training run."""
+    config = find_gsplat_config(path)
+    if config is None:
+        return file
+    normalized, mode = config.normalize_world_space, config.rasterize_mode
+    return file._replace(
+        rasterize_mode=mode or file.rasterize_mode,
+        by_gsplat=file.by_gsplat if normalized is None else normalized,
+        test_every=config.test_every,
+        remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
+    )
+
+
 def _format(path: Path) -> str:
-    """Return the name of a file's format: by its suffix, or by its first bytes for the built-in formats."""
-    name = path.suffix.removeprefix(".")
-    if name != "ply" and name in SPLAT_READERS.names():
-        return name
-    if not path.is_file():
-        return "ply"
-    with open_regular(path) as file:
-        return "pt" if file.read(2) == b"PK" else "ply"  # torch.save writes ZIP archives
+    """Return the name of a file's format: by its first bytes, else by its suffix.
+
+    Raises:
+        ValueError: if it is a splat in a format that is not read; the message has the command that converts it.
+    """
+    suffix = path.suffix.removeprefix(".")
+    if suffix in SPLAT_READERS.names() and suffix not in _SNIFFED:
+        return suffix
+    suffix = suffix.lower()
+    head = b""
+    if path.is_file():
+        with open_regular(path) as file:
+            head = file.read(_HEAD_BYTES)
+    if head.startswith(b"PK"):  # torch.save writes ZIP archives
+        _refuse_archive(path)
+        return "pt"
+    for start, name in _MAGIC.items():
+        if head.startswith(start):
+            return name
+    if suffix in _UNREAD or path.name == "meta.json":
+        raise _unread(path, suffix.upper() if suffix in _UNREAD else "SOG")
+    if head.lstrip()[:1] == b"{":
+        return "gltf"
+    return suffix if suffix in _SNIFFED else "ply"
+
+
+def _refuse_archive(path: Path) -> None:
+    """Raise if a ZIP archive holds a splat in a format that is not read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except Exception:  # zipfile raises any kind of exception on a damaged file, which the reader reports
+        return
+    suffixes = {Path(name).suffix.lower() for name in names}
+    if suffixes & {".usd", ".usda", ".usdc"}:
+        raise _unread(path, "USDZ")
+    if "meta.json" in names and ".webp" in suffixes:
+        raise _unread(path, "SOG")
+    if not any(Path(name).name == "data.pkl" for name in names):  # which torch.save writes
+        raise InputError(
+            f"{path} is a ZIP archive of {', '.join(names)[:200] or 'nothing'}, expected a splat. Extract the file of "
+            "the splat, and give that."
+        )
+
+
+def _unread(path: Path, name: str) -> InputError:
+    advice = "Export a PLY file from the program that wrote it, and give that."
+    if name in _BY_SPLAT_TRANSFORM:
+        advice = f"Convert it with: npx @playcanvas/splat-transform {path.name} {path.stem}.ply (Node 22 or newer)"
+    return InputError(f"{path} is a {name} file, which is not read. {advice}")
 
 
 def _assumptions(
     path: Path, options: SplatOptions, file: SplatFile, held_out: frozenset[str], cameras: CameraFile
 ) -> list[str]:
     """Return messages about settings that the files do not specify."""
-    texts, mode, frames = [], file.rasterize_mode, cameras.frames
+    texts, mode, frames = list(file.remarks), file.rasterize_mode, cameras.frames
     if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
         texts.append(
-            f"{path.name} has SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} is used instead."
+            f"{path.name} was trained with rasterize mode {mode}; --rasterize-mode {options.rasterize_mode} is used "
+            "instead."
         )
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")

@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.data.compressed_ply import PACKED, unpack_compressed_ply
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import file_kind, open_regular
 from normlift_ns.options import RasterizeMode
@@ -161,6 +162,10 @@ class SplatFile(NamedTuple):
     """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
     by_gsplat: bool = False
     """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
+    test_every: int | None = None
+    """Interval of the images that the training held out; None if the file does not name it."""
+    remarks: tuple[str, ...] = ()
+    """Messages about the file, such as rounding errors of a compressed format."""
 
 
 _MAX_HEADER_BYTES, _MAX_LINE_BYTES = 2**20, 2**16
@@ -172,7 +177,7 @@ _MODES: dict[str, RasterizeMode] = {
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat. Its properties may be in any order; other properties are ignored.
+    """Read a splat, also of a compressed PLY file. Its properties may be in any order; other properties are ignored.
 
     Peak memory is a little more than one copy of the Gaussians.
 
@@ -188,11 +193,17 @@ def read_ply(path: Path) -> SplatFile:
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count == 0:
         raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+    mode = _mode([*data.comments, *vertex.comments])
+    if any(item.name == PACKED for item in vertex.properties):
+        parameters, rounding = unpack_compressed_ply(data, path)
+        splat = splat_from_parameters(parameters, path)
+        validate_splat(splat, path)
+        return SplatFile(splat, mode, remarks=(rounding,))
     _check_properties(path, vertex)
     rest = _rest_names(path, {item.name for item in vertex.properties})
     splat = _read_columns(path, vertex.data, rest)
     validate_splat(splat, path)
-    return SplatFile(splat, _mode([*data.comments, *vertex.comments]))
+    return SplatFile(splat, mode)
 
 
 def _parse_ply(path: Path) -> PlyData:
@@ -219,10 +230,6 @@ def _parse_ply(path: Path) -> PlyData:
 def _check_properties(path: Path, vertex: PlyElement) -> None:
     """Raise InputError unless the vertices have the properties of a splat, as plain numbers."""
     names = {item.name for item in vertex.properties}
-    if "packed_position" in names:
-        raise InputError(
-            f"{path} is a compressed PLY file. Expand it with: splat-transform {path.name} scene.ply, and give that."
-        )
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
     if missing:

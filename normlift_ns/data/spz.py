@@ -1,21 +1,34 @@
-"""SPZ files of Niantic: Gaussians in a few bytes per attribute, compressed (https://github.com/nianticlabs/spz)."""
+"""SPZ files of Niantic: Gaussians in a few bytes per attribute, compressed (https://github.com/nianticlabs/spz).
+
+Versions 2 and 3 are one gzip stream of a header and the attributes, one after the other. Version 4 has a plain header,
+a table of sizes, and a zstd stream per attribute.
+"""
 
 from __future__ import annotations
 
 import gzip
 import struct
+import zlib
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.quantization import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
+from normlift_ns.data.splat import SH_DEGREES, SplatFile, SplatParameters, validate_splat
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import open_regular
+from normlift_ns.io.memory import refuse_small_memory
 
-_MAGIC = 0x5053474E  # "NGSP"
-_HEADER = struct.Struct("<IIIBBBB")
-"""Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, a reserved byte."""
+SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
+_HEADER = struct.Struct("<4sIIBBBB")
+"""Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, number of streams."""
+_TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
+"""The whole header of version 4, and the compressed and uncompressed size of a stream."""
 _ANTIALIASED = 1
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
@@ -23,10 +36,27 @@ _SH_STEPS = (8, 16)
 """Steps of the spherical harmonics of degree 1 and of higher degrees, in 1/128: the defaults of Niantic's library."""
 _COMPONENT_STEPS = 511 * 2**0.5
 """Steps of a quaternion component per unit; components other than the largest are at most sqrt(1/2)."""
+_MAX_RATIO = 1032
+"""Ratio that deflate reaches at best."""
+_MAX_WINDOW = 2**27
 
 
-def encode_spz(splat: SplatParameters, *, antialiased: bool = False) -> bytes:
-    """Return Gaussians as an SPZ file of version 3, in the order of their rows and in their own coordinates.
+class _Header(NamedTuple):
+    version: int
+    gaussians: int
+    degree: int
+    fractional_bits: int
+    flags: int
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of bytes of positions, opacities, colors, scales, rotations and spherical harmonics."""
+        harmonics = 3 * ((self.degree + 1) ** 2 - 1)
+        return [self.gaussians * size for size in (9, 1, 3, 3, 3 if self.version == 2 else 4, harmonics)]
+
+
+def encode_spz(splat: SplatParameters, *, antialiased: bool = False, version: Literal[3, 4] = 3) -> bytes:
+    """Return Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
     Positions take the finest of the 24 steps between 1 and 2^-23 that holds them all. Logarithms of scales are rounded
     to 1/16 and clamped to -10..5.94, opacities to 1/255, colors to 1/38, spherical harmonics to 1/16 (degree 1) or 1/8
@@ -35,6 +65,7 @@ def encode_spz(splat: SplatParameters, *, antialiased: bool = False) -> bytes:
     Args:
         splat: the Gaussians, whose colors are spherical harmonics.
         antialiased: True if they were trained with the rasterize mode "antialiased".
+        version: 3 is read by more programs; 4 is the newest one.
     Raises:
         ValueError: if a Gaussian that can be drawn is further than 8,388,607 from the origin along an axis.
     """
@@ -43,20 +74,151 @@ def encode_spz(splat: SplatParameters, *, antialiased: bool = False) -> bytes:
         torch.where(drawable.view(-1, *[1] * (value.ndim - 1)), value.detach().cpu().double(), 0.0).nan_to_num()
         for value in splat.parameters.values()
     )
-    fractional_bits = _fractional_bits(means)
-    fixed = (means * 2**fractional_bits).round().to(torch.int32).numpy().astype("<i4")
-    alphas = torch.where(drawable, logits[:, 0].sigmoid(), 0.0)
+    bits = _fractional_bits(means)
+    fixed = (means * 2**bits).round().to(torch.int32).numpy().astype("<i4")
     fields = (
         fixed.view(np.uint8).reshape(-1, 4)[:, :3],
-        _to_bytes(alphas * 255),
-        _to_bytes(colors * (_COLOR_SCALE * 255) + 127.5),
-        _to_bytes((scales - _MIN_SCALE) * _SCALE_STEPS),
+        to_bytes(torch.where(drawable, logits[:, 0].sigmoid(), 0.0) * 255),
+        to_bytes(colors * (_COLOR_SCALE * 255) + 127.5),
+        to_bytes((scales - _MIN_SCALE) * _SCALE_STEPS),
         _pack_quats(quats),
         _pack_harmonics(rest),
     )
-    flags = _ANTIALIASED if antialiased else 0
-    header = _HEADER.pack(_MAGIC, 3, len(splat), splat.degree, fractional_bits, flags, 0)
-    return gzip.compress(b"".join([header, *(field.tobytes() for field in fields)]), compresslevel=6, mtime=0)
+    streams = [field.tobytes() for field in fields if field.size > 0]
+    flags, number = _ANTIALIASED if antialiased else 0, len(streams) if version == 4 else 0
+    header = _HEADER.pack(SPZ_MAGIC, version, len(splat), splat.degree, bits, flags, number)
+    if version == 3:
+        return gzip.compress(b"".join([header, *streams]), compresslevel=6, mtime=0)
+    packed = [zstandard.compress(stream, level=12) for stream in streams]
+    table = [_TABLE_ENTRY.pack(len(after), len(before)) for before, after in zip(streams, packed)]
+    return b"".join([header, struct.pack("<I12x", _TABLE_OFFSET.size), *table, *packed])
+
+
+def read_spz(path: Path) -> SplatFile:
+    """Read an SPZ file of version 2, 3 or 4, in its own coordinates.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be drawn.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no SPZ file at {path}. Give the file of the splat with --load-ply.")
+    with open_regular(path) as file:
+        return decode_spz(file.read(), path)
+
+
+def decode_spz(data: bytes, path: Path) -> SplatFile:
+    """Return the Gaussians in the bytes of an SPZ file; `path` is for messages. Raises the errors of `read_spz`."""
+    is_gzip = data.startswith(GZIP_MAGIC)
+    header, streams = _read_gzip(data, path) if is_gzip else _read_zstd(data, path)
+    n, k = header.gaussians, (header.degree + 1) ** 2 - 1
+    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(stream, np.uint8) for stream in streams)
+    fixed = np.zeros((n, 3, 4), np.uint8)
+    fixed[:, :, 1:] = positions.reshape(n, 3, 3)
+    means = (fixed.view("<i4")[:, :, 0] >> 8) * 0.5**header.fractional_bits
+    quats = _unpack_first_three(rotations) if header.version == 2 else _unpack_quats(rotations)
+    splat = SplatParameters(
+        means=torch.from_numpy(means).float(),
+        quats=quats,
+        scales=_floats(scales, n, 3) / _SCALE_STEPS + _MIN_SCALE,
+        opacities=opacity_logits(_floats(alphas, n, 1) / 255),
+        features_dc=(_floats(colors, n, 3) / 255 - 0.5) / _COLOR_SCALE,
+        features_rest=_floats(rest, n, k, 3) / 128 - 1,
+    )
+    validate_splat(splat, path)
+    mode = "antialiased" if header.flags & _ANTIALIASED else None
+    return SplatFile(splat, mode, remarks=(spz_rounding(path.name, header.fractional_bits, header.version),))
+
+
+def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:
+    """Return a sentence about the rounding errors of an SPZ file."""
+    turn = "0.1" if version == 2 else "0.004"
+    return (
+        f"{name} holds rounded numbers: positions within {0.5 ** (fractional_bits + 1):.2g}, logarithms of scales "
+        f"within 0.03 of -10 to 5.9, rotations within {turn} radians, opacities within 0.002."
+    )
+
+
+def _read_header(data: bytes, path: Path) -> _Header:
+    if len(data) < _HEADER.size or not data.startswith(SPZ_MAGIC):
+        raise InputError(
+            f"{path} is not an SPZ file: it begins with {data[:4].hex() or 'nothing'}, expected {SPZ_MAGIC.hex()}. If "
+            "it is a compressed file of another kind, decompress it first, for example with gunzip."
+        )
+    _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack_from(data)
+    if not 2 <= version <= 4:
+        raise InputError(
+            f"{path} is an SPZ file of version {version}, expected 2, 3 or 4. Write it again as version 3."
+        )
+    if count == 0:
+        raise InputError(f"{path} holds no Gaussians. Export the scene again.")
+    if degree not in SH_DEGREES.values() or fractional_bits > _MAX_FRACTIONAL_BITS + 1:
+        raise InputError(
+            f"{path} is damaged: its header has spherical harmonics of degree {degree} and {fractional_bits} "
+            f"fractional bits, expected a degree of at most {max(SH_DEGREES.values())} and at most 24 bits. Copy it "
+            "again."
+        )
+    return _Header(version, count, degree, fractional_bits, flags)
+
+
+def _check_size(header: _Header, size: int, path: Path) -> None:
+    """Raise if the Gaussians cannot be in a compressed file of so many bytes, or not in memory."""
+    if sum(header.sizes) > size * _MAX_RATIO:
+        raise _damaged(path, f"its header declares {header.gaussians:,} Gaussians, but it has only {size:,} bytes")
+    refuse_small_memory(header.gaussians)
+
+
+def _damaged(path: Path, problem: str) -> InputError:
+    return InputError(f"{path} is truncated or damaged: {problem}. Copy it again.")
+
+
+def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
+    """Return the header and the attributes of version 2 or 3, decompressing no more than the header declares."""
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    try:
+        header = _read_header(stream.decompress(data, _HEADER.size), path)
+        if header.version == 4:
+            raise _damaged(path, "it is compressed as version 3, and its header has version 4")
+        _check_size(header, len(data), path)
+        content = stream.decompress(stream.unconsumed_tail, sum(header.sizes))
+    except zlib.error as error:
+        raise _damaged(path, str(error)) from error
+    if len(content) < sum(header.sizes):
+        raise _damaged(path, f"it ends after {len(content):,} of {sum(header.sizes):,} bytes")
+    ends = np.cumsum(header.sizes).tolist()
+    return header, [content[end - size : end] for end, size in zip(ends, header.sizes)]
+
+
+def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
+    """Return the header and the attributes of version 4."""
+    header = _read_header(data, path)
+    if header.version != 4 or len(data) < _TABLE_OFFSET.size:
+        raise _damaged(path, f"it is not compressed, and its header has version {header.version}")
+    _check_size(header, len(data) * 64, path)  # zstd repeats a byte in fewer bytes than deflate
+    (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
+    sizes = [size for size in header.sizes if size > 0]
+    offset = start + number * _TABLE_ENTRY.size
+    if number != len(sizes) or start < _TABLE_OFFSET.size or offset > len(data):
+        raise _damaged(path, f"its table of {number} streams begins at byte {start:,}")
+    streams = []
+    for i, size in enumerate(sizes):
+        packed, unpacked = _TABLE_ENTRY.unpack_from(data, start + i * _TABLE_ENTRY.size)
+        if unpacked != size or packed > len(data) - offset:
+            raise _damaged(path, f"its stream {i} declares {unpacked:,} bytes, expected {size:,}")
+        streams.append(_decompress_zstd(data[offset : offset + packed], size, path))
+        offset += packed
+    return header, [*streams, *[b""] * (len(header.sizes) - len(streams))]
+
+
+def _decompress_zstd(data: bytes, size: int, path: Path) -> bytes:
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as reader:
+            content = reader.read(size)
+    except zstandard.ZstdError as error:
+        raise _damaged(path, str(error)) from error
+    if len(content) < size:
+        raise _damaged(path, f"a stream ends after {len(content):,} of {size:,} bytes")
+    return content
 
 
 def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
@@ -70,26 +232,33 @@ def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
     return next(bits for bits in range(_MAX_FRACTIONAL_BITS, -1, -1) if round(reach * 2**bits) <= _MAX_FIXED)
 
 
-def _to_bytes(values: Tensor) -> np.ndarray:
-    return values.round().clamp(0, 255).to(torch.uint8).numpy()
+def _floats(values: np.ndarray, *shape: int) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32)).reshape(shape)
 
 
 def _pack_quats(quats: Float[Tensor, "n 4"]) -> np.ndarray:
     """Return 2 bits for the index of the largest component of (x, y, z, w), and 10 bits for each of the others."""
-    identity = torch.tensor([0.0, 0, 0, 1], dtype=quats.dtype)
-    unit = quats / quats.abs().amax(dim=1, keepdim=True)
-    unit = torch.nn.functional.normalize(unit, dim=1).roll(-1, dims=1)
-    unit = torch.where(unit.isfinite().all(dim=1, keepdim=True), unit, identity)
-    largest = unit.abs().argmax(dim=1, keepdim=True)
-    unit = unit * torch.where(unit.gather(1, largest) < 0, -1.0, 1.0)  # q and -q are the same rotation
-    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
-    components = unit.gather(1, others)
+    index, components = split_largest(normalize_quats(quats).roll(-1, dims=1))
     steps = (components.abs() * _COMPONENT_STEPS).round().clamp(max=511).long() | ((components < 0).long() << 9)
-    packed = largest[:, 0] << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    packed = index << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
     return packed.numpy().astype("<u4")
+
+
+def _unpack_quats(packed: np.ndarray) -> Float[Tensor, "n 4"]:
+    bits = torch.from_numpy(packed.view("<u4").astype(np.int64))
+    steps = torch.stack([bits >> 20, bits >> 10, bits], dim=1)
+    components = (steps & 511) / _COMPONENT_STEPS * torch.where((steps & 512) > 0, -1.0, 1.0)
+    return join_largest(bits >> 30, components).roll(1, dims=1)
+
+
+def _unpack_first_three(packed: np.ndarray) -> Float[Tensor, "n 4"]:
+    """Return the quaternions of version 2: a byte for each of x, y and z."""
+    xyz = _floats(packed, len(packed) // 3, 3) / 127.5 - 1
+    w = (1 - xyz.square().sum(dim=1, keepdim=True)).clamp(min=0).sqrt()
+    return torch.cat([w, xyz], dim=1)
 
 
 def _pack_harmonics(rest: Float[Tensor, "n k 3"]) -> np.ndarray:
     steps = torch.full((rest.shape[1], 1), float(_SH_STEPS[1]), dtype=rest.dtype)
     steps[:3] = _SH_STEPS[0]
-    return _to_bytes(((rest * 128 + 128) / steps + 0.5).floor() * steps)
+    return to_bytes(((rest * 128 + 128) / steps + 0.5).floor() * steps)

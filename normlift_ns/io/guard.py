@@ -80,6 +80,7 @@ _OWNERS = (
 """Kind of folder, entries that identify it, and a pattern of the entries that belong to it."""
 _KINDS = {
     ".ply": rb"ply\r?\n", ".png": rb"\x89PNG\r\n\x1a\n", ".npy": rb"\x93NUMPY", ".jpg": rb"\xff\xd8\xff",
+    ".glb": rb"glTF", ".spz": rb"\x1f\x8b|NGSP",
     ".pdf": rb"%PDF-", ".safetensors": rb'(?s).{8}\{"', ".svg": rb"<\?xml[^>]*>\s*(<!DOCTYPE svg|<svg)|<svg",
 }  # fmt: skip
 """First bytes of files by the suffix that names their kind."""

@@ -187,7 +187,7 @@ class NormLiftModel(SplatfactoModel):
         return self._scene(None)
 
     def splat_parameters(self) -> TrainedSplat:
-        """Return the trained Gaussians, for `write_splat_ply`."""
+        """Return the trained Gaussians, for `write_splat`."""
         return TrainedSplat(dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode)
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:

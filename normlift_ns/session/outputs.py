@@ -13,7 +13,7 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.exports import EXPORTERS, ExportJob, TrainedSplat, write_splat_ply
+from normlift_ns.exports import EXPORTERS, ExportJob, SplatLabels, TrainedSplat, write_splat
 from normlift_ns.io.atomic import safe_file_name
 from normlift_ns.query.question import Query, load_query, save_query
 from normlift_ns.rasterization.settings import RasterSettings
@@ -43,7 +43,7 @@ def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], nam
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{safe_file_name(name)}.ply"
-        rows = write_splat_ply(path, splat, state.space.field, state.answer, keep=mask)
+        rows = write_splat(path, splat, SplatLabels(state.space.field, state.answer), keep=mask).rows
         return path.name, path.read_bytes(), len(rows)
 
 

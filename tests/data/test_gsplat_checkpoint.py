@@ -1,12 +1,16 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from normlift_ns.data.checkpoint import read_gsplat_checkpoint
+from normlift_ns.data.open_splat import _held_out, _read
+from normlift_ns.data.transforms import CameraFile
 from normlift_ns.errors import InputError
-from tests.data.scene_files import random_splat, rows_of, write_gsplat
+from normlift_ns.options import SplatOptions
+from tests.data.scene_files import ply_columns, random_splat, rows_of, write_gsplat, write_ply
 
 
 def test_one_file_and_its_ranks_are_read_alike(tmp_path: Path) -> None:
@@ -80,3 +84,62 @@ def test_moved_poses_are_read_or_refused(tmp_path: Path) -> None:
         write_gsplat(path, random_splat(), pose_adjust=wrong)
         with pytest.raises(InputError, match=r"`pose_adjust` .*--pose_opt"):
             read_gsplat_checkpoint(path)
+
+
+CONFIG = """antialiased: true
+camera_model: pinhole
+ckpt: null
+data_dir: data/garden
+normalize_world_space: false
+result_dir: results/garden
+steps_scaler: 1.0
+strategy: !!python/object:gsplat.strategy.default.DefaultStrategy
+  absgrad: false
+  refine_scale2d_stop_iter: 0
+test_every: 4
+with_ut: false
+"""
+
+
+def test_settings_of_the_training_are_read(tmp_path: Path) -> None:
+    """As simple_trainer writes cfg.yml next to ckpts/ and ply/; options are stronger."""
+    splat = random_splat()
+    for folder in ("ckpts", "ply", "other"):
+        (tmp_path / folder).mkdir()
+    checkpoint = write_gsplat(tmp_path / "ckpts" / "ckpt_29999_rank0.pt", splat)
+    ply = write_ply(tmp_path / "ply" / "point_cloud_29999.ply", ply_columns(splat))
+    other = write_ply(tmp_path / "other" / "a.ply", ply_columns(splat))
+    assert _read(checkpoint).by_gsplat
+    config = tmp_path / "cfg.yml"
+    config.write_text(CONFIG)
+    for path in (checkpoint, ply):
+        found = _read(path)
+        assert (found.rasterize_mode, found.by_gsplat, found.test_every) == ("antialiased", False, 4)
+        assert any("cfg.yml" in text for text in found.remarks)
+    assert _read(other).test_every is None
+    config.write_text(CONFIG.replace("true", "false").replace("space: false", "space: true"))
+    assert (_read(ply).rasterize_mode, _read(ply).by_gsplat) == ("classic", True)
+    config.write_text("antialiased: true\ntest_every: x\n")  # of another program
+    assert _read(checkpoint).rasterize_mode is None
+    frames = [SimpleNamespace(name=f"{i}.png") for i in range(8)]
+    cameras = CameraFile(frames, frozenset(), tmp_path, tmp_path, tmp_path)
+    for options, expected in ((SplatOptions(), {"0.png", "4.png"}), (SplatOptions(test_every=5), {"0.png", "5.png"})):
+        assert _held_out(options, cameras, 4) == expected
+
+
+def test_other_primitives_and_damaged_settings_are_refused(tmp_path: Path) -> None:
+    path = write_gsplat(tmp_path / "ckpt_29999_rank0.pt", random_splat())
+    for old, new, message in (
+        ("with_ut: false", "with_ut: true", "3DGUT"),
+        ("camera_model: pinhole", "camera_model: fisheye", "camera_model fisheye"),
+        ("camera_model: pinhole", "camera_model: ortho", "camera_model ortho"),
+        ("ckpt: null", "model_type: 2dgs", "model_type 2dgs"),
+        ("antialiased: true", "antialiased: maybe", "antialiased 'maybe', expected true or false"),
+        ("test_every: 4", "test_every: 0", "test_every '0'"),
+        ("ckpt: null", "ckpt: [", "not valid YAML"),
+        ("ckpt: null", "ckpt: " + "x" * 300_000, "expected at most"),
+    ):
+        (tmp_path / "cfg.yml").write_text(CONFIG.replace(old, new))
+        with pytest.raises(InputError, match=message) as caught:
+            _read(path)
+        assert "cfg.yml" in str(caught.value)

@@ -42,7 +42,7 @@ def test_a_format_of_another_package_is_read_by_its_suffix(options: SplatOptions
     with pytest.raises(InputError, match="not a gsplat checkpoint"):
         open_splat(path, options)
     with plugged(tmp_path / "a", "zipping", points("zipping:read"), READER.format(result=SPLAT)):
-        assert SPLAT_READERS.names() == ["ply", "pt", "zipped"]
+        assert SPLAT_READERS.names() == ["glb", "gltf", "ply", "pt", "splat", "spz", "zipped"]
         scene = open_splat(path, options)
         assert (scene.step, scene.rasterize_mode) == (7, "antialiased")
         assert torch.equal(scene.splat.means, splat.means)

@@ -1,0 +1,222 @@
+"""Compressed PLY files of PlayCanvas: chunks of 256 Gaussians with their bounds, and 16 bytes per Gaussian.
+
+The format is that of https://github.com/playcanvas/splat-transform. Spherical harmonics have a byte per coefficient.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from normlift_ns.core.gaussians import SH_C0
+from normlift_ns.data.quantization import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
+from normlift_ns.errors import InputError
+
+PACKED = "packed_position"
+"""Vertex property that only compressed PLY files have."""
+_CHUNK_ROWS = 256
+_VERTEX = (PACKED, "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = {
+    group: tuple(f"{end}_{column}" for end in ("min", "max") for column in columns)
+    for group, columns in {
+        "means": ("x", "y", "z"),
+        "scales": ("scale_x", "scale_y", "scale_z"),
+        "colors": ("r", "g", "b"),
+    }.items()
+}
+_POSITION_BITS = (11, 10, 11)
+_MAX_LOG_SCALE = 20.0
+_MAX_HARMONICS = 15
+"""Number of coefficients of degrees 1 to 3."""
+_SH_RANGE = 8.0
+"""Spherical harmonics are clamped to half of it on both sides of 0."""
+
+
+class CompressedPly(NamedTuple):
+    """Bytes of a compressed PLY file."""
+
+    data: bytes
+    rows: Int64[np.ndarray, " n"]
+    """Rows of the Gaussians in the order of the file."""
+    rounding: str
+    """Rounding errors of the file, for a message."""
+
+
+def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor], str]:
+    """Return the parameters in a compressed PLY file by splatfacto's names, and its rounding errors for a message.
+
+    Raises:
+        ValueError: if elements or properties are missing, or their numbers or types do not match.
+    """
+    elements = {element.name: element.data for element in data.elements}
+    chunk, vertex, harmonics = elements.get("chunk"), elements["vertex"], elements.get("sh")
+    n = len(vertex)
+    _check_element(path, "chunk", chunk, (*_BOUNDS["means"], *_BOUNDS["scales"]), "f")
+    _check_element(path, "vertex", vertex, _VERTEX, "u")
+    assert chunk is not None
+    if n > len(chunk) * _CHUNK_ROWS or (harmonics is not None and len(harmonics) != n):
+        extra = "" if harmonics is None else f" and {len(harmonics):,} rows of spherical harmonics"
+        raise _unmatched(path, f"{n:,} Gaussians in {len(chunk):,} chunks{extra}")
+    words = {name: torch.from_numpy(vertex[name].astype(np.int64)) for name in _VERTEX}
+    rotation, color = words["packed_rotation"], _units(words["packed_color"], (8, 8, 8, 8))
+    means, scales = (_bounds(chunk, group, n) for group in ("means", "scales"))
+    parameters = {
+        "means": torch.lerp(*means, _units(words[PACKED], _POSITION_BITS)),
+        "scales": torch.lerp(*scales, _units(words["packed_scale"], _POSITION_BITS)),
+        "quats": join_largest(rotation >> 30, (_units(rotation, (10, 10, 10)) - 0.5) * 2**0.5),
+        "opacities": opacity_logits(color[:, 3:]),
+        "features_dc": (_colors(chunk, color[:, :3], path) - 0.5) / SH_C0,
+        "features_rest": _unpack_harmonics(path, harmonics, n),
+    }
+    return parameters, _rounding(path.name, means[1] - means[0], scales[1] - scales[0])
+
+
+def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
+    """Return Gaussians as a compressed PLY file, in an order that makes chunks small.
+
+    Opacities and colors have 8 bits, spherical harmonics 1/32 between -4 and 4, rotations 10 bits per component, and
+    positions and logarithms of scales 10 or 11 bits of their range in a chunk.
+
+    Args:
+        parameters: finite parameters by splatfacto's names; colors are spherical harmonics, of which those of degree 4
+            are left out.
+        name: name of the file, for the message.
+        comments: comments for its header.
+    """
+    rows = _chunk_order(parameters["means"].detach().cpu().numpy())
+    values = {key: value.detach().cpu().double()[rows] for key, value in parameters.items()}
+    colors = values["features_dc"] * SH_C0 + 0.5
+    scales = values["scales"].clamp(-_MAX_LOG_SCALE, _MAX_LOG_SCALE)
+    index, others = split_largest(normalize_quats(values["quats"]))
+    unit_rotation = others / 2**0.5 + 0.5
+    chunk, units, ranges = {}, {}, []
+    for group, column in (("means", values["means"]), ("scales", scales), ("colors", colors)):
+        low, high = _chunk_bounds(column)
+        chunk |= dict(zip(_BOUNDS[group], torch.cat([low, high], dim=1).T))
+        spread = [bound.repeat_interleave(_CHUNK_ROWS, 0)[: len(rows)].double() for bound in (low, high)]
+        ranges.append(high - low)
+        units[group] = ((column - spread[0]) / (spread[1] - spread[0])).nan_to_num().clamp(0, 1)
+    color = torch.cat([units["colors"], values["opacities"].sigmoid()], dim=1)
+    words = (
+        _words(units["means"], _POSITION_BITS),
+        index << 30 | _words(unit_rotation, (10, 10, 10)),
+        _words(units["scales"], _POSITION_BITS),
+        _words(color, (8, 8, 8, 8)),
+    )
+    elements = [
+        _element("chunk", {key: value.numpy() for key, value in chunk.items()}, "<f4"),
+        _element("vertex", {key: word.numpy() for key, word in zip(_VERTEX, words)}, "<u4"),
+    ]
+    rest = (
+        values["features_rest"][:, :_MAX_HARMONICS].transpose(1, 2).reshape(len(rows), -1)
+    )  # all of red, then green, then blue
+    if rest.shape[1] > 0:
+        packed = to_bytes(((rest / _SH_RANGE + 0.5) * 256).floor())
+        elements.append(_element("sh", {f"f_rest_{i}": packed[:, i] for i in range(rest.shape[1])}, "u1"))
+    buffer = io.BytesIO()
+    PlyData(elements, byte_order="<", comments=list(comments)).write(buffer)
+    return CompressedPly(buffer.getvalue(), rows, _rounding(name, *ranges[:2]))
+
+
+def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> str:
+    """Describe rounding errors by the ranges of positions and logarithms of scales."""
+    steps = 2 * (2 ** min(_POSITION_BITS) - 1)
+    errors = means.amax(dim=1).sort().values / steps
+    most = float(errors[(len(errors) * 99 - 1) // 100])
+    return (
+        f"{name} holds rounded numbers: 99 % of the positions within {most:.2g} and all "
+        f"within {float(errors[-1]):.2g}, logarithms of scales within {float(scales.max()) / steps:.2g}, "
+        "rotations within 0.005 radians, opacities within 0.002."
+    )
+
+
+def _check_element(path: Path, element: str, table: np.ndarray | None, names: tuple[str, ...], kind: str) -> None:
+    """Raise unless a table has these properties, as numbers of one kind."""
+    types = {} if table is None else {name: table.dtype[name] for name in table.dtype.names or ()}
+    wrong = [name for name in names if name not in types or types[name].kind != kind]
+    if len(wrong) > 0:
+        raise InputError(
+            f"{path} is a compressed PLY file whose element {element!r} has no valid {', '.join(wrong)}. Write it "
+            "again, or give the PLY file that it was made of."
+        )
+
+
+def _unmatched(path: Path, problem: str) -> InputError:
+    return InputError(
+        f"{path} is a compressed PLY file with {problem}: these numbers do not match. Write it again, or give the PLY "
+        "file that it was made of."
+    )
+
+
+def _bounds(chunk: np.ndarray, group: str, n: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return the lower and upper bounds of every Gaussian."""
+    table = torch.from_numpy(np.stack([chunk[name].astype(np.float32) for name in _BOUNDS[group]], axis=1))
+    rows = table.repeat_interleave(_CHUNK_ROWS, 0)[:n]
+    return rows[:, :3], rows[:, 3:]
+
+
+def _colors(chunk: np.ndarray, units: Float[Tensor, "n 3"], path: Path) -> Float[Tensor, "n 3"]:
+    if _BOUNDS["colors"][0] not in (chunk.dtype.names or ()):  # the first version of the format had no bounds
+        return units
+    _check_element(path, "chunk", chunk, _BOUNDS["colors"], "f")
+    return torch.lerp(*_bounds(chunk, "colors", len(units)), units)
+
+
+def _unpack_harmonics(path: Path, table: np.ndarray | None, n: int) -> Float[Tensor, "n k 3"]:
+    names = () if table is None else tuple(f"f_rest_{i}" for i in range(len(table.dtype.names or ())))
+    if table is None or len(names) == 0:
+        return torch.zeros(n, 0, 3)
+    _check_element(path, "sh", table, names, "u")
+    if len(names) not in (9, 24, 45, 72):
+        raise _unmatched(path, f"{len(names)} spherical harmonics, expected 9, 24, 45 or 72")
+    packed = torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
+    units = torch.where(packed == 0, 0.0, torch.where(packed == 255, 1.0, (packed + 0.5) / 256))
+    return ((units - 0.5) * _SH_RANGE).reshape(n, 3, -1).transpose(1, 2).contiguous()
+
+
+def _units(words: Int64[Tensor, " n"], bits: tuple[int, ...]) -> Float[Tensor, "n k"]:
+    """Return the unsigned numbers in the last bits of words, each divided by its largest value."""
+    shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
+    return torch.stack([(words >> s & (2**b - 1)).float() / (2**b - 1) for s, b in zip(shifts, bits)], dim=1)
+
+
+def _words(units: Float[Tensor, "n k"], bits: tuple[int, ...]) -> Int64[Tensor, " n"]:
+    words = torch.zeros(len(units), dtype=torch.int64)
+    for i, count in enumerate(bits):
+        words = words << count | (units[:, i] * (2**count - 1)).round().clamp(0, 2**count - 1).long()
+    return words
+
+
+def _chunk_bounds(values: Float[Tensor, "n c"]) -> tuple[Float[Tensor, "k c"], Float[Tensor, "k c"]]:
+    """Return the smallest and the largest values of every chunk as float32."""
+    chunks = values.split(_CHUNK_ROWS)
+    return torch.stack([x.amin(dim=0) for x in chunks]).float(), torch.stack([x.amax(dim=0) for x in chunks]).float()
+
+
+def _element(name: str, columns: Mapping[str, np.ndarray], kind: str) -> PlyElement:
+    table = np.rec.fromarrays([column.astype(kind) for column in columns.values()], dtype=[(c, kind) for c in columns])
+    return PlyElement.describe(table, name)
+
+
+def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """Return an order of the rows in which chunks are small boxes: those of a k-d tree."""
+    weights = 1 / (2.0 ** np.array(_POSITION_BITS) - 1)
+    chunks, boxes = [], [np.arange(len(means))]
+    while len(boxes) > 0:
+        rows = boxes.pop()
+        if len(rows) <= _CHUNK_ROWS:
+            chunks.append(rows)
+            continue
+        axis = int((np.ptp(means[rows], axis=0) * weights).argmax())
+        middle = -(-len(rows) // _CHUNK_ROWS) // 2 * _CHUNK_ROWS  # all chunks but the last one are full
+        rows = rows[np.argpartition(means[rows, axis], middle)]
+        boxes += [rows[middle:], rows[:middle]]
+    return np.concatenate(chunks)

@@ -1,0 +1,340 @@
+"""glTF files with the extension KHR_gaussian_splatting, binary (GLB) or with separate buffers.
+
+https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.gaussians import SH_C0
+from normlift_ns.data.quantization import normalize_quats, opacity_logits, to_bytes
+from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.spz import decode_spz
+from normlift_ns.errors import InputError
+from normlift_ns.io.guard import MAX_TEXT_BYTES, open_regular, read_file
+from normlift_ns.options import RasterizeMode
+
+GLB_MAGIC = b"glTF"
+_EXTENSION = "KHR_gaussian_splatting"
+_SPZ_EXTENSIONS = (f"{_EXTENSION}_compression_spz_2", f"{_EXTENSION}_compression_spz")
+_KNOWN = {_EXTENSION, *_SPZ_EXTENSIONS, "KHR_mesh_quantization"}
+"""Extensions that a file may require."""
+_SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_MIN_SCALE = 1e-30
+_MAX_DEGREE = 3
+
+
+class _Accessor(msgspec.Struct, rename="camel"):
+    component_type: int
+    count: int
+    type: str
+    buffer_view: int | None = None
+    byte_offset: int = 0
+    normalized: bool = False
+    sparse: dict[str, Any] | None = None
+
+
+class _BufferView(msgspec.Struct, rename="camel"):
+    buffer: int
+    byte_length: int
+    byte_offset: int = 0
+    byte_stride: int | None = None
+
+
+class _Buffer(msgspec.Struct, rename="camel"):
+    byte_length: int
+    uri: str | None = None
+
+
+class _Primitive(msgspec.Struct, rename="camel"):
+    attributes: dict[str, int]
+    extensions: dict[str, dict[str, Any]] = {}
+
+
+class _Mesh(msgspec.Struct, rename="camel"):
+    primitives: list[_Primitive]
+    extras: Any = None
+
+
+class _Node(msgspec.Struct, rename="camel"):
+    matrix: list[float] | None = None
+    rotation: list[float] | None = None
+    scale: list[float] | None = None
+    translation: list[float] | None = None
+
+
+class _Document(msgspec.Struct, rename="camel"):
+    asset: dict[str, Any]
+    accessors: list[_Accessor] = []
+    buffer_views: list[_BufferView] = []
+    buffers: list[_Buffer] = []
+    meshes: list[_Mesh] = []
+    nodes: list[_Node] = []
+    extensions_required: list[str] = []
+
+
+class _Gltf(NamedTuple):
+    """A glTF file with the content of its buffers."""
+
+    path: Path
+    document: _Document
+    buffers: list[bytes]
+
+
+def read_gltf(path: Path) -> SplatFile:
+    """Read the splat of a glTF file, in its own coordinates: transforms of nodes are not applied.
+
+    Compression as SPZ (KHR_gaussian_splatting_compression_spz_2) is read too.
+
+    Raises:
+        FileNotFoundError: if there is no such file, or no file of a buffer.
+        ValueError: if the file is not a glTF file with exactly one splat, is truncated or damaged, or needs an
+            extension or setting that is not supported, or if its Gaussians cannot be drawn.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")
+    gltf = _open_gltf(path)
+    mesh, primitive = _find_splat(gltf)
+    extension = primitive.extensions[_EXTENSION]
+    for name, expected in _SETTINGS.items():
+        found = extension.get(name, expected)
+        if found != expected:
+            raise InputError(
+                f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export it with that "
+                "setting, or as a PLY file."
+            )
+    moved = any(value is not None for node in gltf.document.nodes for value in msgspec.structs.astuple(node))
+    remarks = (f"The nodes of {path.name} have transforms, which are not applied to the splat.",) if moved else ()
+    compressed = next((extension["extensions"][n] for n in _SPZ_EXTENSIONS if n in _nested(extension)), None)
+    if compressed is not None:
+        view = compressed.get("bufferView") if isinstance(compressed, dict) else None
+        file = decode_spz(bytes(_view_bytes(gltf, view)[1]), path)
+        return file._replace(remarks=(*file.remarks, *remarks))
+    splat = _read_attributes(gltf, primitive)
+    validate_splat(splat, path)
+    mode = mesh.extras.get("rasterize_mode") if isinstance(mesh.extras, dict) else None  # as `encode_glb` is given it
+    return SplatFile(splat, mode if mode in get_args(RasterizeMode) else None, remarks=remarks)
+
+
+def _nested(extension: Mapping[str, Any]) -> Mapping[str, Any]:
+    nested = extension.get("extensions", {})
+    return nested if isinstance(nested, dict) else {}
+
+
+def _open_gltf(path: Path) -> _Gltf:
+    """Read the JSON of a file, and the binary chunk if it has one."""
+    with open_regular(path) as file:
+        is_glb = file.read(4) == GLB_MAGIC
+    text, binary = _glb_chunks(path) if is_glb else (read_file(path), b"")
+    try:
+        document = msgspec.json.decode(text, type=_Document)
+    except (msgspec.DecodeError, msgspec.ValidationError, ValueError, RecursionError) as error:
+        raise _damaged(path, f"its JSON is not that of glTF ({error})") from error
+    if not str(document.asset.get("version", "")).startswith("2."):
+        raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export it again.")
+    unknown = sorted(set(document.extensions_required) - _KNOWN)
+    if len(unknown) > 0:
+        raise InputError(
+            f"{path} requires {', '.join(unknown)[:200]}, which is not supported. Export it without that extension, or "
+            "as a PLY file."
+        )
+    return _Gltf(path, document, [_buffer_bytes(path, buffer, binary) for buffer in document.buffers])
+
+
+def _damaged(path: Path, problem: str) -> InputError:
+    return InputError(f"{path} is truncated or damaged: {problem}. Expected a glTF file; copy it again.")
+
+
+def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
+    """Return the JSON and the binary chunk."""
+    with open_regular(path) as file:
+        size = path.stat().st_size
+        header = file.read(_HEADER.size)
+        if len(header) < _HEADER.size or _HEADER.unpack(header)[1] != 2 or _HEADER.unpack(header)[2] > size:
+            raise _damaged(path, f"its header does not match its {size:,} bytes")
+        chunks = {}
+        while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+            length, kind = _CHUNK.unpack(head)
+            limit = MAX_TEXT_BYTES if kind == b"JSON" else size
+            if length > min(limit, size - file.tell()):
+                raise _damaged(path, f"a chunk declares {length:,} bytes")
+            if kind in (b"JSON", b"BIN\0") and kind not in chunks:
+                chunks[kind] = file.read(length)
+            else:
+                file.seek(length, 1)
+    return chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
+
+
+def _find_splat(gltf: _Gltf) -> tuple[_Mesh, _Primitive]:
+    primitives = [(mesh, primitive) for mesh in gltf.document.meshes for primitive in mesh.primitives]
+    splats = [(mesh, primitive) for mesh, primitive in primitives if _EXTENSION in primitive.extensions]
+    if len(splats) != 1:
+        raise InputError(
+            f"{gltf.path} has {len(splats)} splats ({_EXTENSION}) among its {len(primitives)} primitives, expected "
+            f"one. {'Export the splat, not a mesh.' if len(splats) == 0 else 'Export each splat to a file of its own.'}"
+        )
+    return splats[0]
+
+
+def _read_attributes(gltf: _Gltf, primitive: _Primitive) -> SplatParameters:
+    def read(name: str, size: int) -> Tensor:
+        index = primitive.attributes.get(name)
+        if index is None:
+            raise InputError(f"{gltf.path} has a splat without {name}. Export the scene again.")
+        return torch.from_numpy(_read_accessor(gltf, index, name, size))
+
+    opacity, scales = read(f"{_EXTENSION}:OPACITY", 1), read(f"{_EXTENSION}:SCALE", 3)
+    if bool((scales < 0).any()) or bool(((opacity < 0) | (opacity > 1)).any()):
+        raise InputError(
+            f"{gltf.path} has scales between {float(scales.min()):.3g} and {float(scales.max()):.3g}, and opacities "
+            f"between {float(opacity.min()):.3g} and {float(opacity.max()):.3g}. Expected linear scales >= 0, and "
+            f"opacities in 0..1, as the final version of {_EXTENSION} stores them. Export the scene again."
+        )
+    degree = max((d for d in range(1, _MAX_DEGREE + 1) if _harmonic(d, 0) in primitive.attributes), default=0)
+    rest = [read(_harmonic(d, i), 3) for d in range(1, degree + 1) for i in range(2 * d + 1)]
+    parameters = {
+        "means": read("POSITION", 3),
+        "quats": read(f"{_EXTENSION}:ROTATION", 4).roll(1, dims=1),
+        "scales": scales.clamp(min=_MIN_SCALE).log(),
+        "opacities": opacity_logits(opacity),
+        "features_dc": read(_harmonic(0, 0), 3),
+        "features_rest": torch.stack(rest, dim=1) if degree > 0 else torch.zeros(len(scales), 0, 3),
+    }
+    return splat_from_parameters(parameters, gltf.path)
+
+
+def _harmonic(degree: int, index: int) -> str:
+    return f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
+
+
+def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.ndarray, "n c"]:
+    """Return the numbers of an accessor as float32, normalized ones in 0..1 or -1..1."""
+    accessors = gltf.document.accessors
+    accessor = accessors[index] if 0 <= index < len(accessors) else None
+    kind = None if accessor is None else _TYPES.get(accessor.component_type)
+    if accessor is None or kind is None or accessor.sparse is not None or _SIZES.get(accessor.type) != size:
+        raise _damaged(gltf.path, f"{name} is not a dense accessor of {size} numbers")
+    view, data = _view_bytes(gltf, accessor.buffer_view)
+    dtype = np.dtype(kind)
+    stride = dtype.itemsize * size if view.byte_stride is None else view.byte_stride
+    end = accessor.byte_offset + (accessor.count - 1) * stride + dtype.itemsize * size
+    if accessor.count < 1 or accessor.byte_offset < 0 or stride < dtype.itemsize * size or end > len(data):
+        raise _damaged(gltf.path, f"{name} declares {accessor.count:,} rows in a view of {len(data):,} bytes")
+    shape, strides = (accessor.count, size), (stride, dtype.itemsize)
+    values = np.ndarray(shape, dtype, data, accessor.byte_offset, strides).astype(np.float32)
+    return np.maximum(values / np.iinfo(dtype).max, -1) if accessor.normalized and dtype.kind != "f" else values
+
+
+def _view_bytes(gltf: _Gltf, index: object) -> tuple[_BufferView, memoryview]:
+    """Return a buffer view and its bytes."""
+    views, buffers = gltf.document.buffer_views, gltf.buffers
+    view = views[index] if isinstance(index, int) and 0 <= index < len(views) else None
+    if view is None or not 0 <= view.buffer < len(buffers):
+        raise _damaged(gltf.path, f"it has no buffer view {str(index)[:20]}")
+    data = memoryview(buffers[view.buffer])
+    if view.byte_offset < 0 or view.byte_length < 0 or view.byte_offset + view.byte_length > len(data):
+        raise _damaged(gltf.path, f"a buffer view ends after byte {len(data):,} of its buffer")
+    return view, data[view.byte_offset : view.byte_offset + view.byte_length]
+
+
+def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
+    """Return the binary chunk, the bytes of a data URI, or those of a file in the same folder."""
+    if buffer.uri is None:
+        return binary
+    head, comma, text = buffer.uri.partition(",")
+    if head.startswith("data:") and comma:
+        try:
+            return base64.b64decode(text, validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise _damaged(path, f"a data URI is not base64 ({error})") from error
+    file = path.parent / buffer.uri
+    if "/" in buffer.uri or "\\" in buffer.uri or "\0" in buffer.uri or file.name != buffer.uri:
+        raise InputError(
+            f"{path} names the buffer {buffer.uri[:80]!r}, expected the name of a file in the same folder. Export "
+            "it as a GLB file."
+        )
+    if not file.is_file():
+        raise FileNotFoundError(f"There is no file {file}, a buffer of {path.name}. Copy it into that folder.")
+    return read_file(file, max_bytes=max(buffer.byte_length, 0) + 3)
+
+
+def encode_glb(
+    splat: SplatParameters, columns: Mapping[str, Float[np.ndarray, " n"]], extras: Mapping[str, Any]
+) -> bytes:
+    """Return Gaussians as a GLB file, with float32 numbers in their own coordinates.
+
+    Args:
+        splat: finite Gaussians whose colors are spherical harmonics; those of degree 4 are left out.
+        columns: further attributes, whose names begin with an underscore.
+        extras: `extras` of the mesh, with JSON types only; "rasterize_mode" is read again.
+    """
+    values = {name: value.detach().cpu().double() for name, value in splat.parameters.items()}
+    colors = (values["features_dc"] * SH_C0 + 0.5).clamp(0, 1)
+    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # as COLOR_0 has them
+    opacities = values["opacities"].sigmoid()
+    attributes = {
+        "POSITION": values["means"].float().numpy(),
+        "COLOR_0": to_bytes(torch.cat([linear, opacities], dim=1) * 255),
+        f"{_EXTENSION}:ROTATION": normalize_quats(values["quats"]).roll(-1, dims=1).float().numpy(),
+        f"{_EXTENSION}:SCALE": values["scales"].exp().float().numpy(),
+        f"{_EXTENSION}:OPACITY": opacities.float().numpy(),
+        _harmonic(0, 0): values["features_dc"].float().numpy(),
+    }
+    names = [_harmonic(d, i) for d in range(1, min(splat.degree, _MAX_DEGREE) + 1) for i in range(2 * d + 1)]
+    attributes |= {name: values["features_rest"][:, i].float().numpy() for i, name in enumerate(names)}
+    attributes |= {name: column.astype(np.float32)[:, None] for name, column in columns.items()}
+    arrays = [np.ascontiguousarray(value, value.dtype.newbyteorder("<")) for value in attributes.values()]
+    document = _document(attributes, extras)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(array.tobytes() for array in arrays)  # rows of 4 bytes or a multiple of it
+    total = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
+    parts = (_HEADER.pack(GLB_MAGIC, 2, total), _CHUNK.pack(len(text), b"JSON"), text)
+    return b"".join([*parts, _CHUNK.pack(len(binary), b"BIN\0"), binary])
+
+
+def _document(attributes: Mapping[str, np.ndarray], extras: Mapping[str, Any]) -> dict[str, Any]:
+    views, accessors, offset = [], [], 0
+    kinds = {size: kind for kind, size in _SIZES.items()}
+    for i, (name, value) in enumerate(attributes.items()):
+        is_byte = value.dtype == np.uint8
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": value.nbytes, "target": _ARRAY_BUFFER})
+        accessor = {"bufferView": i, "componentType": _BYTE if is_byte else _FLOAT, "count": len(value)}
+        accessor |= {"type": kinds[value.shape[1]]} | ({"normalized": True} if is_byte else {})
+        if name == "POSITION":
+            accessor |= {"min": value.min(axis=0).tolist(), "max": value.max(axis=0).tolist()}
+        accessors.append(accessor)
+        offset += value.nbytes
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "mode": _POINTS,
+        "extensions": {_EXTENSION: _SETTINGS},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "normlift_ns"},
+        "extensionsUsed": [_EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive], "extras": extras}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }

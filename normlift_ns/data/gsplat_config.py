@@ -1,0 +1,76 @@
+"""cfg.yml, in which gsplat's trainer stores its settings next to ckpts/ and ply/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from normlift_ns.data.nerfstudio.config import config_string, describe_yaml_error
+from normlift_ns.errors import InputError
+from normlift_ns.io.guard import read_text
+from normlift_ns.options import RasterizeMode
+
+_MAX_BYTES = 2**18
+_FOLDERS = ("ckpts", "ply")
+_ADVICE = "Copy it from the training run again, or move the splat to a folder of its own."
+
+
+class GsplatConfig(NamedTuple):
+    """Settings of a training that change what is drawn, or which images it used; None if not stored."""
+
+    path: Path
+    rasterize_mode: RasterizeMode | None
+    normalize_world_space: bool | None
+    test_every: int | None
+
+
+def find_gsplat_config(splat: Path) -> GsplatConfig | None:
+    """Read the cfg.yml of the training run that a checkpoint or PLY file lies in; None if there is none.
+
+    Raises:
+        ValueError: if the file is damaged, or the splat was not trained as 3D Gaussians with pinhole cameras.
+    """
+    path = splat.parent.parent / "cfg.yml" if splat.parent.name in _FOLDERS else splat.parent / "cfg.yml"
+    if not path.is_file():
+        return None
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}. {_ADVICE}")
+    try:
+        root = yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
+        raise InputError(f"{path} is not valid YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
+    if config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
+        return None  # of another program
+    texts = {name: config_string(root, name) for name in ("camera_model", "model_type", "test_every")}
+    flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", "with_ut")}
+    _check_primitive(path, texts["camera_model"], texts["model_type"], is_3dgut=flags["with_ut"] is True)
+    test_every = texts["test_every"]
+    if test_every is not None and not (test_every.isdecimal() and 0 < int(test_every) < 10**9):
+        raise InputError(f"{path} has test_every {test_every[:40]!r}, expected a whole number above 0. {_ADVICE}")
+    antialiased = flags["antialiased"]
+    mode = None if antialiased is None else "antialiased" if antialiased else "classic"
+    return GsplatConfig(path, mode, flags["normalize_world_space"], None if test_every is None else int(test_every))
+
+
+def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
+    text = config_string(root, name)
+    if text not in (None, "true", "false"):
+        raise InputError(f"{path} has {name} {text[:40]!r}, expected true or false. {_ADVICE}")
+    return None if text is None else text == "true"
+
+
+def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, *, is_3dgut: bool) -> None:
+    if is_3dgut:
+        problem = "with_ut true (3DGUT), whose Gaussians are drawn in another way"
+    elif model_type not in (None, "3dgs"):
+        problem = f"model_type {model_type[:40]}, whose Gaussians are drawn in another way"
+    elif camera_model not in (None, "pinhole"):
+        problem = f"camera_model {camera_model[:40]}"
+    else:
+        return
+    raise InputError(
+        f"{path} says that the splat was trained with {problem}. Expected 3D Gaussians and pinhole cameras. Train it "
+        "again with simple_trainer.py and undistorted images."
+    )

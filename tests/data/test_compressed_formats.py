@@ -1,0 +1,319 @@
+"""Splats in compressed formats and glTF: round trips within the precision of each, other writers, hostile files."""
+
+import base64
+import gzip
+import json
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from plyfile import PlyData, PlyElement
+
+from normlift_ns.data.antimatter import read_antimatter
+from normlift_ns.data.compressed_ply import encode_compressed_ply
+from normlift_ns.data.gltf import encode_glb, read_gltf
+from normlift_ns.data.open_splat import _format, _read
+from normlift_ns.data.quantization import normalize_quats
+from normlift_ns.data.splat import SplatParameters, read_ply
+from normlift_ns.data.spz import encode_spz, read_spz
+from normlift_ns.errors import InputError
+from tests.data.scene_files import ply_columns, random_splat, rows_of, write_ply
+from tests.hostile import damaged, fuzz, hostile_json, no_files
+
+N = 700
+
+
+def write_antimatter(path: Path, splat: SplatParameters) -> Path:
+    """As antimatter15's converter writes it, in the order of the rows."""
+    rows = np.empty(len(splat), [("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+    rows["means"], rows["scales"] = splat.means, splat.scales.exp()
+    colors = torch.cat([0.5 + 0.28209479177387814 * splat.features_dc, splat.opacities.sigmoid()], dim=1)
+    rows["colors"] = (colors * 255).clip(0, 255)
+    rows["quats"] = (normalize_quats(splat.quats) * 128 + 128).clip(0, 255)
+    path.write_bytes(rows.tobytes())
+    return path
+
+
+def write_any(path: Path, splat: SplatParameters, kind: str) -> tuple[Path, np.ndarray]:
+    """Write a splat, and return its file and the rows in the order of the file."""
+    path, rows = path / f"scene.{kind}", np.arange(len(splat))
+    if kind in ("spz", "spz4"):
+        path.write_bytes(encode_spz(splat, version=3 if kind == "spz" else 4))
+    elif kind == "splat":
+        write_antimatter(path, splat)
+    elif kind == "glb":
+        path.write_bytes(encode_glb(splat, {}, {}))
+    else:
+        encoded = encode_compressed_ply(splat.parameters, "scene.ply")
+        path.write_bytes(encoded.data)
+        rows = encoded.rows
+    return path, rows
+
+
+def angles(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Angles between rotations in radians."""
+    cosine = (normalize_quats(first.double()) * normalize_quats(second.double())).sum(dim=1).abs()
+    return 2 * cosine.clamp(max=1).acos()
+
+
+PRECISION = {
+    "spz": {"means": 1.2e-6, "scales": 0.0313, "opacities": 0.002, "quats": 0.004, "colors": 0.0131, "rest": 0.0626},
+    "splat": {"means": 0, "scales": 1e-5, "opacities": 0.004, "quats": 0.03, "colors": 0.014, "rest": None},
+    "glb": {"means": 0, "scales": 1e-5, "opacities": 1e-6, "quats": 1e-6, "colors": 0, "rest": 0},
+    "ply": {"means": 0.005, "scales": 0.005, "opacities": 0.002, "quats": 0.004, "colors": 0.014, "rest": 0.0314},
+}
+"""Largest errors by format, for a scene of a few units."""
+
+
+@pytest.mark.parametrize("kind", ["spz", "spz4", "splat", "glb", "ply"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, kind: str, degree: int) -> None:
+    made = random_splat(N, degree)
+    splat = replace(made, features_rest=made.features_rest.clamp(-1, 1), features_dc=made.features_dc.clamp(-1.7, 1.7))
+    path, rows = write_any(tmp_path, splat, kind)
+    found = _read(path)
+    expected, limits = rows_of(splat, rows), PRECISION[kind[:3] if kind != "splat" else kind]  # type: ignore[arg-type]
+    assert sorted(rows) == list(range(N))
+    ours, theirs = found.splat, expected
+    errors = {
+        "means": (ours.means - theirs.means).abs().max(),
+        "scales": (ours.scales - theirs.scales).abs().max(),
+        "opacities": (ours.opacities.sigmoid() - theirs.opacities.sigmoid()).abs().max(),
+        "quats": angles(ours.quats, theirs.quats).max(),
+        "colors": (ours.features_dc - theirs.features_dc).abs().max(),
+    }
+    if limits["rest"] is None:
+        assert ours.degree == 0
+    elif degree > 0:
+        assert ours.degree == (degree if "spz" in kind else min(degree, 3))
+        kept = theirs.features_rest[:, : ours.features_rest.shape[1]]
+        errors["rest"] = (ours.features_rest - kept).abs().max()
+    for name, error in errors.items():
+        assert float(error) <= limits[name], (name, float(error))
+    said = [re.search(r"positions within ([\d.e-]+)", text) for text in found.remarks]
+    if kind in ("spz", "spz4"):  # the message has the true size
+        assert float(errors["means"]) <= float(said[0][1]) * 1.05 < 10 * float(errors["means"]) + 1e-6
+
+
+def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
+    """Version 2 of SPZ, glTF with buffers outside and quantized attributes, SPZ in glTF, PLY of the first version."""
+    splat = random_splat(50, 1)
+    header, *fields = _fields(encode_spz(splat), splat)
+    flags = bytearray(header)
+    flags[4], flags[14] = 2, 1
+    unit = normalize_quats(splat.quats)
+    xyz = unit[:, 1:] * torch.where(unit[:, :1] < 0, -1, 1)
+    fields[4] = (xyz * 127.5 + 127.5).round().clamp(0, 255).byte().numpy().tobytes()
+    path = tmp_path / "scene.spz"
+    path.write_bytes(gzip.compress(bytes(flags) + b"".join(fields)))
+    old = read_spz(path)
+    assert old.rasterize_mode == "antialiased"
+    assert float(angles(old.splat.quats, splat.quats).median()) < 0.02
+
+    document, binary = _glb(encode_glb(splat, {}, {}))
+    document["buffers"][0]["uri"] = "scene.bin"
+    (tmp_path / "scene.bin").write_bytes(binary)
+    path = tmp_path / "scene.gltf"
+    path.write_text(json.dumps(document))
+    plain = _read(path).splat
+    assert torch.equal(plain.means, splat.means)
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    attributes, quats = _primitive(document)["attributes"], unit.roll(-1, dims=1)
+    packed = (quats * 32767).round().short().numpy().tobytes()
+    opacity = (splat.opacities.sigmoid() * 255).round().byte().numpy()
+    strided = np.zeros((50, 4), np.uint8)  # rows of four bytes, of which one is used
+    strided[:, :1] = opacity
+    for name, data, kind, number in (
+        ("ROTATION", packed, "VEC4", 5122),
+        ("OPACITY", strided.tobytes(), "SCALAR", 5121),
+    ):
+        document["buffers"].append({"byteLength": len(data), "uri": "data:;base64," + base64.b64encode(data).decode()})
+        view = {"buffer": len(document["buffers"]) - 1, "byteLength": len(data)}
+        document["bufferViews"].append({**view, "byteStride": 4} if name == "OPACITY" else view)
+        accessor = {"bufferView": len(document["bufferViews"]) - 1, "componentType": number, "count": 50, "type": kind}
+        document["accessors"].append({**accessor, "normalized": True})
+        attributes[f"KHR_gaussian_splatting:{name}"] = len(document["accessors"]) - 1
+    document["nodes"][0]["scale"] = [2, 2, 2]
+    path.write_text(json.dumps(document))
+    found = _read(path)
+    assert float(angles(found.splat.quats, splat.quats).max()) < 2e-3
+    assert float((found.splat.opacities.sigmoid() - splat.opacities.sigmoid()).abs().max()) < 0.002
+    assert any("transforms" in text for text in found.remarks)
+
+    data = encode_spz(splat)
+    _settings(document)["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    uri = "data:;base64," + base64.b64encode(data).decode()
+    document["buffers"], document["bufferViews"] = (
+        [{"byteLength": len(data), "uri": uri}],
+        [{"buffer": 0, "byteLength": len(data)}],
+    )
+    path.write_text(json.dumps(document))
+    assert float((read_gltf(path).splat.means - splat.means).abs().max()) < 1e-5
+
+    encoded = encode_compressed_ply(splat.parameters, "a.ply", ("SplatRenderMode: mip",))
+    path = tmp_path / "scene.ply"
+    path.write_bytes(encoded.data)
+    assert read_ply(path).rasterize_mode == "antialiased"
+    ply = PlyData.read(str(path))
+    names = [name for name in ply["chunk"].data.dtype.names if not name.endswith(("_r", "_g", "_b"))]
+    first = PlyData([_element("chunk", ply["chunk"].data[names]), ply["vertex"], ply["sh"]], byte_order="<")
+    first.write(str(tmp_path / "first.ply"))
+    assert float((read_ply(tmp_path / "first.ply").splat.means - splat.means[encoded.rows]).abs().max()) < 0.01
+
+
+def _element(name: str, table: np.ndarray) -> Any:
+    return PlyElement.describe(np.rec.fromarrays([table[n] for n in table.dtype.names], names=table.dtype.names), name)
+
+
+def _fields(data: bytes, splat: SplatParameters) -> list[bytes]:
+    """The header and the six attributes of an SPZ file of version 3."""
+    content, n, k = gzip.decompress(data), len(splat), splat.features_rest.shape[1]
+    ends = np.cumsum([16, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * k * n]).tolist()
+    assert ends[-1] == len(content)
+    return [content[start:end] for start, end in zip([0, *ends], ends)]
+
+
+def _glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the binary chunk of a GLB file."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def _with_glb(change: Callable[[dict[str, Any]], object]) -> bytes:
+    document, binary = _glb(encode_glb(random_splat(20, 1), {}, {}))
+    change(document)
+    text = json.dumps(document).encode()
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    parts = (struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary)
+    return head + b"".join(parts)
+
+
+def _primitive(document: dict[str, Any]) -> dict[str, Any]:
+    return document["meshes"][0]["primitives"][0]
+
+
+def _settings(document: dict[str, Any]) -> dict[str, Any]:
+    return _primitive(document)["extensions"]["KHR_gaussian_splatting"]
+
+
+def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
+    splat = random_splat(20, 1)
+    spz, spz4 = encode_spz(splat), encode_spz(splat, version=4)
+    content = gzip.decompress(spz)
+
+    def changed(data: bytes, at: int, value: bytes) -> bytes:
+        return data[:at] + value + data[at + len(value) :]
+
+    zipped = tmp_path / "made.zip"
+    for name, data, message in (
+        ("a.spz", gzip.compress(b"plain text of another kind"), "not an SPZ file.* gunzip"),
+        ("a.spz", gzip.compress(changed(content, 4, b"\1")), "version 1, expected 2, 3 or 4"),
+        ("a.spz", gzip.compress(changed(content, 8, b"\0\0\0\0")), "no Gaussians"),
+        ("a.spz", gzip.compress(changed(content, 12, b"\7")), "degree 7"),
+        ("a.spz", gzip.compress(changed(content, 8, b"\xff\xff\xff\x7f")), "declares 2,147,483,647 Gaussians"),
+        ("a.spz", spz[:-30], "truncated or damaged"),
+        ("a.spz", changed(spz4, 15, b"\3"), "table of 3 streams"),
+        ("a.spz", changed(spz4, 40, b"\xff\xff"), "stream 0 declares"),
+        ("a.spz", spz4[:-9], "truncated or damaged"),
+        ("a.glb", _with_glb(lambda d: _primitive(d)["extensions"].clear()), "0 splats .* among its 1 prim.*not a mesh"),
+        ("a.glb", _with_glb(lambda d: d["meshes"].append(d["meshes"][0])), "2 splats"),
+        ("a.glb", _with_glb(lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"])), "EXT_meshopt"),
+        ("a.glb", _with_glb(lambda d: _settings(d).update(kernel="disc")), "disc"),
+        ("a.glb", _with_glb(lambda d: _primitive(d)["attributes"].pop("POSITION")), "without POSITION"),
+        ("a.glb", _with_glb(lambda d: d["accessors"][0].update(count=10**12)), "declares 1,000,000,000,000 rows"),
+        ("a.glb", _with_glb(lambda d: d["bufferViews"][0].update(byteOffset=-4)), "buffer view"),
+        ("a.glb", _with_glb(lambda d: d["buffers"][0].update(uri="../a.bin")), "in the same folder"),
+        ("a.glb", _with_glb(lambda d: d["accessors"][3].update(bufferView=0, byteOffset=4)), "damaged|linear scales"),
+        ("a.glb", b"glTF" + bytes(8), "header does not match"),
+        ("a.splat", bytes(33), "33 bytes, expected a multiple of 32"),
+        ("a.splat", np.full(16, -1, "<f4").tobytes(), "negative scales"),
+        ("a.ksplat", bytes(4096), "KSPLAT file.*npx @playcanvas/splat-transform a.ksplat a.ply"),
+        ("a.lcc", b"{}", "LCC file.*npx @playcanvas/splat-transform a.lcc a.ply"),
+        ("meta.json", b"{}", "SOG file.*npx @playcanvas/splat-transform meta.json meta.ply"),
+        ("a.usdc", b"PXR-USDC", "USDC file.*Export a PLY file"),
+    ):  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=message) as caught:
+            _read(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+    for names, message in (
+        (("meta.json", "means_l.webp"), "SOG file.*splat-transform made.zip made.ply"),
+        (("default.usda",), "USDZ file.*Export a PLY file"),
+        (("model/scene.ply",), "ZIP archive of model/scene.ply.* Extract"),
+        ((), "ZIP archive of nothing"),
+    ):
+        with zipfile.ZipFile(zipped, "w") as archive:
+            for name in names:
+                archive.writestr(name, b"x")
+        with pytest.raises(InputError, match=message):
+            _read(zipped)
+
+
+def test_small_files_that_would_grow_are_refused_or_cost_little(tmp_path: Path) -> None:
+    """A stream that goes on after the declared Gaussians is not read; declared sizes are not believed."""
+    splat = random_splat(20, 0)
+    content = gzip.decompress(encode_spz(splat))
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(content + bytes(10**7)))
+    assert len(read_spz(path).splat) == 20
+    bomb = zlib.compressobj(9, zlib.DEFLATED, 31)
+    head = content[:8] + struct.pack("<I", 2**31 - 1) + content[12:16]
+    path.write_bytes(bomb.compress(head + bytes(10**7)) + bomb.flush())
+    with pytest.raises(InputError, match="declares 2,147,483,647"):
+        read_spz(path)
+    spz4 = encode_spz(splat, version=4)
+    streams = [zstandard.compress(bytes(10**7))] * 5
+    sizes = [9 * 20, 20, 60, 60, 80]
+    table = b"".join(struct.pack("<QQ", len(stream), size) for stream, size in zip(streams, sizes))
+    path.write_bytes(spz4[:32] + table + b"".join(streams))
+    assert len(read_spz(path).splat) == 20
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["spz", "spz4", "splat", "glb", "ply"])
+def test_damage_is_a_message(tmp_path: Path, kind: str) -> None:
+    path, _ = write_any(tmp_path, random_splat(20, 1), kind)
+    whole = path.read_bytes()
+    contents = damaged(whole)
+    if kind == "spz":  # damage under a valid checksum
+        contents |= damaged(gzip.decompress(whole)).map(gzip.compress)
+    if kind == "glb":
+        document, binary = _glb(whole)
+        contents |= hostile_json(document).map(
+            lambda text: struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+            + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        )  # fmt: skip
+
+    def load() -> None:
+        try:
+            assert len(_read(path).splat) > 0
+        except (InputError, FileNotFoundError) as error:
+            assert str(tmp_path) in str(error), error
+            raise
+
+    load()
+    fuzz(20, contents, path, load)
+    for _ in no_files(path):
+        with pytest.raises((FileNotFoundError, InputError)):
+            _read(path)
+
+
+def test_the_first_bytes_tell_the_format(tmp_path: Path) -> None:
+    splat = random_splat(20, 0)
+    for kind in ("spz", "spz4", "glb", "ply"):
+        path, _ = write_any(tmp_path, splat, kind)
+        other = path.rename(tmp_path / "renamed.splat")
+        assert _format(other) == kind[:3]
+    write_ply(tmp_path / "renamed.splat", ply_columns(splat))
+    assert _format(tmp_path / "renamed.splat") == "ply"
+    assert read_antimatter(write_antimatter(tmp_path / "b.SPLAT", splat)).splat.degree == 0
+    assert _format(tmp_path / "b.SPLAT") == "splat"
