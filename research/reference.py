@@ -22,6 +22,7 @@ from normlift_ns.cli.evaluate import NormLiftEval
 from normlift_ns.cli.export import NormLiftExport
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.query import NormLiftQuery
+from normlift_ns.cli.serve import NormLiftServe
 from normlift_ns.cli.view import NormLiftView
 from normlift_ns.cli.weights import NormLiftWeights
 from normlift_ns.options import OPTION_RANGES, VOTE_FLAGS, RefineConfig
@@ -33,6 +34,7 @@ COMMANDS: dict[str, type] = {
     "ns-normlift-weights": NormLiftWeights,
     "ns-normlift-query": NormLiftQuery,
     "ns-normlift-view": NormLiftView,
+    "ns-normlift-serve": NormLiftServe,
     "ns-normlift-export": NormLiftExport,
     "ns-normlift-batch": NormLiftBatch,
     "ns-normlift-eval": NormLiftEval,

@@ -137,7 +137,7 @@ def check(stage, names):
 import normlift_ns
 normlift_ns.__version__
 check("version", HEAVY)
-from normlift_ns.cli import batch, check as _, demo, evaluate, export, lift, query, view
+from normlift_ns.cli import batch, check as _, demo, evaluate, export, lift, query, serve, view
 check("scripts", HEAVY)
 from normlift_ns.encoders.open_clip import has_local_clip_weights
 has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")

@@ -203,7 +203,7 @@ class PanelWidgets(ActionWidgets):
                 self._button(Action.SAVE, hint="Add them to the stored prompts; ns-render draws them.")
                 self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
-            with gui.add_folder("How it is asked and drawn", expand_by_default=False):
+            with gui.add_folder("Advanced", expand_by_default=False):
                 choice = gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt to show.")
                 self.shown = self._input(Action.SHOW_PROMPT, choice)
                 colors = gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")

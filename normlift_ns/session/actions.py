@@ -65,7 +65,7 @@ def _warning(finding: Finding, histogram: Histogram) -> str:
         return ""
     return (
         f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
-        f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
+        f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Use suggested."
     )
 
 

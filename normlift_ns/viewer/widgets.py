@@ -36,22 +36,22 @@ class Action(Enum):
     REDO = "Redo"
     CLEAR = "Clear"
     THRESHOLD = "Threshold"
-    SUGGESTED = "Suggested"
+    SUGGESTED = "Use suggested"
     RELIABILITY = "Minimum reliability"
     REFINED = "refined"
     SHOW_PROMPT = "shown"
     HIDE = "Hide"
-    SHOW_ONLY = "Only"
-    SHOW_ALL = "All"
+    SHOW_ONLY = "Isolate"
+    SHOW_ALL = "Show all"
     GROW = "Grow"
     REMOVE_WEAK = "Leave out Gaussians with weak evidence"
     SELECT_FLOATERS = "Select likely floaters"
     LIKE = "More like this"
     SELECT = "Select"
     ADD = "Add"
-    REMOVE = "Drop"
+    REMOVE = "Remove"
     EXPLAIN = "Why?"
-    GO_TO = "go to"
+    GO_TO = "Go to"
     DOWNLOAD = "Download selection"
     SAVE = "Save prompts in run"
     REPLACE = "Replace the saved prompts"
@@ -177,10 +177,10 @@ def color_swatch(color: Sequence[float]) -> str:
 
 MAX_OBJECT_ROWS = 8
 _OBJECT_BUTTONS = {
-    "go to": Action.GO_TO,
-    "only": Action.SHOW_ONLY,
-    "hide": Action.HIDE,
-    "export": Action.DOWNLOAD,
+    "Go to": Action.GO_TO,
+    "Isolate": Action.SHOW_ONLY,
+    "Hide": Action.HIDE,
+    "Export": Action.DOWNLOAD,
 }
 
 
@@ -195,7 +195,7 @@ class ObjectRows:
     def __init__(self, gui: Any, act: Act) -> None:
         self._objects: tuple[ObjectRow, ...] = ()
         with gui.add_folder("Found objects"):
-            self._summary = gui.add_markdown("Nothing is selected.")
+            self._summary = gui.add_markdown("No visible objects selected")
             # created once: viser never frees what is added to or removed from a panel that all pages share
             self._rows = [self._row(gui, i, act) for i in range(MAX_OBJECT_ROWS)]
 
@@ -204,7 +204,7 @@ class ObjectRows:
         self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
         unlisted = [f"{object_list.left_out:,} smaller objects are not listed"] * (object_list.left_out > 0)
         unlisted += [f"Gaussians in smaller components: {small:,}"] * (small > 0)
-        empty = "" if len(self._objects) > 0 else "Nothing that is drawn is selected."
+        empty = "" if len(self._objects) > 0 else "No visible objects selected"
         self._summary.content = escape_mdx("; ".join(unlisted) or empty)
         for i, (text, buttons) in enumerate(self._rows):
             if i < len(self._objects):
@@ -330,7 +330,7 @@ def _image(media_type: str, content: bytes) -> str:
 
 MAX_EXPLAIN_IMAGES = 3
 """Number of images shown with the largest weight, and of those shown with the largest disagreement."""
-_BUSY = "Looking for the training images that voted."
+_BUSY = "Finding supporting images …"
 _explain_lock = Lock()
 """Held while votes are read and cached, so that two threads do not do both twice."""
 
@@ -353,7 +353,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
     except (InputError, OSError) as error:
         problem = f"The images cannot be shown: {error}"
     lines = [escape_mdx(why.sentence), *filter(None, [escape_mdx(clip_text(problem, 400))])]
-    for title, view_votes in (("Images that weigh most:", heaviest), ("Images that disagree most:", different)):
+    for title, view_votes in (("Strongest support:", heaviest), ("Most disagreement:", different)):
         if len(view_votes) > 0:
             lines += [f"**{title}**", *_list_votes(view_votes, votes.names, images)]
     return "\n\n".join(lines)

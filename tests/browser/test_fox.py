@@ -38,7 +38,7 @@ def test_a_person_finds_the_fox(tmp_path: Path, browser: Browser) -> None:
         tab.asks("orange, crimson", answered=2)
         tab.until(lambda: tab.output() == "overlay", "the first answer is shown")
         tab.type("Threshold", "0.35")
-        tab.hit(tab.page.get_by_text("How it is asked and drawn", exact=True))
+        tab.hit(tab.page.get_by_text("Advanced", exact=True))
         tab.choose("Prompt shown", "1: orange")
 
         def has_found(seen: np.ndarray) -> bool:

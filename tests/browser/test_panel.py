@@ -60,21 +60,21 @@ def test_a_person_asks_and_sees_answers_objects_reasons_and_floaters(tab: Tab, t
 
     tab.until(lambda: tab.images("svg") == 1, "a histogram")
     tab.says("object 1")
-    tab.press("go to")
+    tab.press("Go to")
     near = tab.sees(lambda seen: changed(seen, overlay) > 3, "the camera has moved")
-    tab.press("hide")
+    tab.press("Hide")
     tab.says(HIDDEN)
     tab.sees(lambda seen: overlaid(seen).sum() < 0.8 * overlaid(near).sum(), "hidden")
     tab.press("Undo")
     tab.until(lambda: HIDDEN not in tab.text(), "undone")
-    assert tab.save("export", tmp_path).name == "red_1.ply"
+    assert tab.save("Export", tmp_path).name == "red_1.ply"
 
     tab.press("Why?")
     tab.until(lambda: tab.images("jpeg") >= 3, "photographs")
     tab.type("Threshold", "0.995")
     tab.selects(lambda count: count < some, "fewer")
     tab.until(lambda: tab.images("jpeg") == 0, "another selection has other reasons")
-    tab.press("Suggested")
+    tab.press("Use suggested")
     tab.until(lambda: 0.5 < float(tab.typed("Threshold")) < 0.95, "another threshold")
     for _ in range(2):
         tab.press("Undo")
@@ -124,7 +124,7 @@ def test_a_person_clicks_hides_downloads_grows_and_undoes(tab: Tab, tmp_path: Pa
     tab.sees(lambda seen: iou(hue_mask(seen, *YELLOW), things["yellow"]) > 0.9, "yellow is back")
 
     counts = [alike]
-    for button, thing in (("Select", "red"), ("Add", "yellow"), ("Drop", "red")):
+    for button, thing in (("Select", "red"), ("Add", "yellow"), ("Remove", "red")):
         tab.arm(button)
         tab.click(middle(things[thing]))
         counts.append(tab.selects(lambda count: count != counts[-1], button))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from normlift_ns.cli import evaluate, export, lift, query, view
+from normlift_ns.cli import evaluate, export, lift, query, serve, view
 from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.encoders import open_clip
 from tests.cli.conftest import run_entry, said
@@ -162,6 +162,10 @@ VIEW = [
     (f"--host {'a' * 70}", f"--host {'a' * 70}"),
     ("--text-embeddings none.npz", "none.npz, given with --text-embeddings"),
 ]
+SERVE = [
+    ("", "No run is given", "ns-normlift-serve RUN/config.yml"),
+    ("nowhere/config.yml", "nowhere/config.yml"),
+]
 
 
 @pytest.mark.parametrize(
@@ -173,6 +177,8 @@ VIEW = [
         pytest.param(export, ("--load-config", "CONFIG", "--output-dir", "out"), EXPORT, id="export"),
         pytest.param(evaluate, ("--load-config", "CONFIG"), EVAL, id="eval"),
         pytest.param(view, ("--load-config", "CONFIG"), VIEW, id="view"),
+        pytest.param(serve, (), SERVE, id="serve"),
+        pytest.param(serve, ("CONFIG",), VIEW[:-1], id="serve a run"),
     ],
 )
 def test_a_mistake_is_told_early_and_leaves_nothing(command, given, cases, config, tmp_path, monkeypatch, capsys):

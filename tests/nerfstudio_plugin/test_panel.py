@@ -243,14 +243,14 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     panel.act(Action("Hide"))
     assert torch.equal(model._display.drawn, ~whole) and outputs(pipeline)["accumulation"].sum() < before
     assert f"{int(whole.sum())} Gaussians are hidden" in said(panel)
-    panel.act(Action("All"))
+    panel.act(Action("Show all"))
     assert model._display.drawn is None
-    panel.act(Action("Only"))
+    panel.act(Action("Isolate"))
     ask(panel, "up")
     assert torch.equal(model._display.drawn, whole)  # what is hidden stays hidden
     panel.act(Action("Undo"))
     assert widgets.prompts.value == "left"
-    panel.act(Action("All"))
+    panel.act(Action("Show all"))
     widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
     panel.act(Action("Threshold"), 0.7)
     assert widgets.reliability.value == 0.25
@@ -275,7 +275,7 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
     assert not chosen(pipeline).any()
-    panel.act(Action("Suggested"))
+    panel.act(Action("Use suggested"))
     assert "threshold" in said(panel)
     panel.act(Action("Undo"))
     assert panel.answer.texts == ("left",)
@@ -353,19 +353,19 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert len(groups) == len(objects) > 0
     assert panel._widgets.histograms.content.count("data:image/svg+xml") == 2
     first, camera = objects[0], browser.camera
-    press_row(groups[0], "go to", browser)
+    press_row(groups[0], "Go to", browser)
     assert camera.look_at == pytest.approx(10 * np.array(first.center))
     assert np.linalg.norm(camera.position - camera.look_at) == pytest.approx(10 * first.extent / (1.6 * np.tan(0.5)))
-    press_row(groups[0], "export", browser)
+    press_row(groups[0], "Export", browser)
     assert 0 < PlyData.read(io.BytesIO(browser.files["left_1.ply"]))["vertex"].count <= first.size
-    press_row(groups[0], "only", browser)
+    press_row(groups[0], "Isolate", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
     assert listed(panel) == []
     assert "up: probably not here" in html.unescape(panel._widgets.histograms.content)
-    press_row(groups[0], "hide", browser)  # as its page still shows it
+    press_row(groups[0], "Hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
-    assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
+    assert "No visible objects selected" in html.unescape(panel._widgets.rows._summary.content)
     panel.act(Action("Clear"))
     listed(panel)
     assert panel._widgets.histograms.content == ""
@@ -511,7 +511,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
 def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipeline: Any) -> None:
     browser, event = Browser(), ray(pipeline)
     weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
-    for name, mode in (("Select", "select"), ("Drop", "remove"), ("Add", "add")):
+    for name, mode in (("Select", "select"), ("Remove", "remove"), ("Add", "add")):
         expected = actions.click(panel.state, weights, mode).selection  # type: ignore[arg-type]
         panel.act(Action(name), client=browser)
         browser._scene_pointer_cb(event)

@@ -46,7 +46,7 @@ def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     state = asked(coloured(), "red")
     (verdict,) = diagnose_prompts(actions.set_threshold(state, 1.0))  # that nothing reaches
     assert verdict.warning.startswith("red: ") and verdict.warning.count("1.00") == 2
-    assert "Suggested" in verdict.warning and verdict.nearest_position is not None
+    assert "Use suggested" in verdict.warning and verdict.nearest_position is not None
 
 
 def test_histograms_are_of_the_prompts_that_select():

@@ -47,13 +47,13 @@ def test_three_that_weigh_most_and_those_that_disagree():
     named = [line for line in lines.splitlines() if line.startswith("a&#47;")]
     assert len(named) == 2  # it weighs most, and disagrees a little
     assert not any(set("[]()/") & set(line) for line in named)
-    most, different = html.unescape(lines).split("disagree most:")
-    assert "weigh most:" in most and "C_inter" in most
+    most, different = html.unescape(lines).split("Most disagreement:")
+    assert "Strongest support:" in most and "C_inter" in most
     assert "a/[x](y).png: 33% of the weight (320 pixels, 1 region), cosine 1.00" in most
     assert [name in most for name in NAMES] == [True, True, True, False, False]
     assert "e.png: 7% of the weight" in different and "of the disagreement" in different
     alike = explanation_mdx(FakeVotes(), rows(1))
-    assert "disagree most" not in alike
+    assert "Most disagreement" not in alike
     assert [text.count("data:image/jpeg") for text in (lines, alike)] == [4, 3]  # e.png too, and each once
     for problem in (InputError("they were given from Python"), FileNotFoundError("b.png is missing")):
         text = html.unescape(explanation_mdx(FakeVotes(problem), rows(0)))
@@ -67,7 +67,7 @@ def test_reasons_belong_to_their_selection():
     assert (reasons.content, reasons.busy) == ("", "")
     state = actions.select(State(world()), rows(0))
     reasons.compute(reasons.start(state), state)
-    assert "weigh most" in reasons.content
+    assert "Strongest support" in reasons.content
     reasons.update(actions.hide(state))  # the selection is the same
     assert reasons.content != ""
     reasons.update(actions.select(state, rows(1)))
