@@ -11,7 +11,7 @@ from setuptools import setup
 
 sys.path.insert(0, str(Path(__file__).parent / "web"))
 
-from backend import BuildPage  # noqa: E402
+from backend import BuildPage
 
 FILES = "https://github.com/normlift-ns/normlift_ns/blob/main/"
 README = (Path(__file__).parent / "README.md").read_text("utf8")
