@@ -192,7 +192,7 @@ class Page {
       tool("Screenshot", "camera", "Save a picture of the scene.", "S", (anchor) => this.screenshot(anchor), {
         id: "do-screenshot",
       }),
-      tool("Link", "link", "Copy a link to this question and view.", "Ctrl+L", (anchor) => this.copyLink(anchor), {
+      tool("Link", "link", "Copy a link to this question and view.", null, (anchor) => this.copyLink(anchor), {
         id: "do-link",
       }),
       tool("Dark or light", "theme", "Switch between dark and light.", "D", () => this.switchTheme(), {

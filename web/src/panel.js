@@ -290,7 +290,6 @@ export class Panel {
   goToFirst(anchor) {
     const first = this.state?.objects?.[0];
     if (first) this.act("go_to", { id: first.id }, anchor);
-    else this.act("message", null, anchor);
   }
 
   /** @param {Element} anchor */
