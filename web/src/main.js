@@ -65,7 +65,11 @@ class Page {
       () => this.sendCamera(),
     );
     this.search = new Search(this.act, run);
-    this.panel = new Panel(this.act, run, { goToCamera: (i) => this.view.goToCamera(this.cameras[i]), cameras: [] });
+    this.panel = new Panel(this.act, run, {
+      goToCamera: (i) => this.view.goToCamera(this.cameras[i]),
+      sees: (point) => this.view.sees(point),
+      cameras: [],
+    });
     this.tools = new Tools(this.view, this.act);
     /** @type {any[]} */
     this.cameras = [];

@@ -52,7 +52,7 @@ export class Panel {
   /**
    * @param {Act} act
    * @param {any} run
-   * @param {{goToCamera: (index: number) => void, cameras: any[]}} scene
+   * @param {{goToCamera: (index: number) => void, sees: (point: number[]) => boolean, cameras: any[]}} scene
    */
   constructor(act, run, scene) {
     this.act = act;
@@ -87,7 +87,14 @@ export class Panel {
           "div",
           { id: "selection-actions" },
           button("Hide", null, "Hide the selected Gaussians.", "H", simple("hide"), { id: "do-hide" }),
-          button("Isolate", null, "Show only the selected Gaussians.", "I", simple("isolate"), { id: "do-isolate" }),
+          button(
+            "Isolate",
+            null,
+            "Show only the selected Gaussians.",
+            "I",
+            (anchor) => this.isolate(null, this.state.objects ?? [], anchor),
+            { id: "do-isolate" },
+          ),
           button("Show all", null, "Show everything that is hidden.", "A", simple("show_all"), { id: "do-show" }),
           button("Invert", null, "Select everything else.", "X", simple("invert"), { id: "do-invert" }),
           button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), {
@@ -292,6 +299,18 @@ export class Panel {
     if (first) this.act("go_to", { id: first.id }, anchor);
   }
 
+  /**
+   * Hides everything else, and goes to an object if none would be in view.
+   * @param {number[] | null} ids Of objects; null: the selection.
+   * @param {{id: number, center: number[]}[]} objects @param {Element} anchor
+   */
+  isolate(ids, objects, anchor) {
+    this.act("isolate", ids, anchor);
+    if (objects.length > 0 && !objects.some((one) => this.scene.sees(one.center))) {
+      this.act("go_to", { id: objects[0].id }, anchor);
+    }
+  }
+
   /** @param {Element} anchor */
   addLayer(anchor) {
     const names = new Set((this.state?.layers ?? []).map((/** @type {any} */ layer) => layer.name));
@@ -456,7 +475,10 @@ export class Panel {
           h("span.soft.small.num", {}, facts),
         ),
         small("Go to", "go", "go_to", { id: one.id }),
-        small("Isolate", "isolate", "isolate", [one.id]),
+        button(`Isolate ${one.name}`, "isolate", "Isolate", null, (anchor) => this.isolate([one.id], [one], anchor), {
+          bare: true,
+          "data-key": `Isolate-${one.name}`,
+        }),
         small("Hide", "hide", "hide", [one.id]),
         small("Download", "download", "export", { format: "ply", object: one.id }),
       );

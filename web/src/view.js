@@ -140,4 +140,10 @@ export class View3D extends EventTarget {
     const p = new THREE.Vector3().fromArray(point).project(this.camera);
     return { x: ((p.x + 1) / 2) * this.width, y: ((1 - p.y) / 2) * this.height, visible: p.z < 1 };
   }
+
+  /** @param {number[]} point @returns {boolean} True if a point lies within the picture. */
+  sees(point) {
+    const { x, y, visible } = this.project(point);
+    return visible && x >= 0 && y >= 0 && x <= this.width && y <= this.height;
+  }
 }
