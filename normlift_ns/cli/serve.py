@@ -7,6 +7,7 @@ import stat
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -22,7 +23,7 @@ class NormLiftServe(ServeOptions):
     agents. Runs stay open, so that answers take milliseconds.
     """
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN…")]
     """Paths of the config.yml files of lifted runs."""
     mcp: bool = False
     """Also offer the tools of the Model Context Protocol: at /mcp, or on standard input and output if standard input is

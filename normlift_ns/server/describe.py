@@ -1,4 +1,4 @@
-"""What a page is told of a state, of the pointer and of a selection, as JSON types."""
+"""Descriptions of a state, of a Gaussian under the pointer and of votes as JSON types, for pages."""
 
 from __future__ import annotations
 

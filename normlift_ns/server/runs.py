@@ -334,6 +334,7 @@ class ServedRun:
         if view is not None:
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
             self.still(codes, view.camera(64))  # compiles the renderer
+            self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
         _ = self.pca
 
     @property
