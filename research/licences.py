@@ -26,7 +26,8 @@ HEAD = """# Licences
 
 normlift_ns is under the Apache License 2.0. It contains no code of the packages below; pip installs them beside it,
 each under its own licence, here as the package states it. Weights and words have licences of their own, below. This
-page is made of what is installed: `python -m research.licences`.
+page is made of what is installed: `python -m research.licences`. The web page that wheels contain is built of Spark
+2.2.0, three.js 0.187.0 and fflate (all MIT); `normlift_ns/page/assets/licenses.txt` holds their licenses in full.
 
 | package | licence | needed |
 |---|---|---|

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from setuptools import Command, build_meta
 from setuptools.build_meta import *  # noqa: F403 (the hooks that are not changed here)
@@ -141,7 +141,7 @@ class BuildPage(Command):
     """Command `python setup.py build_page`."""
 
     description = "build the web page into normlift_ns/page"
-    user_options: list[tuple[str, str | None, str]] = []  # noqa: RUF012 (as setuptools expects it)
+    user_options: ClassVar[list[Any]] = []
 
     def initialize_options(self) -> None:
         """Do nothing: there are no options."""

@@ -39,7 +39,7 @@ _WATCH = """() => {
   const draw = renderer.render.bind(renderer);
   renderer.render = (what, camera) => {
     draw(what, camera);
-    if (what !== scene.scene || renderer.getRenderTarget() !== null) return;
+    if (renderer.getRenderTarget() !== null) return;
     [canvas.width, canvas.height] = [160, 100];
     context.drawImage(renderer.domElement, 0, 0, 160, 100);
     const pixels = context.getImageData(0, 0, 160, 100).data;

@@ -272,13 +272,6 @@ class Person:
         """Clicks on the picture, pixels from its upper left corner."""
         self.page.mouse.click(place[0], self.top + place[1])
 
-    def click_holding(self, key: str, place: tuple[float, float]) -> None:
-        self.page.keyboard.down(key)
-        self.says(ARMED)
-        self.click(place)
-        self.page.keyboard.up(key)
-        self.until(lambda: ARMED not in self.text(), "released")
-
     def drag(self, x: float, y: float, button: Any = "left") -> None:
         """Drags from the middle of the picture: turns the camera, with the right button moves it."""
         middle = ((self.size[0] - PANEL) / 2, (self.top + self.size[1]) / 2)
@@ -286,13 +279,6 @@ class Person:
         self.page.mouse.down(button=button)
         self.page.mouse.move(middle[0] + x, middle[1] + y, steps=8)
         self.page.mouse.up(button=button)
-
-    def fits(self, *buttons: str) -> None:
-        """Nothing reaches beyond the page's width."""
-        assert self.page.evaluate("document.documentElement.scrollWidth") <= self.size[0]
-        for name in buttons:
-            box = self.button(name).first.bounding_box()
-            assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= self.size[0], (name, box)
 
 
 def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
@@ -307,11 +293,6 @@ def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
 def coloured(picture: np.ndarray) -> np.ndarray:
     """Pixels that are not grey; without the axes."""
     return without_axes(np.ptp(picture.astype(int), axis=2) > 50)
-
-
-def covers(seen: np.ndarray, things: np.ndarray) -> bool:
-    """Whether colours lie on these things, and hardly elsewhere."""
-    return bool(coloured(seen)[things].mean() > 0.8 and coloured(seen)[~things].mean() < 0.03)
 
 
 def without_axes(mask: np.ndarray) -> np.ndarray:

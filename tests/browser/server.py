@@ -22,15 +22,13 @@ PATIENCE = 600.0
 class Server:
     """A viewer of one run, always at the same port; its output goes to the end of `log`."""
 
-    def __init__(
-        self, program: str, config: Path, log: Path, *, cwd: Path | None = None, python: Path | str = sys.executable
-    ) -> None:
+    def __init__(self, program: str, config: Path, log: Path, *, cwd: Path | None = None) -> None:
         port = str(free_port())
         place = ["--port", port]
         if "nerfstudio" in program:
             place = ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port]
             place += ["--viewer.max-num-display-images", "0"]  # no training cameras in front of the scene
-        self._words = [str(python), "-W", "ignore", "-c", program, "--load-config", str(config), *place]
+        self._words = [sys.executable, "-W", "ignore", "-c", program, "--load-config", str(config), *place]
         self._log, self._cwd, self._flags = log, cwd, ()
         self.process: subprocess.Popen[bytes] | None = None
         self.address = f"http://127.0.0.1:{port}"

@@ -1,7 +1,8 @@
 /**
  * Connection to the server's session of this page.
  *
- * It comes back by itself, with the last question. Dispatches `status` with `online` and `reason`, and an event per type of message.
+ * It comes back by itself, with the last question. Dispatches `status` with `online` and `reason`, and an event per
+ * type of message.
  */
 
 /** @typedef {{type: string, seq?: number, [name: string]: any}} Message */
@@ -64,7 +65,8 @@ export class Connection extends EventTarget {
 
   /** @param {string | ArrayBuffer} data */
   receive(data) {
-    const { header, payload } = typeof data === "string" ? { header: JSON.parse(data), payload: null } : parseFrame(data);
+    const { header, payload } =
+      typeof data === "string" ? { header: JSON.parse(data), payload: null } : parseFrame(data);
     this.dispatchEvent(Object.assign(new Event(header.type), { message: header, payload }));
   }
 

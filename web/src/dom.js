@@ -48,7 +48,11 @@ export function saveBlob(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-/** @param {(...values: any[]) => void} call @param {number} wait Milliseconds. @returns {(...values: any[]) => void} At most one call per wait, the last one always. */
+/**
+ * Limits calls to one per wait; the last one is always made.
+ * @param {(...values: any[]) => void} call @param {number} wait Milliseconds.
+ * @returns {(...values: any[]) => void}
+ */
 export function throttled(call, wait) {
   let timer = 0;
   let last = 0;

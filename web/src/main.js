@@ -59,9 +59,17 @@ class Page {
     this.view = new View3D($("canvas"), run.up, run.radius);
     this.connection = new Connection(run.id, () => ({ ...this.greeting(), webgl: this.webgl }));
     this.scene = this.webgl ? new SceneRenderer($("canvas"), this.view) : null;
-    this.stills = new Stills(this.view, (value) => this.connection.send("still", value), () => this.sendCamera());
+    this.stills = new Stills(
+      this.view,
+      (value) => this.connection.send("still", value),
+      () => this.sendCamera(),
+    );
     this.search = new Search(this.act, run);
-    this.panel = new Panel(this.act, run, { goToCamera: (i) => this.view.goToCamera(this.cameras[i]), cameras: [] });
+    this.panel = new Panel(this.act, run, {
+      goToCamera: (i) => this.view.goToCamera(this.cameras[i]),
+      sees: (point) => this.view.sees(point),
+      cameras: [],
+    });
     this.tools = new Tools(this.view, this.act);
     /** @type {any[]} */
     this.cameras = [];
@@ -80,7 +88,11 @@ class Page {
     const here = memory.search === location.search;
     const access = parameters.get("access") ?? memory.access ?? "";
     this.connection.remember({ token: memory.token || crypto.randomUUID(), search: location.search, access });
-    return { token: this.connection.memory.token, link: here && memory.link ? memory.link : location.search.slice(1), access };
+    return {
+      token: this.connection.memory.token,
+      link: here && memory.link ? memory.link : location.search.slice(1),
+      access,
+    };
   }
 
   /**
@@ -109,30 +121,94 @@ class Page {
   build() {
     document.title = `${this.run.name} · normlift`;
     if (this.runs.length > 1) {
-      const choose = h("select", { "aria-label": "Scene", onchange: () => (location.search = `?run=${encodeURIComponent(choose.value)}`) },
-        ...this.runs.map((one) => h("option", { value: one.id, selected: one.id === this.run.id },
-          this.runs.filter((other) => other.name === one.name).length > 1 ? one.id : one.name)));
+      const choose = h(
+        "select",
+        { "aria-label": "Scene", onchange: () => (location.search = `?run=${encodeURIComponent(choose.value)}`) },
+        ...this.runs.map((one) =>
+          h(
+            "option",
+            { value: one.id, selected: one.id === this.run.id },
+            this.runs.filter((other) => other.name === one.name).length > 1 ? one.id : one.name,
+          ),
+        ),
+      );
       $("name").replaceChildren(choose);
     }
     $("modes").replaceChildren(
-      ...MODES.map(([mode, label, tip], i) => h("button.tool", {
-        type: "button", role: "radio", id: `mode-${mode}`, "aria-checked": "false", "data-tip": tip, "data-keys": String(i + 1), "aria-keyshortcuts": String(i + 1),
-        onclick: (/** @type {Event} */ event) => this.act("color_mode", mode, /** @type {Element} */ (event.currentTarget)),
-      }, label)),
-      h("input", { id: "blend", type: "range", min: 0, max: 1, step: 0.01, value: 1, "aria-label": "Blend: scene to answer", "data-tip": "Blend between scene and answer.", oninput: () => this.scene?.setBlend(Number($("blend").value)) }),
+      ...MODES.map(([mode, label, tip], i) =>
+        h(
+          "button.tool",
+          {
+            type: "button",
+            role: "radio",
+            id: `mode-${mode}`,
+            "aria-checked": "false",
+            "data-tip": tip,
+            "data-keys": String(i + 1),
+            "aria-keyshortcuts": String(i + 1),
+            onclick: (/** @type {Event} */ event) =>
+              this.act("color_mode", mode, /** @type {Element} */ (event.currentTarget)),
+          },
+          label,
+        ),
+      ),
+      h("input", {
+        id: "blend",
+        type: "range",
+        min: 0,
+        max: 1,
+        step: 0.01,
+        value: 1,
+        "aria-label": "Blend: scene to answer",
+        "data-tip": "Blend between scene and answer.",
+        oninput: () => this.scene?.setBlend(Number($("blend").value)),
+      }),
     );
-    const tool = (/** @type {string} */ label, /** @type {any} */ name, /** @type {string} */ tip, /** @type {string | null} */ keys, /** @type {(anchor: Element) => void} */ press, more = {}) =>
-      h("button.tool", { type: "button", "aria-label": label, "data-tip": tip, "data-keys": keys, "aria-keyshortcuts": keys, onclick: (/** @type {Event} */ event) => press(/** @type {Element} */ (event.currentTarget)), ...more }, icon(name));
+    const tool = (
+      /** @type {string} */ label,
+      /** @type {any} */ name,
+      /** @type {string} */ tip,
+      /** @type {string | null} */ keys,
+      /** @type {(anchor: Element) => void} */ press,
+      more = {},
+    ) =>
+      h(
+        "button.tool",
+        {
+          type: "button",
+          "aria-label": label,
+          "data-tip": tip,
+          "data-keys": keys,
+          "aria-keyshortcuts": keys,
+          onclick: (/** @type {Event} */ event) => press(/** @type {Element} */ (event.currentTarget)),
+          ...more,
+        },
+        icon(name),
+      );
     $("corner").replaceChildren(
-      tool("Start view", "home", "Back to the view at the start.", "Home", () => this.home && this.view.go(this.home), { id: "do-home" }),
-      tool("Compare", "compare", "Compare scene and answer with a divider.", "C", () => this.toggleCompare(), { id: "do-compare", "aria-pressed": "false" }),
-      tool("Screenshot", "camera", "Save a picture of the scene.", "S", (anchor) => this.screenshot(anchor), { id: "do-screenshot" }),
-      tool("Link", "link", "Copy a link to this question and view.", "Ctrl+L", (anchor) => this.copyLink(anchor), { id: "do-link" }),
-      tool("Dark or light", "theme", "Switch between dark and light.", "D", () => this.switchTheme(), { id: "do-theme" }),
+      tool("Start view", "home", "Back to the view at the start.", "Home", () => this.home && this.view.go(this.home), {
+        id: "do-home",
+      }),
+      tool("Compare", "compare", "Compare scene and answer with a divider.", "C", () => this.toggleCompare(), {
+        id: "do-compare",
+        "aria-pressed": "false",
+      }),
+      tool("Screenshot", "camera", "Save a picture of the scene.", "S", (anchor) => this.screenshot(anchor), {
+        id: "do-screenshot",
+      }),
+      tool("Link", "link", "Copy a link to this question and view.", null, (anchor) => this.copyLink(anchor), {
+        id: "do-link",
+      }),
+      tool("Dark or light", "theme", "Switch between dark and light.", "D", () => this.switchTheme(), {
+        id: "do-theme",
+      }),
       tool("Help", "help", "List all shortcuts.", "?", () => $("help").showModal(), { id: "do-help" }),
     );
     if (!this.webgl) $("blend").hidden = $("do-compare").hidden = true;
-    this.setTheme(localStorage.getItem("normlift:theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"));
+    this.setTheme(
+      localStorage.getItem("normlift:theme") ??
+        (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"),
+    );
     startTooltips();
     startShortcuts(this.shortcuts());
   }
@@ -141,7 +217,14 @@ class Page {
   shortcuts() {
     const press = (/** @type {string} */ id) => () => $(id) && !$(id).disabled && $(id).click();
     return [
-      { keys: "/", text: "Search", run: () => { $("prompts").focus(); $("prompts").select(); } },
+      {
+        keys: "/",
+        text: "Search",
+        run: () => {
+          $("prompts").focus();
+          $("prompts").select();
+        },
+      },
       { keys: "Escape", text: "Stop searching, close, back to Select", run: () => this.escape() },
       ...TOOLS.map(([name, , label, keys]) => ({ keys, text: label, run: () => this.tools.choose(name) })),
       { keys: "H", text: "Hide the selection", run: press("do-hide") },
@@ -194,12 +277,16 @@ class Page {
       toast(text || `Downloaded ${name}`, { kind: "done", anchor: this.anchors.get(seq) });
     });
     on("token", (message) => this.receiveToken(message));
-    this.connection.addEventListener("status", (/** @type {any} */ event) => this.showStatus(event.online, event.reason));
+    this.connection.addEventListener("status", (/** @type {any} */ event) =>
+      this.showStatus(event.online, event.reason),
+    );
     this.tools.addEventListener("hover", (/** @type {any} */ event) => {
       this.pointed = event.ray && this.state ? this.connection.send("hover", event.ray) : 0;
       if (!event.ray) $("hover").hidden = true;
     });
-    this.tools.addEventListener("probe", (/** @type {any} */ event) => this.probes.set(this.connection.send("hover", event.ray), event.found));
+    this.tools.addEventListener("probe", (/** @type {any} */ event) =>
+      this.probes.set(this.connection.send("hover", event.ray), event.found),
+    );
     const rest = throttled(() => this.sendCamera(), 250);
     this.view.addEventListener("move", () => {
       $("hover").hidden = true;
@@ -220,9 +307,11 @@ class Page {
   }
 
   async open() {
-    fetch(`/api/runs/${encodeURIComponent(this.run.id)}/cameras`).then((answer) => answer.json()).then(({ cameras }) => {
-      this.cameras = this.panel.scene.cameras = cameras;
-    });
+    fetch(`/api/runs/${encodeURIComponent(this.run.id)}/cameras`)
+      .then((answer) => answer.json())
+      .then(({ cameras }) => {
+        this.cameras = this.panel.scene.cameras = cameras;
+      });
     if (!this.scene) {
       $("loading").querySelector("p").textContent = "This browser has no WebGL 2: the server draws the scene.";
       return;
@@ -233,7 +322,8 @@ class Page {
         $("loading").querySelector("span").style.width = `${8 + 87 * share}%`;
       });
     } catch (error) {
-      $("loading").querySelector("p").textContent = `The scene cannot be loaded (${error}). Reload the page to try again.`;
+      $("loading").querySelector("p").textContent =
+        `The scene cannot be loaded (${error}). Reload the page to try again.`;
       return;
     }
     if (this.waiting) this.scene.paint(this.waiting.payload, this.waiting.palette);
@@ -263,7 +353,8 @@ class Page {
 
   /** @param {any} state */
   show(state) {
-    if (state.seq === this.asked && this.state?.revision !== state.revision && state.step !== this.state?.step) this.setStale(false);
+    if (state.seq === this.asked && this.state?.revision !== state.revision && state.step !== this.state?.step)
+      this.setStale(false);
     this.state = state;
     this.search.show(state);
     this.panel.show(state);
@@ -280,8 +371,10 @@ class Page {
     if (!legend) return;
     const stops = legend.colors.map((/** @type {number[]} */ rgb) => `rgb(${rgb.join(" ")})`).join(", ");
     $("legend").replaceChildren(
-      h("span", {}, legend.label), h("div.ramp", { style: `background: linear-gradient(to right, ${stops})` }),
-      h("div.row.spread.num", {}, h("span", {}, fixed(legend.low)), h("span", {}, fixed(legend.high))));
+      h("span", {}, legend.label),
+      h("div.ramp", { style: `background: linear-gradient(to right, ${stops})` }),
+      h("div.row.spread.num", {}, h("span", {}, fixed(legend.low)), h("span", {}, fixed(legend.high))),
+    );
   }
 
   /** @param {any} message */
@@ -297,7 +390,11 @@ class Page {
     const known = reliability !== null && reliability !== undefined;
     $("hover").hidden = !known;
     if (!known) return;
-    const facts = [relevancy === null ? "" : `relevancy ${fixed(relevancy)}`, `R ${fixed(reliability)}`, object?.name ?? ""];
+    const facts = [
+      relevancy === null ? "" : `relevancy ${fixed(relevancy)}`,
+      `R ${fixed(reliability)}`,
+      object?.name ?? "",
+    ];
     $("hover").replaceChildren(...(label ? [h("b", {}, label)] : []), facts.filter(Boolean).join(" · "));
     const stage = $("stage").getBoundingClientRect();
     const x = Math.min(this.pointer[0] - stage.left + 16, stage.width - 220);
@@ -392,11 +489,17 @@ class Page {
       const stage = $("stage").getBoundingClientRect();
       this.setDivider(Math.min(1, Math.max(0, (x - stage.left) / stage.width)));
     };
-    divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => divider.setPointerCapture(event.pointerId));
-    divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => divider.hasPointerCapture(event.pointerId) && move(event.clientX));
+    divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) =>
+      divider.setPointerCapture(event.pointerId),
+    );
+    divider.addEventListener(
+      "pointermove",
+      (/** @type {PointerEvent} */ event) => divider.hasPointerCapture(event.pointerId) && move(event.clientX),
+    );
     divider.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
       const step = event.key === "ArrowLeft" ? -0.02 : event.key === "ArrowRight" ? 0.02 : 0;
-      if (step !== 0) this.setDivider(Math.min(1, Math.max(0, Number(divider.getAttribute("aria-valuenow")) / 100 + step)));
+      if (step !== 0)
+        this.setDivider(Math.min(1, Math.max(0, Number(divider.getAttribute("aria-valuenow")) / 100 + step)));
     });
   }
 

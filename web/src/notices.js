@@ -1,7 +1,7 @@
 /** Tooltips with shortcuts, and toasts near what was pressed. */
 import { $, h } from "./dom.js";
 
-/** @param {HTMLElement} box @param {DOMRect} anchor Keeps a box inside the window, below its anchor if there is room. */
+/** Keeps a box inside the window, below its anchor if there is room. @param {HTMLElement} box @param {DOMRect} anchor */
 function place(box, anchor) {
   const { width, height } = box.getBoundingClientRect();
   const left = Math.min(Math.max(8, anchor.left + anchor.width / 2 - width / 2), innerWidth - width - 8);

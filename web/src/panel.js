@@ -4,8 +4,11 @@ import { icon } from "./icons.js";
 
 const COLORMAPS = ["viridis", "cividis", "inferno", "magma", "turbo"];
 const RULES = [
-  ["auto", "Automatic"], ["contrast", "Contrast with unrelated words"], ["lerf", "LERF: against each negative"],
-  ["margin", "Margin over negatives"], ["cosine", "Cosine"],
+  ["auto", "Automatic"],
+  ["contrast", "Contrast with unrelated words"],
+  ["lerf", "LERF: against each negative"],
+  ["margin", "Margin over negatives"],
+  ["cosine", "Cosine"],
 ];
 /** @param {number} value */
 const evidence = (value) => (value >= 0.7 ? "strong" : value >= 0.4 ? "moderate" : "weak");
@@ -18,22 +21,38 @@ const evidence = (value) => (value >= 0.7 ? "strong" : value >= 0.4 ? "moderate"
  */
 export function button(label, name, tip, keys, press, more = {}) {
   const bare = more.bare === true;
-  return h(bare ? "button.btn.square" : "button.btn", {
-    type: "button", "data-tip": tip, "data-keys": keys, "aria-keyshortcuts": keys, "aria-label": bare ? label : null,
-    onclick: (/** @type {Event} */ event) => press(/** @type {Element} */ (event.currentTarget)), ...more, bare: null,
-  }, name && icon(name), !bare && label);
+  return h(
+    bare ? "button.btn.square" : "button.btn",
+    {
+      type: "button",
+      "data-tip": tip,
+      "data-keys": keys,
+      "aria-keyshortcuts": keys,
+      "aria-label": bare ? label : null,
+      onclick: (/** @type {Event} */ event) => press(/** @type {Element} */ (event.currentTarget)),
+      ...more,
+      bare: null,
+    },
+    name && icon(name),
+    !bare && label,
+  );
 }
 
 /** @param {string} id @param {string} title @param {Node[]} children @param {boolean} [open] */
 function fold(id, title, children, open = false) {
-  return h("details", { id: `fold-${id}`, open }, h("summary", {}, title, h("span.count", { id: `${id}-count` })), h("div", {}, ...children));
+  return h(
+    "details",
+    { id: `fold-${id}`, open },
+    h("summary", {}, title, h("span.count", { id: `${id}-count` })),
+    h("div", {}, ...children),
+  );
 }
 
 export class Panel {
   /**
    * @param {Act} act
    * @param {any} run
-   * @param {{goToCamera: (index: number) => void, cameras: any[]}} scene
+   * @param {{goToCamera: (index: number) => void, sees: (point: number[]) => boolean, cameras: any[]}} scene
    */
   constructor(act, run, scene) {
     this.act = act;
@@ -48,49 +67,158 @@ export class Panel {
 
   build() {
     const { act, run } = this;
-    const simple = (/** @type {string} */ action, /** @type {any} */ value = null) => (/** @type {Element} */ anchor) => act(action, value, anchor);
+    const simple =
+      (/** @type {string} */ action, /** @type {any} */ value = null) =>
+      (/** @type {Element} */ anchor) =>
+        act(action, value, anchor);
     $("panel").replaceChildren(
       h("header", {}, h("h1", { id: "name" }, run.name), h("p.soft.small.num", { id: "facts" })),
-      h("section", { id: "selection", "aria-label": "Selection" },
-        h("div", { role: "status" }, h("p.big.num", { id: "selected" }), h("p.soft.small.num", { id: "selected-more" }), h("p.warn.small", { id: "warning" })),
-        h("div", { id: "selection-actions" },
+      h(
+        "section",
+        { id: "selection", "aria-label": "Selection" },
+        h(
+          "div",
+          { role: "status" },
+          h("p.big.num", { id: "selected" }),
+          h("p.soft.small.num", { id: "selected-more" }),
+          h("p.warn.small", { id: "warning" }),
+        ),
+        h(
+          "div",
+          { id: "selection-actions" },
           button("Hide", null, "Hide the selected Gaussians.", "H", simple("hide"), { id: "do-hide" }),
-          button("Isolate", null, "Show only the selected Gaussians.", "I", simple("isolate"), { id: "do-isolate" }),
+          button(
+            "Isolate",
+            null,
+            "Show only the selected Gaussians.",
+            "I",
+            (anchor) => this.isolate(null, this.state.objects ?? [], anchor),
+            { id: "do-isolate" },
+          ),
           button("Show all", null, "Show everything that is hidden.", "A", simple("show_all"), { id: "do-show" }),
           button("Invert", null, "Select everything else.", "X", simple("invert"), { id: "do-invert" }),
-          button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), { id: "do-why" }),
-          button("Go to", null, "Move the camera to the selection's largest object.", "G", (anchor) => this.goToFirst(anchor), { id: "do-go" }),
+          button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), {
+            id: "do-why",
+          }),
+          button(
+            "Go to",
+            null,
+            "Move the camera to the selection's largest object.",
+            "G",
+            (anchor) => this.goToFirst(anchor),
+            { id: "do-go" },
+          ),
           button("Clear", null, "Remove question and selection.", "Delete", simple("clear"), { id: "do-clear" }),
-          button("Layer", null, "Save the selection as a layer.", "N", (anchor) => this.addLayer(anchor), { id: "do-layer" })),
-        h("div.row.spread", {},
-          h("div.row", { role: "group", "aria-label": "History" },
+          button("Layer", null, "Save the selection as a layer.", "N", (anchor) => this.addLayer(anchor), {
+            id: "do-layer",
+          }),
+        ),
+        h(
+          "div.row.spread",
+          {},
+          h(
+            "div.row",
+            { role: "group", "aria-label": "History" },
             button("Undo", "undo", "Undo the last step.", "Ctrl+Z", simple("undo"), { id: "do-undo", bare: true }),
-            button("Redo", "redo", "Redo the step that was undone.", "Ctrl+Shift+Z", simple("redo"), { id: "do-redo", bare: true })),
-          h("div.row", { role: "group", "aria-label": "Size of the selection" },
+            button("Redo", "redo", "Redo the step that was undone.", "Ctrl+Shift+Z", simple("redo"), {
+              id: "do-redo",
+              bare: true,
+            }),
+          ),
+          h(
+            "div.row",
+            { role: "group", "aria-label": "Size of the selection" },
             h("span.soft.small", {}, "Grow"),
-            button("Shrink", "shrink", "Shrink the selection.", "[", (anchor) => this.grow(-1, anchor), { id: "do-shrink", bare: true }),
+            button("Shrink", "shrink", "Shrink the selection.", "[", (anchor) => this.grow(-1, anchor), {
+              id: "do-shrink",
+              bare: true,
+            }),
             h("span.num", { id: "grow" }, "0"),
-            button("Grow", "grow", "Grow the selection from part to whole.", "]", (anchor) => this.grow(1, anchor), { id: "do-grow", bare: true }))),
-        h("div.row", { role: "group", "aria-label": "Download" },
+            button("Grow", "grow", "Grow the selection from part to whole.", "]", (anchor) => this.grow(1, anchor), {
+              id: "do-grow",
+              bare: true,
+            }),
+          ),
+        ),
+        h(
+          "div.row",
+          { role: "group", "aria-label": "Download" },
           h("span.soft.small", {}, "Download"),
-          button("PLY", null, "Download the selection as a PLY file of Gaussians.", null, simple("export", { format: "ply" }), { id: "save-ply" }),
-          button("GLB", null, "Download the selection as a GLB file.", null, simple("export", { format: "glb" }), { id: "save-glb" }),
-          button("Masks", null, "Download masks of the selection in all training images.", null, simple("export", { format: "masks" }), { id: "save-masks" }))),
-      h("section", { id: "answer", "aria-label": "Answer", hidden: true },
-        h("div.row.spread", {}, h("h2", { id: "threshold-title" }, "Threshold"),
-          button("Use suggested", null, "Use the threshold at the dashed line.", "T", simple("suggested"), { id: "do-suggested" })),
+          button(
+            "PLY",
+            null,
+            "Download the selection as a PLY file of Gaussians.",
+            null,
+            simple("export", { format: "ply" }),
+            { id: "save-ply" },
+          ),
+          button("GLB", null, "Download the selection as a GLB file.", null, simple("export", { format: "glb" }), {
+            id: "save-glb",
+          }),
+          button(
+            "Masks",
+            null,
+            "Download masks of the selection in all training images.",
+            null,
+            simple("export", { format: "masks" }),
+            { id: "save-masks" },
+          ),
+        ),
+      ),
+      h(
+        "section",
+        { id: "answer", "aria-label": "Answer", hidden: true },
+        h(
+          "div.row.spread",
+          {},
+          h("h2", { id: "threshold-title" }, "Threshold"),
+          button("Use suggested", null, "Use the threshold at the dashed line.", "T", simple("suggested"), {
+            id: "do-suggested",
+          }),
+        ),
         h("div", { id: "histograms" }),
-        h("label.field", {}, h("span", {}, "Least relevancy", h("b.num", { id: "threshold-value" })),
-          h("input", { id: "threshold", type: "range", min: 0, max: 1, step: 0.005, oninput: () => this.slid("threshold"), onchange: () => this.rested() })),
-        h("label.field", {}, h("span", {}, "Least reliability R", h("b.num", { id: "reliability-value" })),
-          h("input", { id: "reliability", type: "range", min: 0, max: 1, step: 0.01, value: 0, oninput: () => this.slid("reliability"), onchange: () => this.rested(), "data-tip": "Leaves out what few images have shown clearly." }))),
+        h(
+          "label.field",
+          {},
+          h("span", {}, "Least relevancy", h("b.num", { id: "threshold-value" })),
+          h("input", {
+            id: "threshold",
+            type: "range",
+            min: 0,
+            max: 1,
+            step: 0.005,
+            oninput: () => this.slid("threshold"),
+            onchange: () => this.rested(),
+          }),
+        ),
+        h(
+          "label.field",
+          {},
+          h("span", {}, "Least reliability R", h("b.num", { id: "reliability-value" })),
+          h("input", {
+            id: "reliability",
+            type: "range",
+            min: 0,
+            max: 1,
+            step: 0.01,
+            value: 0,
+            oninput: () => this.slid("reliability"),
+            onchange: () => this.rested(),
+            "data-tip": "Leaves out what few images have shown clearly.",
+          }),
+        ),
+      ),
       fold("objects", "Objects", [h("ul.list", { id: "objects" })], true),
-      fold("layers", "Layers", [h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to come back to it."), h("ul.list", { id: "layers" })]),
+      fold("layers", "Layers", [
+        h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to come back to it."),
+        h("ul.list", { id: "layers" }),
+      ]),
       fold("history", "History", [h("ol.list", { id: "history" })]),
       fold("cameras", "Training cameras", [h("div", { id: "cameras" })]),
       fold("advanced", "Advanced", this.advanced()),
     );
-    $("facts").textContent = `${grouped(run.num_drawn)} Gaussians · ${grouped(run.num_views)} images` +
+    $("facts").textContent =
+      `${grouped(run.num_drawn)} Gaussians · ${grouped(run.num_views)} images` +
       (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} hidden to keep the browser responsive` : "");
     $("fold-cameras").addEventListener("toggle", () => this.showCameras(), { once: true });
   }
@@ -99,19 +227,69 @@ export class Panel {
     const { act, run } = this;
     const options = (/** @type {string[][]} */ rows) => rows.map(([value, text]) => h("option", { value }, text));
     return [
-      h("label.field", {}, h("span", {}, "Negative prompts"),
-        h("input", { id: "negatives", type: "text", placeholder: "Automatic", "data-tip": "What the answer is compared with, separated by commas. Empty: automatic.", onchange: () => {
-          const texts = $("negatives").value.split(",").map((/** @type {string} */ text) => text.trim()).filter(Boolean);
-          act("negatives", texts.length > 0 ? texts : null, $("negatives"));
-        } })),
-      h("label.field", {}, h("span", {}, "Relevancy rule"),
-        h("select", { id: "rule", onchange: () => act("rule", $("rule").value, $("rule")) }, ...options(RULES))),
-      h("label.field", {}, h("span", {}, "Colormap"),
-        h("select", { id: "colormap", onchange: () => act("colormap", $("colormap").value, $("colormap")) }, ...options(COLORMAPS.map((name) => [name, name])))),
-      h("div.row", {},
-        button("Select likely floaters", null, "Select Gaussians that belong to no surface. Look first, then hide them.", null, (anchor) => act("floaters", null, anchor), { id: "do-floaters" }),
-        button("Remove weak evidence", null, "Leave out what few images have shown clearly.", null, (anchor) => act("remove_weak", null, anchor), { id: "do-weak" }),
-        !run.read_only && button("Save prompts", null, "Store these prompts in the run, in addition to the saved ones.", null, (anchor) => act("save_prompts", { replace: false }, anchor), { id: "do-save" })),
+      h(
+        "label.field",
+        {},
+        h("span", {}, "Negative prompts"),
+        h("input", {
+          id: "negatives",
+          type: "text",
+          placeholder: "Automatic",
+          "data-tip": "What the answer is compared with, separated by commas. Empty: automatic.",
+          onchange: () => {
+            const texts = $("negatives")
+              .value.split(",")
+              .map((/** @type {string} */ text) => text.trim())
+              .filter(Boolean);
+            act("negatives", texts.length > 0 ? texts : null, $("negatives"));
+          },
+        }),
+      ),
+      h(
+        "label.field",
+        {},
+        h("span", {}, "Relevancy rule"),
+        h("select", { id: "rule", onchange: () => act("rule", $("rule").value, $("rule")) }, ...options(RULES)),
+      ),
+      h(
+        "label.field",
+        {},
+        h("span", {}, "Colormap"),
+        h(
+          "select",
+          { id: "colormap", onchange: () => act("colormap", $("colormap").value, $("colormap")) },
+          ...options(COLORMAPS.map((name) => [name, name])),
+        ),
+      ),
+      h(
+        "div.row",
+        {},
+        button(
+          "Select likely floaters",
+          null,
+          "Select Gaussians that belong to no surface. Look first, then hide them.",
+          null,
+          (anchor) => act("floaters", null, anchor),
+          { id: "do-floaters" },
+        ),
+        button(
+          "Remove weak evidence",
+          null,
+          "Leave out what few images have shown clearly.",
+          null,
+          (anchor) => act("remove_weak", null, anchor),
+          { id: "do-weak" },
+        ),
+        !run.read_only &&
+          button(
+            "Save prompts",
+            null,
+            "Store these prompts in the run, in addition to the saved ones.",
+            null,
+            (anchor) => act("save_prompts", { replace: false }, anchor),
+            { id: "do-save" },
+          ),
+      ),
     ];
   }
 
@@ -119,7 +297,18 @@ export class Panel {
   goToFirst(anchor) {
     const first = this.state?.objects?.[0];
     if (first) this.act("go_to", { id: first.id }, anchor);
-    else this.act("message", null, anchor);
+  }
+
+  /**
+   * Hides everything else, and goes to an object if none would be in view.
+   * @param {number[] | null} ids Of objects; null: the selection.
+   * @param {{id: number, center: number[]}[]} objects @param {Element} anchor
+   */
+  isolate(ids, objects, anchor) {
+    this.act("isolate", ids, anchor);
+    if (objects.length > 0 && !objects.some((one) => this.scene.sees(one.center))) {
+      this.act("go_to", { id: objects[0].id }, anchor);
+    }
   }
 
   /** @param {Element} anchor */
@@ -165,7 +354,12 @@ export class Panel {
     const before = this.state;
     if (!state.details && before) {
       const same = before.selected === state.selected && before.by_hand === state.by_hand;
-      state = { ...state, histogram: state.prompts.length ? before.histogram : null, objects: same ? before.objects : before.objects, suggested: before.suggested };
+      state = {
+        ...state,
+        histogram: state.prompts.length ? before.histogram : null,
+        objects: same ? before.objects : before.objects,
+        suggested: before.suggested,
+      };
     }
     this.state = state;
     this.showSelection(state);
@@ -176,7 +370,8 @@ export class Panel {
     $("rule").value = state.rule ?? "auto";
     $("colormap").value = state.colormap;
     if (document.activeElement !== $("negatives")) $("negatives").value = (state.negatives ?? []).join(", ");
-    if (state.used_negatives?.length) $("negatives").placeholder = `Automatic: ${state.used_negatives.slice(0, 4).join(", ")} …`;
+    if (state.used_negatives?.length)
+      $("negatives").placeholder = `Automatic: ${state.used_negatives.slice(0, 4).join(", ")} …`;
   }
 
   /** @param {any} state */
@@ -185,12 +380,25 @@ export class Panel {
     const some = selected > 0;
     $("selected").textContent = some ? `${grouped(selected)} selected` : "Nothing selected";
     const parts = [];
-    if (some && visible !== selected) parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
+    if (some && visible !== selected)
+      parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
     if (hidden > 0) parts.push(`${grouped(hidden)} hidden`);
     if (some && state.by_hand) parts.push("by hand");
     $("selected-more").textContent = parts.join(" · ") || (some ? "Gaussians" : "Ask, or click an object.");
     $("warning").textContent = state.warning ?? "";
-    for (const id of ["do-hide", "do-isolate", "do-why", "do-go", "do-layer", "do-grow", "do-shrink", "save-ply", "save-glb", "save-masks"]) $(id).disabled = !some;
+    for (const id of [
+      "do-hide",
+      "do-isolate",
+      "do-why",
+      "do-go",
+      "do-layer",
+      "do-grow",
+      "do-shrink",
+      "save-ply",
+      "save-glb",
+      "save-masks",
+    ])
+      $(id).disabled = !some;
     $("do-show").disabled = hidden === 0;
     $("do-clear").disabled = !some && state.prompts.length === 0;
     $("do-undo").disabled = step === 0;
@@ -213,29 +421,74 @@ export class Panel {
       $("reliability").value = state.reliability;
       $("reliability-value").textContent = fixed(state.reliability);
     }
-    $("do-suggested").disabled = state.suggested === null || state.suggested === undefined || Math.abs(state.suggested - state.threshold) < 1e-4;
-    const shown = state.shown === null ? rows.slice(0, 3) : rows.filter((/** @type {any} */ row) => row.text === state.prompts.filter((/** @type {any} */ one) => !one.error)[state.shown]?.text);
-    fill($("histograms"), shown.map((/** @type {any} */ row) => histogram(row, state.threshold, low, high)));
+    $("do-suggested").disabled =
+      state.suggested === null || state.suggested === undefined || Math.abs(state.suggested - state.threshold) < 1e-4;
+    const shown =
+      state.shown === null
+        ? rows.slice(0, 3)
+        : rows.filter(
+            (/** @type {any} */ row) =>
+              row.text === state.prompts.filter((/** @type {any} */ one) => !one.error)[state.shown]?.text,
+          );
+    fill(
+      $("histograms"),
+      shown.map((/** @type {any} */ row) => histogram(row, state.threshold, low, high)),
+    );
     if (this.dragging) this.moveLine(Number($("threshold").value));
   }
 
   /** @param {any} state */
   showObjects(state) {
     const { act } = this;
-    $("objects-count").textContent = state.objects.length ? grouped(state.objects.length + (state.more_objects ?? 0)) : "";
+    $("objects-count").textContent = state.objects.length
+      ? grouped(state.objects.length + (state.more_objects ?? 0))
+      : "";
     const rows = state.objects.map((/** @type {any} */ one) => {
       const facts = `${grouped(one.count)} · ${evidence(one.reliability)} evidence`;
-      const small = (/** @type {string} */ label, /** @type {any} */ name, /** @type {string} */ action, /** @type {any} */ value) =>
-        button(`${label} ${one.name}`, name, label, null, (anchor) => act(action, value, anchor), { bare: true, "data-key": `${label}-${one.name}` });
-      return h("li", { "data-id": one.id },
-        h("button.main", { type: "button", "data-tip": "Select this object. Shift adds, Ctrl removes.", "data-key": `object-${one.name}`, onclick: (/** @type {MouseEvent} */ event) =>
-          act("object", { id: one.id, mode: event.shiftKey ? "add" : event.ctrlKey || event.metaKey ? "remove" : "select" }, /** @type {Element} */ (event.currentTarget)) },
-        h("span", {}, one.name), h("span.soft.small.num", {}, facts)),
-        small("Go to", "go", "go_to", { id: one.id }), small("Isolate", "isolate", "isolate", [one.id]),
-        small("Hide", "hide", "hide", [one.id]), small("Download", "download", "export", { format: "ply", object: one.id }));
+      const small = (
+        /** @type {string} */ label,
+        /** @type {any} */ name,
+        /** @type {string} */ action,
+        /** @type {any} */ value,
+      ) =>
+        button(`${label} ${one.name}`, name, label, null, (anchor) => act(action, value, anchor), {
+          bare: true,
+          "data-key": `${label}-${one.name}`,
+        });
+      return h(
+        "li",
+        { "data-id": one.id },
+        h(
+          "button.main",
+          {
+            type: "button",
+            "data-tip": "Select this object. Shift adds, Ctrl removes.",
+            "data-key": `object-${one.name}`,
+            onclick: (/** @type {MouseEvent} */ event) =>
+              act(
+                "object",
+                { id: one.id, mode: event.shiftKey ? "add" : event.ctrlKey || event.metaKey ? "remove" : "select" },
+                /** @type {Element} */ (event.currentTarget),
+              ),
+          },
+          h("span", {}, one.name),
+          h("span.soft.small.num", {}, facts),
+        ),
+        small("Go to", "go", "go_to", { id: one.id }),
+        button(`Isolate ${one.name}`, "isolate", "Isolate", null, (anchor) => this.isolate([one.id], [one], anchor), {
+          bare: true,
+          "data-key": `Isolate-${one.name}`,
+        }),
+        small("Hide", "hide", "hide", [one.id]),
+        small("Download", "download", "export", { format: "ply", object: one.id }),
+      );
     });
-    const note = state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} smaller ones`)] : [];
-    fill($("objects"), rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "Objects of an answer are listed here.")]);
+    const note =
+      state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} smaller ones`)] : [];
+    fill(
+      $("objects"),
+      rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "Objects of an answer are listed here.")],
+    );
   }
 
   /** @param {any} state */
@@ -244,23 +497,69 @@ export class Panel {
     const layers = state.layers ?? [];
     $("layers-count").textContent = layers.length || "";
     $("no-layers").hidden = layers.length > 0;
-    fill($("layers"), layers.map((/** @type {any} */ one) => {
-      const { name, visible } = one;
-      return h("li", {},
-        h("button.main", { type: "button", "data-tip": "Select this layer.", "data-key": `layer-${name}`, onclick: () => act("layer_select", { name }) },
-          h("span", {}, name), h("span.soft.small.num", {}, `${grouped(one.count)} Gaussians`)),
-        button(visible ? `Hide ${name}` : `Show ${name}`, visible ? "show" : "hide", visible ? "Hide this layer." : "Show this layer.", null,
-          (anchor) => act("layer_visible", { name, visible: !visible }, anchor), { bare: true, "aria-pressed": String(!visible), "data-key": `eye-${name}` }),
-        button(`Remove ${name}`, "trash", "Remove this layer from the list.", null, (anchor) => act("layer_remove", { name }, anchor), { bare: true, "data-key": `trash-${name}` }));
-    }));
+    fill(
+      $("layers"),
+      layers.map((/** @type {any} */ one) => {
+        const { name, visible } = one;
+        return h(
+          "li",
+          {},
+          h(
+            "button.main",
+            {
+              type: "button",
+              "data-tip": "Select this layer.",
+              "data-key": `layer-${name}`,
+              onclick: () => act("layer_select", { name }),
+            },
+            h("span", {}, name),
+            h("span.soft.small.num", {}, `${grouped(one.count)} Gaussians`),
+          ),
+          button(
+            visible ? `Hide ${name}` : `Show ${name}`,
+            visible ? "show" : "hide",
+            visible ? "Hide this layer." : "Show this layer.",
+            null,
+            (anchor) => act("layer_visible", { name, visible: !visible }, anchor),
+            { bare: true, "aria-pressed": String(!visible), "data-key": `eye-${name}` },
+          ),
+          button(
+            `Remove ${name}`,
+            "trash",
+            "Remove this layer from the list.",
+            null,
+            (anchor) => act("layer_remove", { name }, anchor),
+            { bare: true, "data-key": `trash-${name}` },
+          ),
+        );
+      }),
+    );
   }
 
   /** @param {any} state */
   showHistory(state) {
     const { history, step } = state;
     $("history-count").textContent = history.length > 1 ? `${step} of ${history.length - 1}` : "";
-    fill($("history"), history.map((/** @type {any} */ one, /** @type {number} */ i) =>
-      h("li", {}, h(`button.main${i > step ? ".undone" : ""}`, { type: "button", "data-key": `step-${i}`, "aria-current": i === step ? "step" : null, onclick: (/** @type {Event} */ event) => this.act("go_to_step", i, /** @type {Element} */ (event.currentTarget)) }, h("span", {}, one.text)))));
+    fill(
+      $("history"),
+      history.map((/** @type {any} */ one, /** @type {number} */ i) =>
+        h(
+          "li",
+          {},
+          h(
+            `button.main${i > step ? ".undone" : ""}`,
+            {
+              type: "button",
+              "data-key": `step-${i}`,
+              "aria-current": i === step ? "step" : null,
+              onclick: (/** @type {Event} */ event) =>
+                this.act("go_to_step", i, /** @type {Element} */ (event.currentTarget)),
+            },
+            h("span", {}, one.text),
+          ),
+        ),
+      ),
+    );
     $("history").querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
   }
 
@@ -268,9 +567,23 @@ export class Panel {
     const { cameras } = this.scene;
     const step = Math.max(1, Math.ceil(cameras.length / 48));
     const base = `/api/runs/${encodeURIComponent(this.run.id)}/images`;
-    $("cameras").replaceChildren(...cameras.map((camera, i) => ({ camera, i })).filter(({ i }) => i % step === 0).map(({ camera, i }) =>
-      h("button", { type: "button", "data-tip": camera.name, "aria-label": `View of ${camera.name}`, onclick: () => this.scene.goToCamera(i) },
-        h("img", { loading: "lazy", alt: "", src: `${base}/${i}?max_size=160` }))));
+    $("cameras").replaceChildren(
+      ...cameras
+        .map((camera, i) => ({ camera, i }))
+        .filter(({ i }) => i % step === 0)
+        .map(({ camera, i }) =>
+          h(
+            "button",
+            {
+              type: "button",
+              "data-tip": camera.name,
+              "aria-label": `View of ${camera.name}`,
+              onclick: () => this.scene.goToCamera(i),
+            },
+            h("img", { loading: "lazy", alt: "", src: `${base}/${i}?max_size=160` }),
+          ),
+        ),
+    );
   }
 }
 
@@ -283,8 +596,15 @@ function histogram(row, threshold, low, high) {
     return element;
   };
   const x = (/** @type {number} */ value) => (100 * (value - low)) / (high - low || 1);
-  const svg = make("svg", { viewBox: "0 0 100 40", preserveAspectRatio: "none", class: "histogram", role: "img",
-    "aria-label": `How many Gaussians have which relevancy for ${row.text}`, "data-low": low, "data-high": high });
+  const svg = make("svg", {
+    viewBox: "0 0 100 40",
+    preserveAspectRatio: "none",
+    class: "histogram",
+    role: "img",
+    "aria-label": `How many Gaussians have which relevancy for ${row.text}`,
+    "data-low": low,
+    "data-high": high,
+  });
   const top = Math.max(1, ...row.counts.map((/** @type {number} */ count) => Math.log1p(count)));
   const width = (row.high - row.low) / row.counts.length;
   row.counts.forEach((/** @type {number} */ count, /** @type {number} */ i) => {
@@ -292,10 +612,30 @@ function histogram(row, threshold, low, high) {
     const height = (38 * Math.log1p(count)) / top;
     const inside = start + width > threshold;
     const style = inside && row.color ? `fill: ${cssColor(row.color)}` : "";
-    svg.append(make("rect", { x: x(start), y: 40 - height, width: Math.max(0, x(start + width) - x(start) - 0.4), height, class: inside ? "in" : "", style }));
+    svg.append(
+      make("rect", {
+        x: x(start),
+        y: 40 - height,
+        width: Math.max(0, x(start + width) - x(start) - 0.4),
+        height,
+        class: inside ? "in" : "",
+        style,
+      }),
+    );
   });
-  const line = (/** @type {number} */ value, /** @type {string} */ name) => make("line", { x1: x(value), x2: x(value), y1: 0, y2: 40, class: name });
+  const line = (/** @type {number} */ value, /** @type {string} */ name) =>
+    make("line", { x1: x(value), x2: x(value), y1: 0, y2: 40, class: name });
   if (Number.isFinite(row.suggested)) svg.append(line(row.suggested, "suggested"));
   svg.append(line(threshold, "now"));
-  return h("div", {}, h("p.soft.small", {}, row.text, row.warning ? h("span.warn", {}, ` · ${row.warning.replace(`${row.text}: `, "")}`) : ""), svg);
+  return h(
+    "div",
+    {},
+    h(
+      "p.soft.small",
+      {},
+      row.text,
+      row.warning ? h("span.warn", {}, ` · ${row.warning.replace(`${row.text}: `, "")}`) : "",
+    ),
+    svg,
+  );
 }

@@ -47,7 +47,10 @@ export class SceneRenderer extends EventTarget {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.scene = new THREE.Scene();
     this.spark = new SparkRenderer({
-      renderer: this.renderer, enableLod: false, sortRadial: false, minAlpha: 1 / 255,
+      renderer: this.renderer,
+      enableLod: false,
+      sortRadial: false,
+      minAlpha: 1 / 255,
       onDirty: () => this.invalidate("order"),
     });
     this.scene.add(this.spark);
@@ -69,7 +72,10 @@ export class SceneRenderer extends EventTarget {
   /** @param {string} url Of an SPZ file. @param {(share: number) => void} progress */
   async load(url, progress) {
     const mesh = new SplatMesh({
-      url, fileType: SplatFileType.SPZ, lod: false, raycastable: false,
+      url,
+      fileType: SplatFileType.SPZ,
+      lod: false,
+      raycastable: false,
       onProgress: (event) => progress(event.total ? event.loaded / event.total : 0),
     });
     await mesh.initialized;
@@ -131,7 +137,7 @@ export class SceneRenderer extends EventTarget {
     if (!this.splats || !this.view.placed) return;
     this.busy = true;
     const still = performance.now() - this.changed.when > REST || this.changed.what !== "camera";
-    const known = this.frames > 0;  // the first frame is coarse: it may take long
+    const known = this.frames > 0; // the first frame is coarse: it may take long
     const quick = this.costs.full < VERY_SLOW && !this.preview.ready;
     const full = known && (!this.slow || (still && (quick || this.coarse)));
     const milliseconds = await (this.preview.ready && !full ? this.renderPreview() : this.render(full));
@@ -143,7 +149,7 @@ export class SceneRenderer extends EventTarget {
     else if (this.slow) this.timer = setTimeout(() => this.rest(), LONG_REST);
   }
 
-  /** Adds the outline to a fine frame of a slow renderer, which would otherwise come later; prepares the next colors. */
+  /** Adds the outline to a fine frame of a slow renderer, and prepares the next colors. */
   async rest() {
     const { renderer, scene, splats, view } = this;
     if (this.busy || this.waiting || !splats) return;

@@ -3,7 +3,10 @@ import { $, cssColor, fill, fixed, grouped, h } from "./dom.js";
 import { icon } from "./icons.js";
 
 export class Search {
-  /** @param {(action: string, value?: any, anchor?: Element) => number} act @param {{examples: string[], saved_prompts: string[]}} run */
+  /**
+   * @param {(action: string, value?: any, anchor?: Element) => number} act
+   * @param {{examples: string[], saved_prompts: string[]}} run
+   */
   constructor(act, run) {
     this.act = act;
     this.run = run;
@@ -20,7 +23,10 @@ export class Search {
       this.cancel();
       $("prompts").blur();
     });
-    Object.assign($("ask").dataset, { tip: "Search. Commas separate several prompts, double quotes keep a comma.", keys: "Enter" });
+    Object.assign($("ask").dataset, {
+      tip: "Search. Commas separate several prompts, double quotes keep a comma.",
+      keys: "Enter",
+    });
     Object.assign($("cancel").dataset, { tip: "Stop searching.", keys: "Escape" });
     $("cancel").addEventListener("click", () => this.cancel());
     this.showExamples(true);
@@ -49,7 +55,8 @@ export class Search {
   /** @param {boolean} shown */
   showExamples(shown) {
     const { examples, saved_prompts: saved } = this.run;
-    const pill = (/** @type {string} */ text) => h("button.pill", { type: "button", onclick: () => this.ask(text) }, text);
+    const pill = (/** @type {string} */ text) =>
+      h("button.pill", { type: "button", onclick: () => this.ask(text) }, text);
     const pills = [
       ...(saved.length > 0 ? [h("span.soft.small", {}, "Saved:"), pill(saved.join(", "))] : []),
       ...(examples.length > 0 ? [h("span.soft.small", {}, "Try:"), ...examples.slice(0, 4).map(pill)] : []),
@@ -66,10 +73,23 @@ export class Search {
     this.line = state.line;
     if (state.busy !== undefined) this.setBusy(state.busy);
     this.showExamples(state.prompts.length === 0 && !state.by_hand);
-    const shownTexts = state.prompts.filter((/** @type {any} */ one) => !one.error).map((/** @type {any} */ one) => one.text);
+    const shownTexts = state.prompts
+      .filter((/** @type {any} */ one) => !one.error)
+      .map((/** @type {any} */ one) => one.text);
     const chips = state.prompts.map((/** @type {any} */ one) => this.chip(one, state, shownTexts));
     if (state.by_hand && state.selected > 0) {
-      chips.push(h("li", {}, h("span.chip", {}, h("span.swatch", { style: "background: rgb(255 191 26)" }), h("span", {}, "Selected by hand"))));
+      chips.push(
+        h(
+          "li",
+          {},
+          h(
+            "span.chip",
+            {},
+            h("span.swatch", { style: "background: rgb(255 191 26)" }),
+            h("span", {}, "Selected by hand"),
+          ),
+        ),
+      );
     }
     $("answers").hidden = chips.length === 0;
     fill($("answers"), chips);
@@ -79,19 +99,43 @@ export class Search {
   chip(one, state, texts) {
     if (one.error) {
       const tip = one.error;
-      return h("li", {}, h("span.chip.failed", { "data-tip": tip, tabindex: "0", "aria-label": `${one.text}: ${tip}` }, "⚠ ", one.text, h("small", {}, "not understood")));
+      return h(
+        "li",
+        {},
+        h(
+          "span.chip.failed",
+          { "data-tip": tip, tabindex: "0", "aria-label": `${one.text}: ${tip}` },
+          "⚠ ",
+          one.text,
+          h("small", {}, "not understood"),
+        ),
+      );
     }
     const index = texts.indexOf(one.text);
     const shown = state.shown === index && texts.length > 1;
     const verdict = one.verdict && one.verdict !== "found" ? one.verdict : null;
     const several = texts.length > 1;
-    const tip = `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
+    const tip =
+      `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
       (several ? (shown ? " Press to show all answers." : " Press to show this answer alone.") : "");
     const dim = state.by_hand || (state.shown !== null && !shown && several);
-    return h("li", {}, h(`button.chip${dim ? ".dim" : ""}`, {
-      type: "button", "aria-pressed": String(shown), "data-tip": tip, "data-key": `chip-${one.text}`,
-      onclick: (/** @type {Event} */ event) => several && this.act("show_prompt", shown ? null : index, /** @type {Element} */ (event.currentTarget)),
-    }, h("span.swatch", { style: `background: ${cssColor(one.color ?? [0.5, 0.5, 0.5])}` }), h("span", {}, one.text),
-    h("small.num", {}, verdict ?? fixed(Math.min(1, one.relevancy ?? 0)))));
+    return h(
+      "li",
+      {},
+      h(
+        `button.chip${dim ? ".dim" : ""}`,
+        {
+          type: "button",
+          "aria-pressed": String(shown),
+          "data-tip": tip,
+          "data-key": `chip-${one.text}`,
+          onclick: (/** @type {Event} */ event) =>
+            several && this.act("show_prompt", shown ? null : index, /** @type {Element} */ (event.currentTarget)),
+        },
+        h("span.swatch", { style: `background: ${cssColor(one.color ?? [0.5, 0.5, 0.5])}` }),
+        h("span", {}, one.text),
+        h("small.num", {}, verdict ?? fixed(Math.min(1, one.relevancy ?? 0))),
+      ),
+    );
   }
 }

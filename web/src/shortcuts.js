@@ -42,8 +42,13 @@ export function startShortcuts(shortcuts) {
   ];
   const close = h("button.btn", { type: "button", onclick: () => $("help").close() }, "Close");
   $("help").replaceChildren(
-    h("div.row.spread", {}, h("h2", { id: "help-title" }, "Shortcuts"), close), h("ul.keys", {}, ...rows),
-    h("p.small", {}, h("a", { href: "/assets/licenses.txt", target: "_blank" }, "Licenses of the packages in this page")),
+    h("div.row.spread", {}, h("h2", { id: "help-title" }, "Shortcuts"), close),
+    h("ul.keys", {}, ...rows),
+    h(
+      "p.small",
+      {},
+      h("a", { href: "/assets/licenses.txt", target: "_blank" }, "Licenses of the packages in this page"),
+    ),
   );
   closesOutside($("help"));
 }

@@ -67,7 +67,11 @@ function patched(shader, changes) {
 
 /** @returns {THREE.InstancedBufferGeometry} Triangles around the unit circle; z is the number within the batch. */
 function batchGeometry() {
-  const corners = [[0, 2], [-Math.sqrt(3), -1], [Math.sqrt(3), -1]];
+  const corners = [
+    [0, 2],
+    [-Math.sqrt(3), -1],
+    [Math.sqrt(3), -1],
+  ];
   const position = new Float32Array(9 * BATCH);
   for (let i = 0; i < BATCH; i++) corners.forEach(([x, y], corner) => position.set([x, y, i], 9 * i + 3 * corner));
   const geometry = new THREE.InstancedBufferGeometry();

@@ -8,9 +8,21 @@ import { icon } from "./icons.js";
 /** @type {[Tool, any, string, string, string][]} Name, icon, label, key, hint. */
 export const TOOLS = [
   ["select", "select", "Select", "V", "Click an object to select it. Shift adds, Ctrl or Alt removes."],
-  ["rectangle", "rectangle", "Rectangle", "R", "Drag a rectangle. Shift adds, Ctrl or Alt removes. Right drag moves the view."],
+  [
+    "rectangle",
+    "rectangle",
+    "Rectangle",
+    "R",
+    "Drag a rectangle. Shift adds, Ctrl or Alt removes. Right drag moves the view.",
+  ],
   ["lasso", "lasso", "Lasso", "L", "Draw around what you want. Shift adds, Ctrl or Alt removes."],
-  ["brush", "brush", "Brush", "B", "Paint over what you want. Wheel changes the size, Shift adds, Ctrl or Alt removes."],
+  [
+    "brush",
+    "brush",
+    "Brush",
+    "B",
+    "Paint over what you want. Wheel changes the size, Shift adds, Ctrl or Alt removes.",
+  ],
   ["like", "alike", "More like this", "K", "Click something to find everything similar."],
   ["measure", "measure", "Measure", "M", "Click two points to measure the distance between them."],
 ];
@@ -55,10 +67,22 @@ export class Tools extends EventTarget {
 
   bar() {
     const buttons = TOOLS.map(([tool, name, label, key, hint]) =>
-      h("button.tool", {
-        type: "button", role: "radio", id: `tool-${tool}`, "aria-label": label, "aria-checked": "false",
-        "data-tip": `${label}. ${hint}`, "data-keys": key, "aria-keyshortcuts": key, onclick: () => this.choose(tool),
-      }, icon(name)));
+      h(
+        "button.tool",
+        {
+          type: "button",
+          role: "radio",
+          id: `tool-${tool}`,
+          "aria-label": label,
+          "aria-checked": "false",
+          "data-tip": `${label}. ${hint}`,
+          "data-keys": key,
+          "aria-keyshortcuts": key,
+          onclick: () => this.choose(tool),
+        },
+        icon(name),
+      ),
+    );
     $("tools").replaceChildren(...buttons);
     this.choose("select");
   }
@@ -106,7 +130,8 @@ export class Tools extends EventTarget {
       if (this.drawing && event.pointerId === start.id) {
         if (this.tool === "rectangle") this.points = [this.points[0], this.pointer];
         else this.points.push(this.pointer);
-      } else if (event.buttons === 0 && event.pointerType !== "touch") this.hover(this.view.ray(this.pointer[0], this.pointer[1]));
+      } else if (event.buttons === 0 && event.pointerType !== "touch")
+        this.hover(this.view.ray(this.pointer[0], this.pointer[1]));
       if (this.drawing || this.tool === "brush" || this.tool === "measure") this.draw();
     });
     element.addEventListener("pointerup", (event) => {
@@ -126,13 +151,17 @@ export class Tools extends EventTarget {
       this.hover(null);
       this.draw();
     });
-    element.addEventListener("wheel", (event) => {
-      if (this.tool !== "brush" || event.shiftKey) return;
-      event.preventDefault();
-      event.stopImmediatePropagation();
-      this.radius = Math.min(200, Math.max(4, this.radius * (event.deltaY < 0 ? 1.15 : 1 / 1.15)));
-      this.draw();
-    }, { capture: true, passive: false });
+    element.addEventListener(
+      "wheel",
+      (event) => {
+        if (this.tool !== "brush" || event.shiftKey) return;
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        this.radius = Math.min(200, Math.max(4, this.radius * (event.deltaY < 0 ? 1.15 : 1 / 1.15)));
+        this.draw();
+      },
+      { capture: true, passive: false },
+    );
     element.addEventListener("contextmenu", (event) => event.preventDefault());
     for (const type of ["keydown", "keyup"]) {
       document.addEventListener(type, (event) => {
@@ -156,11 +185,16 @@ export class Tools extends EventTarget {
       /** @type {{position: number[]}} */
       const pending = { position: [] };
       this.ends.push(pending);
-      this.dispatchEvent(Object.assign(new Event("probe"), { ray, found: (/** @type {number[] | null} */ position) => {
-        if (position) pending.position = position;
-        else this.ends = this.ends.filter((end) => end !== pending);
-        this.draw();
-      } }));
+      this.dispatchEvent(
+        Object.assign(new Event("probe"), {
+          ray,
+          found: (/** @type {number[] | null} */ position) => {
+            if (position) pending.position = position;
+            else this.ends = this.ends.filter((end) => end !== pending);
+            this.draw();
+          },
+        }),
+      );
       return;
     }
     this.act("pick", { ...ray, mode: this.tool === "like" ? "like" : modeOf(event) });
@@ -177,8 +211,18 @@ export class Tools extends EventTarget {
     if (tool === "brush") this.act("brush", { points, radius: this.radius, camera, mode });
     else {
       const [[x, y], [u, v]] = [points[0], points[points.length - 1]];
-      const polygon = tool === "rectangle" ? [[x, y], [u, y], [u, v], [x, v]] : points;
-      const spread = Math.max(...[0, 1].map((i) => Math.max(...polygon.map((p) => p[i])) - Math.min(...polygon.map((p) => p[i]))));
+      const polygon =
+        tool === "rectangle"
+          ? [
+              [x, y],
+              [u, y],
+              [u, v],
+              [x, v],
+            ]
+          : points;
+      const spread = Math.max(
+        ...[0, 1].map((i) => Math.max(...polygon.map((p) => p[i])) - Math.min(...polygon.map((p) => p[i]))),
+      );
       if (polygon.length > 2 && spread > CLICK_SLACK) this.act("region", { polygon, camera, mode });
       else this.click(event, points[0]);
     }
@@ -192,12 +236,29 @@ export class Tools extends EventTarget {
     if (this.tool === "brush" && pointer) {
       if (this.drawing) {
         const line = points.map((p) => p.join(",")).join(" ");
-        parts.push(shape("polyline", { points: line, fill: "none", stroke: "rgb(255 255 255 / 35%)", "stroke-width": 2 * this.radius, "stroke-linecap": "round", "stroke-linejoin": "round" }));
+        parts.push(
+          shape("polyline", {
+            points: line,
+            fill: "none",
+            stroke: "rgb(255 255 255 / 35%)",
+            "stroke-width": 2 * this.radius,
+            "stroke-linecap": "round",
+            "stroke-linejoin": "round",
+          }),
+        );
       }
       parts.push(shape("circle", { class: "cursor", cx: pointer[0], cy: pointer[1], r: this.radius }));
     } else if (this.drawing && this.tool === "rectangle" && points.length > 1) {
       const [[x, y], [u, v]] = points;
-      parts.push(shape("rect", { class: "shape", x: Math.min(x, u), y: Math.min(y, v), width: Math.abs(u - x), height: Math.abs(v - y) }));
+      parts.push(
+        shape("rect", {
+          class: "shape",
+          x: Math.min(x, u),
+          y: Math.min(y, v),
+          width: Math.abs(u - x),
+          height: Math.abs(v - y),
+        }),
+      );
     } else if (this.drawing && this.tool === "lasso") {
       parts.push(shape("polygon", { class: "shape", points: points.map((p) => p.join(",")).join(" ") }));
     } else if (this.tool === "measure") parts.push(...this.ruler());
@@ -205,7 +266,9 @@ export class Tools extends EventTarget {
   }
 
   ruler() {
-    const known = this.ends.filter((end) => end.position.length === 3).map((end) => ({ ...this.view.project(end.position), end }));
+    const known = this.ends
+      .filter((end) => end.position.length === 3)
+      .map((end) => ({ ...this.view.project(end.position), end }));
     const parts = [];
     const [from, to] = known;
     if (from && to && from.visible && to.visible) {
@@ -215,6 +278,11 @@ export class Tools extends EventTarget {
       parts.push(shape("text", { x: (from.x + to.x) / 2, y: (from.y + to.y) / 2 - 9 }, label));
       $("hint").textContent = `Distance: ${label}. Click again to measure another one.`;
     }
-    return [...parts, ...known.filter((end) => end.visible).map((end) => shape("circle", { class: "dot", cx: end.x, cy: end.y, r: 4.5 }))];
+    return [
+      ...parts,
+      ...known
+        .filter((end) => end.visible)
+        .map((end) => shape("circle", { class: "dot", cx: end.x, cy: end.y, r: 4.5 })),
+    ];
   }
 }

@@ -59,7 +59,11 @@ export class View3D extends EventTarget {
     const m = this.camera.matrixWorldInverse.clone().premultiply(new THREE.Matrix4().makeScale(1, -1, -1));
     const rows = m.transpose().toArray();
     return {
-      K: [[focal, 0, this.width / 2], [0, focal, this.height / 2], [0, 0, 1]],
+      K: [
+        [focal, 0, this.width / 2],
+        [0, focal, this.height / 2],
+        [0, 0, 1],
+      ],
       world_to_camera: [0, 4, 8, 12].map((i) => rows.slice(i, i + 4)),
       width: Math.round(this.width),
       height: Math.round(this.height),
@@ -135,5 +139,11 @@ export class View3D extends EventTarget {
   project(point) {
     const p = new THREE.Vector3().fromArray(point).project(this.camera);
     return { x: ((p.x + 1) / 2) * this.width, y: ((1 - p.y) / 2) * this.height, visible: p.z < 1 };
+  }
+
+  /** @param {number[]} point @returns {boolean} True if a point lies within the picture. */
+  sees(point) {
+    const { x, y, visible } = this.project(point);
+    return visible && x >= 0 && y >= 0 && x <= this.width && y <= this.height;
   }
 }

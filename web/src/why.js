@@ -10,12 +10,23 @@ export function showExplanation(message, closed) {
     closed();
   };
   const group = (/** @type {string} */ title, /** @type {any[]} */ entries, /** @type {string} */ of) =>
-    entries.length > 0 && h("div", {}, h("h3", {}, title), h("div.images", {}, ...entries.map((entry) => figure(entry, of))));
+    entries.length > 0 &&
+    h("div", {}, h("h3", {}, title), h("div.images", {}, ...entries.map((entry) => figure(entry, of))));
   $("why").replaceChildren(
-    h("div.row.spread", {}, h("p", {}, h("b", {}, "Why? "), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
-      button("Close", "clear", "Close", "Escape", close, { bare: true })),
-    h("div.groups", {},
-      ...[group("Strongest support", message.support ?? [], "agreement"), group("Most disagreement", message.disagreement ?? [], "disagreement")].filter(Boolean)),
+    h(
+      "div.row.spread",
+      {},
+      h("p", {}, h("b", {}, "Why? "), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
+      button("Close", "clear", "Close", "Escape", close, { bare: true }),
+    ),
+    h(
+      "div.groups",
+      {},
+      ...[
+        group("Strongest support", message.support ?? [], "agreement"),
+        group("Most disagreement", message.disagreement ?? [], "disagreement"),
+      ].filter(Boolean),
+    ),
   );
   $("why").hidden = false;
   closed();
@@ -25,13 +36,30 @@ export function showExplanation(message, closed) {
 function figure(entry, of) {
   const label = `${entry.name}, ${Math.round(100 * entry.share)} % of the weight`;
   const enlarge = () => {
-    const dialog = h("dialog", { "aria-label": entry.name }, h("img", { src: entry.url, alt: label }), h("p.soft", {}, label));
+    const dialog = h(
+      "dialog",
+      { "aria-label": entry.name },
+      h("img", { src: entry.url, alt: label }),
+      h("p.soft", {}, label),
+    );
     document.body.append(dialog);
     closesOutside(dialog);
     dialog.addEventListener("close", () => dialog.remove());
     dialog.showModal();
   };
-  return h("figure", {},
-    entry.url ? h("img", { src: entry.url, alt: `Image ${label}`, tabindex: "0", role: "button", onclick: enlarge, onkeydown: (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && enlarge() }) : h("p.soft", {}, "No image"),
-    h("figcaption", {}, label, Number.isFinite(entry[of]) ? `, ${of} ${entry[of].toFixed(2)}` : ""));
+  return h(
+    "figure",
+    {},
+    entry.url
+      ? h("img", {
+          src: entry.url,
+          alt: `Image ${label}`,
+          tabindex: "0",
+          role: "button",
+          onclick: enlarge,
+          onkeydown: (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && enlarge(),
+        })
+      : h("p.soft", {}, "No image"),
+    h("figcaption", {}, label, Number.isFinite(entry[of]) ? `, ${of} ${entry[of].toFixed(2)}` : ""),
+  );
 }
