@@ -175,6 +175,7 @@ def _assumptions(
         texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
     else:
         texts.append(f"All {len(frames)} images are lifted; see --test-every and --eval-images.")
+    texts += cameras.remarks
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})

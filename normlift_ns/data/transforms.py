@@ -18,17 +18,20 @@ import torch
 from jaxtyping import Float
 
 from normlift_ns.data.frames import (
+    GIVE_IMAGES,
     PERSPECTIVE_MODELS,
     Frame,
     Intrinsics,
     WorldTransform,
     find_images,
     find_masks,
+    plain_name,
+    possible_paths,
     read_image_header,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
-from normlift_ns.io.guard import read_file
+from normlift_ns.io.guard import check_files_distinct, read_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
@@ -201,6 +204,8 @@ class CameraFile(NamedTuple):
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
     applied_scale: float = 1.0
     """Scale of `applied_transform`."""
+    remarks: tuple[str, ...] = ()
+    """Messages about the choices that the file left open, in whole sentences."""
 
 
 def read_transforms(
@@ -209,7 +214,7 @@ def read_transforms(
     masks: Path | None = None,
     *,
     base: Path | None = None,
-    advice: str = "give the folder of the images with --images",
+    advice: str = GIVE_IMAGES,
 ) -> CameraFile:
     """Read the frames of a transforms.json; images are located, but only opened if the file does not give their size.
 
@@ -249,18 +254,18 @@ def read_transforms(
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
     """Return whether the file excludes each frame from the training. Like nerfstudio, reject lists of other files."""
-    files = [root / frame.file_path for frame in entries.frames]
+    files = [root / plain_name(frame.file_path) for frame in entries.frames]
     for split, names in entries.lists.items():
-        unknown = [name for name in names or () if root / name not in files]
+        unknown = [name for name in names or () if root / plain_name(name) not in files]
         if unknown:
             raise InputError(
                 f"{path}: its {split}_filenames list {unknown[0]}, which is not the file_path of any frame. Expected "
                 "the same names in both."
             )
     if entries.train_filenames is not None:
-        trained = {root / name for name in entries.train_filenames}
+        trained = {root / plain_name(name) for name in entries.train_filenames}
         return [file not in trained for file in files]
-    excluded = {root / name for name in (*(entries.val_filenames or ()), *(entries.test_filenames or ()))}
+    excluded = {root / plain_name(name) for name in (*(entries.val_filenames or ()), *(entries.test_filenames or ()))}
     return [file in excluded for file in files]
 
 
@@ -289,15 +294,24 @@ def _masks(
             f"{len(missing)} of the {len(names)} masks that {path} lists are missing; the first is "
             f"{root / missing[0]}. Put them back, or next to the images if those were moved."
         )
-    return [file.absolute() for file in files if file is not None]
+    found = [file.absolute() for file in files if file is not None]
+    owned = [(frame.file_path, file) for frame, file in zip(entries.frames, found) if _is_named_like(file, frame)]
+    check_files_distinct(owned, "mask", f"in the mask_path of {path}")
+    return found
 
 
 def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
     """Find a mask at its path in the file, or in a folder of the same name inside or next to the image folder."""
-    own = root / name
-    tail = Path(own.parent.name, own.name)
+    own, *ends = possible_paths(root, name)
+    tail = Path(*Path(plain_name(str(own))).parts[-2:])
     moved = () if images is None else (images / relative_name(own, root), images / tail, images.parent / tail)
-    return next((file for file in (own, *moved) if file.is_file()), None)
+    return next((file for file in (own, *ends, *moved) if file.is_file()), None)
+
+
+def _is_named_like(mask: Path, frame: FrameEntry) -> bool:
+    """Return whether a mask has the name of its image, so that it cannot be the mask of a whole camera."""
+    image = Path(plain_name(frame.file_path))
+    return mask.stem in (image.name, image.stem)
 
 
 def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:

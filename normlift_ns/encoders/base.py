@@ -11,7 +11,6 @@ An image may be segmented at several levels. Evidence is rasterized once, on the
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,6 +30,7 @@ from normlift_ns.core.arguments import as_tensor
 from normlift_ns.core.device import AdaptiveBatches, prefetch_map
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder, check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
+from normlift_ns.io.guard import check_files_distinct
 from normlift_ns.segmentation.regions import resample_nearest
 
 
@@ -275,25 +275,6 @@ def check_image(image: Tensor, name: str) -> None:
         raise InputError(
             f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
         )
-
-
-def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, remedy: str) -> None:
-    """Check that no two images use the same file, with symbolic links resolved.
-
-    Args:
-        files: Pairs of an image name and one of its files.
-        description: Kind of file, for the message.
-        remedy: How to give each image its own file, for the message.
-    Raises:
-        ValueError: If two images share a file.
-    """
-    owner: dict[str, str] = {}
-    for name, file in files:
-        other = owner.setdefault(os.path.realpath(file), name)
-        if other != name:
-            raise InputError(
-                f"images {other} and {name} would share the {description} {file}; give each its own file, {remedy}"
-            )
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
