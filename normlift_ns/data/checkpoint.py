@@ -164,8 +164,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     missing = [_PREFIX + name for name in GAUSSIAN_PARAMETERS if _PREFIX + name not in model]
     if missing:
         raise InputError(
-            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. "
-            "Train the capture with: ns-train splatfacto --data ..."
+            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. Give another checkpoint with "
+            "--load-step, or lift a PLY file of the scene with --load-ply."
         )
     splat = splat_from_parameters({name: model[_PREFIX + name] for name in GAUSSIAN_PARAMETERS}, path)
     return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()}, splat)

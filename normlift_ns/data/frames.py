@@ -107,7 +107,7 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
         (
             [header.mode == "CMYK" for header in headers],
             "are in CMYK, which training reads as different colors",
-            "Convert them to RGB and train again",
+            "Convert them to RGB",
         ),
         ([header.multi_frame for header in headers], "hold several images", "Only the first image of each is used"),
     )
