@@ -33,13 +33,32 @@ def test_frames_stand_in_the_order_of_their_files(tmp_path: Path) -> None:
     assert found.held_out == frozenset()
 
 
-def test_what_stands_in_the_file_counts_before_what_stands_in_a_frame(tmp_path: Path) -> None:
-    path = capture(tmp_path, {"fl_x": 50.0, "k1": 0.1}, fl_x=70.0, fl_y=71.0, k1=0.5, k2=0.6, w=40, h=30)
-    camera = read_transforms(path).frames[0].intrinsics
+def test_what_stands_in_the_file_and_in_a_frame_must_agree(tmp_path: Path) -> None:
+    own = {"fl_x": 50.001, "fl_y": 71.0, "k1": 0.5, "k2": 0.6, "w": 40, "h": 30}
+    camera = read_transforms(capture(tmp_path, {"fl_x": 50.0, "k1": 0.5, "k2": 0.6}, **own)).frames[0].intrinsics
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 71, 20, 15)
-    assert camera.distortion == (0.1, 0, 0, 0, 0)  # any distortion in the file replaces that of the frames
+    assert camera.distortion == (0.5, 0.6, 0, 0, 0)
+    angle = 2 * math.atan(20 / 70)
+    for shared, frame, places in (
+        ({"fl_x": 50.0}, {"fl_x": 70.0}, (".fl_x", ".frames[].fl_x")),
+        ({"fl_x": 50.0}, {"camera_angle_x": angle}, (".fl_x", ".frames[].camera_angle_x")),
+        ({"fl_x": 50.0, "camera_angle_x": angle}, {}, (".fl_x", ".camera_angle_x")),
+        ({"cx": 20.0}, {"cx": 21.0}, (".cx", ".frames[].cx")),
+        ({"k1": 0.1, "k2": 0.2}, {"k1": 0.1}, (".k1, .k2", ".frames[].k1")),
+        ({"w": 40, "h": 30}, {"w": 80, "h": 60}, (".w, .h", ".frames[].w, .frames[].h")),
+        ({"camera_model": "OPENCV"}, {"camera_model": "PINHOLE"}, (".camera_model", ".frames[].camera_model")),
+    ):
+        path = capture(tmp_path, {"fl_x": 50.0, **shared}, **frame)
+        with pytest.raises(InputError, match=r"two ways: .*images/b\.png") as caught:
+            read_transforms(path)
+        for place in places:
+            assert f"jq 'del({place})' transforms.json > new.json" in str(caught.value), place
     path = capture(tmp_path, {}, distortion_params=[0.1, 0.2, 0.3, 0.0, 0.5, 0.6], fl_x=1.0)
     assert read_transforms(path).frames[0].intrinsics.distortion == (0.1, 0.2, 0.3, 0.5, 0.6)
+    path = capture(tmp_path, {"camera_model": "full_opencv", "k3": 0.1, "k6": 0}, fl_x=1.0)
+    assert read_transforms(path).frames[0].intrinsics.k3 == 0.1
+    with pytest.raises(InputError, match=r"k6 = 0\.2"):
+        read_transforms(capture(tmp_path, {"k6": 0.2}, fl_x=1.0))
 
 
 def test_blenders_scenes_have_an_angle_and_names_without_suffix(tmp_path: Path) -> None:
