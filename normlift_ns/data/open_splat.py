@@ -158,7 +158,7 @@ def _assumptions(
     path: Path, options: SplatOptions, file: SplatFile, held_out: frozenset[str], cameras: CameraFile
 ) -> list[str]:
     """Return messages about settings that the files do not specify."""
-    texts, mode, frames = [], file.rasterize_mode, cameras.frames
+    texts, mode, frames = list(file.remarks), file.rasterize_mode, cameras.frames
     if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
         texts.append(
             f"{path.name} has SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} is used instead."
