@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -212,6 +212,7 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
     remarks: list[str] = []
     model = find_colmap_model(folder, remarks.append)
     cameras, registered = read_colmap_model(model)
+    _check_formats(cameras, registered, model)
     registered.sort(key=lambda image: image.name)  # as training tools sort them
     intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (images or folder / "images").absolute()
@@ -226,6 +227,34 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         for image, file, mask in zip(registered, files, mask_files)
     ]
     return CameraFile(frames, frozenset(), model, folder, base, remarks=tuple(remarks))
+
+
+def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage], model: Path) -> None:
+    """Raise if a reconstruction in both formats has different cameras: programs differ in which of them they read."""
+    if not all((model / f"{name}.{suffix}").is_file() for name in ("cameras", "images") for suffix in ("bin", "txt")):
+        return
+    others, other_images = read_colmap_model(model, text_first=True)
+
+    def numbers(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> dict[str, list[float]]:
+        found = {}
+        for image in images:
+            camera, turned = cameras[image.camera_id], np.outer(image.rotation, image.rotation)  # q is -q
+            found[image.name] = [camera.width, camera.height, *camera.params, *turned.ravel(), *image.translation]
+        return found
+
+    first, second = numbers(cameras, images), numbers(others, other_images)
+    differ = [
+        name
+        for name in {**first, **second}
+        if not (name in first and name in second and len(first[name]) == len(second[name]))
+        or not np.allclose(first[name], second[name], rtol=1e-4, atol=1e-4)
+    ]
+    if len(differ) > 0:
+        raise InputError(
+            f"{model} can be read in two ways: the camera of {differ[0]} in its .bin files, which COLMAP and gsplat "
+            f"read, is not that in its .txt files, which nerfstudio reads ({len(differ)} of {len(first)} images). Keep "
+            f"those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
+        )
 
 
 def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:

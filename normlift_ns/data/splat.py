@@ -221,7 +221,7 @@ def read_ply(path: Path) -> SplatFile:
             drawn. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
+        raise FileNotFoundError(f"There is no PLY file at {path}. Expected the file of a trained splat.")
     check_ply_header(path)
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)

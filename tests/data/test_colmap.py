@@ -1,15 +1,18 @@
 import os
+import shutil
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.colmap import (
     colmap_intrinsics,
     colmap_pose,
     find_colmap_model,
+    read_colmap,
     read_colmap_model,
     read_colmap_points,
 )
@@ -80,6 +83,23 @@ def test_the_largest_of_several_reconstructions_is_read(tmp_path: Path) -> None:
     (tmp_path / "p" / "sparse" / "1" / "images.txt").write_text("damaged")
     assert find_colmap_model(tmp_path / "p").name == "10"
     assert len(said) == 2
+
+
+def test_two_formats_must_agree(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(5):
+        Image.new("RGB", (4, 4)).save(tmp_path / "images" / f"photo {i}.jpg")
+    folder = write_colmap(tmp_path, frames()) / "sparse" / "0"
+    text = write_colmap(tmp_path / "text", frames(), binary=False) / "sparse" / "0"
+    for name in ("cameras.txt", "images.txt"):
+        shutil.copy(text / name, folder)
+    assert len(read_colmap(tmp_path, None, None, advice="").frames) == 5
+    for name, old, new in (("cameras.txt", "500.5", "600.5"), ("images.txt", "photo 3", "photo 7")):
+        whole = (folder / name).read_text()
+        (folder / name).write_text(whole.replace(old, new))
+        with pytest.raises(InputError, match=r"two ways: .* rm .*\*\.txt, or rm .*\*\.bin"):
+            read_colmap(tmp_path, None, None, advice="")
+        (folder / name).write_text(whole)
 
 
 def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
