@@ -230,8 +230,7 @@ def read_ply(path: Path) -> SplatFile:
     _check_properties(path, vertex)
     rest = _rest_names(path, {item.name for item in vertex.properties})
     splat, mode = _read_columns(path, vertex.data, rest), _mode([*data.comments, *vertex.comments])
-    known = {*(name for group in _COLUMNS.values() for name in group), *rest, *_UNUSED, _FILTER}
-    remarks = check_extra_names([item.name for item in vertex.properties if item.name not in known], path)
+    remarks = _remarks(path, vertex, rest, _mode_names([*data.comments, *vertex.comments]))
     if any(item.name == _FILTER for item in vertex.properties):
         widths = torch.from_numpy(np.ascontiguousarray(vertex.data[_FILTER]).astype(np.float64))
         splat, mode = _apply_filter(splat, widths, path), mode or "antialiased"
@@ -243,6 +242,16 @@ def read_ply(path: Path) -> SplatFile:
     return SplatFile(splat, mode, remarks=remarks)
 
 
+def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) -> tuple[str, ...]:
+    """Return messages about properties and rasterize modes that are not known; raise as in `check_extra_names`."""
+    known = {*(name for group in _COLUMNS.values() for name in group), *rest, *_UNUSED, _FILTER}
+    remarks = check_extra_names([item.name for item in vertex.properties if item.name not in known], path)
+    unknown = [name for name in modes if name.lower() not in _MODES]
+    if len(unknown) > 0:
+        remarks += (f"{path.name} has SplatRenderMode {unknown[0][:40]}, which is unknown; see --rasterize-mode.",)
+    return remarks
+
+
 def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Path) -> SplatParameters:
     """Return the Gaussians after convolution with isotropic ones of these standard deviations, as Mip-Splatting draws
     them: opacities fall as their volumes grow."""
@@ -250,7 +259,8 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
         raise InputError(f"{path}: filter_3D holds negative numbers, NaN or infinity. Export the scene again.")
     before = splat.scales.double()
     scales = (before.mul(2).exp() + widths[:, None].square()).log() / 2
-    shrunk = splat.opacities.double().sigmoid() * (before - scales).sum(dim=1, keepdim=True).exp()
+    growth = (before - scales).nan_to_num(nan=0.0).sum(dim=1, keepdim=True)  # NaN: a flat Gaussian without a filter
+    shrunk = splat.opacities.double().sigmoid() * growth.exp()
     return replace(splat, scales=scales.float(), opacities=shrunk.logit().float())
 
 
@@ -392,8 +402,9 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 def _mode(comments: list[str]) -> RasterizeMode | None:
     """Return the value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
-    for comment in comments:
-        key, _, value = comment.partition(":")
-        if key.strip().lower() == "splatrendermode":
-            return _MODES.get(value.strip().lower())
-    return None
+    return next((_MODES.get(value.lower()) for value in _mode_names(comments)), None)
+
+
+def _mode_names(comments: list[str]) -> list[str]:
+    pairs = [comment.partition(":") for comment in comments]
+    return [value.strip() for key, _, value in pairs if key.strip().lower() == "splatrendermode"]

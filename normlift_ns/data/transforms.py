@@ -282,9 +282,16 @@ def _masks(
 ) -> Sequence[Path] | Sequence[None]:
     if masks is not None:
         return find_masks([frame.file_path for frame in entries.frames], masks)
-    names = [frame.mask_path for frame in entries.frames if frame.mask_path is not None]
-    if len(names) == 0:
+    if all(frame.mask_path is None for frame in entries.frames):
         return [None] * len(entries.frames)
+    found = _listed_masks(entries, root, images, path)
+    owned = [(frame.file_path, file) for frame, file in zip(entries.frames, found) if _is_named_like(file, frame)]
+    check_files_distinct(owned, "mask", f"in the mask_path of {path}")
+    return found
+
+
+def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, path: Path) -> list[Path]:
+    names = [frame.mask_path for frame in entries.frames if frame.mask_path is not None]
     if len(names) < len(entries.frames):
         unmasked = next(frame.file_path for frame in entries.frames if frame.mask_path is None)
         raise InputError(
@@ -297,10 +304,7 @@ def _masks(
             f"{len(missing)} of the {len(names)} masks that {path} lists are missing; the first is "
             f"{root / missing[0]}. Put them back, or next to the images if those were moved."
         )
-    found = [file.absolute() for file in files if file is not None]
-    owned = [(frame.file_path, file) for frame, file in zip(entries.frames, found) if _is_named_like(file, frame)]
-    check_files_distinct(owned, "mask", f"in the mask_path of {path}")
-    return found
+    return [file.absolute() for file in files if file is not None]
 
 
 def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:

@@ -50,6 +50,7 @@ def test_the_comment_says_how_it_was_rasterized(tmp_path: Path) -> None:
     ):
         path = write_ply(tmp_path / "a.ply", ply_columns(random_splat(5, 0)), comments=["first", comment])
         assert read_ply(path).rasterize_mode == mode, comment
+        assert len(read_ply(path).remarks) == ("odd" in comment)
 
 
 @pytest.mark.parametrize("text", [False, True])

@@ -240,6 +240,11 @@ def test_lists_of_a_project_without_test_images(moved: Path) -> None:
         scene = opened(moved)
         assert (sorted(scene.train.names), sorted(scene.held_out.names)) == expected
         (scene_of(moved) / f"{name}_list.txt").unlink()
+    model, folder = scene_of(moved) / "sparse" / "0", scene_of(moved) / "images"
+    (model / "images.bin").write_bytes((model / "images.bin").read_bytes().replace(b"00", b"a\\00"))
+    shutil.copytree(folder, folder / "a")
+    (scene_of(moved) / "train_list.txt").unlink()
+    assert sum(name.startswith("images/a/00") for name in opened(moved).train.names) >= 8  # names of Windows
 
 
 @pytest.mark.parametrize("start", ["C:\\scene\\", "/home/me/scene/"])

@@ -410,32 +410,46 @@ def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedData
     path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
     folder, meta = path.parent, _entries(path, parser.data)
     _check_transforms(meta, path, parser)
-    first = _locate(folder / plain_name(meta.frames[0].file_path), folder)
-    factor = _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
+    factor = _transforms_factor(folder, meta, parser)
 
     def resolve(name: str, prefix: str = "images_") -> Path:
-        name = plain_name(name)
-        return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
+        file = _listed(folder, name)
+        return folder / f"{prefix}{factor}" / file.name if factor > 1 else file
 
     order = np.argsort([resolve(frame.file_path) for frame in meta.frames])  # type: ignore[arg-type]
     frames = [meta.frames[i] for i in order]
     files = [resolve(frame.file_path) for frame in frames]
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
-    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
-    split_indices = split_files(files, resolved, parser)
+    lists = {split: names if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
+    split_indices = split_files(files, lists, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
-    files, masks = ([_locate(file, folder) for file in group] for group in (files, masks))
-    remedy = f"in the folders that {path} lists"
-    check_files_distinct(zip((frame.file_path for frame in frames), files), "file", remedy)
-    if factor > 1:
-        check_files_distinct(zip((frame.mask_path or "" for frame in frames), masks), "mask", remedy)
+    files, masks = [_locate(file, folder) for file in files], [_locate(mask, folder) for mask in masks]
+    _check_distinct(frames, files, masks, path)
     split = DatasetSplit(
         files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses([_row(meta, frame) for frame in frames])
     )
     train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
     transform = compose_applied_transform(transform, meta.applied_rows(parser.data))
     return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
+
+
+def _transforms_factor(folder: Path, meta: TransformsEntries, parser: config_classes.NerfstudioDataParserConfig) -> int:
+    first = _locate(_listed(folder, meta.frames[0].file_path), folder)
+    return _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
+
+
+def _check_distinct(frames: Sequence[FrameEntry], files: Sequence[Path], masks: Sequence[Path], path: Path) -> None:
+    """Raise if two names of images or masks lead to one file, for example in a folder of smaller copies."""
+    remedy = f"in the folders that {path} lists"
+    check_files_distinct(zip((frame.file_path for frame in frames), files), "file", remedy)
+    if any(mask.parent != (path.parent / (frame.mask_path or "")).parent for frame, mask in zip(frames, masks)):
+        check_files_distinct(zip((frame.mask_path or "" for frame in frames), masks), "mask", remedy)
+
+
+def _listed(folder: Path, name: str) -> Path:
+    """Return the path of a file in a folder by a name that may have been written on Windows."""
+    return folder / (name if (folder / name).exists() else plain_name(name))
 
 
 def _locate(file: Path, folder: Path) -> Path:
@@ -505,7 +519,7 @@ def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDatase
         raise FileNotFoundError(f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}.")
     cameras, images = read_colmap_model(model, text_first=True)
     images.sort(key=lambda image: image.image_id)
-    full_size = [images_dir / image.name for image in images]
+    full_size = [_listed(images_dir, image.name) for image in images]
     _check_files(full_size, model)
     factor = _downscale_factor(full_size[0], parser)
     files = _downscaled(full_size, images_dir, factor)
@@ -574,7 +588,7 @@ def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]
         path = parser.data / f"{name}_list.txt"
         if lists.get(split) is not None or (name == "val" and lists["train"] is None):
             continue  # nerfstudio reads val_list.txt, but looks for validation_list.txt
-        lists[split] = [folder / name for name in read_text(path).splitlines()] if path.is_file() else None
+        lists[split] = [_listed(folder, name) for name in read_text(path).splitlines()] if path.is_file() else None
     return lists
 
 
