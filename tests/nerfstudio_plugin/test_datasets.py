@@ -308,3 +308,20 @@ def test_damage_of_json_is_a_message(copied: Path) -> None:
         whole = file.read_bytes()
         fuzz(6, hostile_json(json.loads(whole)), file, load)
         file.write_bytes(whole)
+
+
+def test_smaller_copies_of_images_of_one_name_are_refused(copied: Path) -> None:
+    """nerfstudio looks for all of them in images_2, without their folders."""
+    folder = scene_of(copied)
+    path, config = folder / "transforms.json", copied.read_text()
+    whole = json.loads(path.read_text())
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+        shutil.copy(folder / "images" / "000.jpg", folder / side / "000.jpg")
+    shutil.copytree(folder / "images", folder / "images_2")
+    for i, side in enumerate(("left", "right")):
+        whole["frames"][i]["file_path"] = f"{side}/000.jpg"
+    path.write_text(json.dumps(whole))
+    copied.write_text(config.replace("downscale_factor: null", "downscale_factor: 2"))
+    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg would share the file .*images_2/000\.jpg"):
+        opened(copied)

@@ -280,9 +280,9 @@ class ConfigLoader(yaml.SafeLoader):
         self.unknown: list[tuple[str, str, Any]] = []
         """Class, field and value."""
 
-    def pass_over(self, cls: type, values: dict[str, Any]) -> None:
-        """Record fields that a class does not have."""
-        self.unknown += [(cls.__name__, name, value) for name, value in values.items()]
+    def pass_over(self, cls: type, known: dict[str, Any], values: dict[str, Any]) -> None:
+        """Record the values whose fields a class does not know."""
+        self.unknown += [(cls.__name__, name, value) for name, value in values.items() if name not in known]
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Reject merge keys (`<<`). Configs do not use them, and a few nested ones would fill the memory."""
@@ -319,7 +319,7 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # translates the field names of version 0.1
         values = dict(vars(config))
-    loader.pass_over(cls, {key: value for key, value in values.items() if key not in known})
+    loader.pass_over(cls, known, values)
     vars(config).clear()
     for key, field in known.items():
         if key in values:

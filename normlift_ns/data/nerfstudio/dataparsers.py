@@ -424,8 +424,7 @@ def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedData
     split_indices = split_files(files, lists, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
-    files, masks = [_locate(file, folder) for file in files], [_locate(mask, folder) for mask in masks]
-    _check_distinct(frames, files, masks, path)
+    files, masks = _locate_all(frames, files, masks, path, are_copies=factor > 1)
     split = DatasetSplit(
         files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses([_row(meta, frame) for frame in frames])
     )
@@ -439,12 +438,16 @@ def _transforms_factor(folder: Path, meta: TransformsEntries, parser: config_cla
     return _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
 
 
-def _check_distinct(frames: Sequence[FrameEntry], files: Sequence[Path], masks: Sequence[Path], path: Path) -> None:
-    """Raise if two names of images or masks lead to one file, for example in a folder of smaller copies."""
+def _locate_all(
+    frames: Sequence[FrameEntry], files: Sequence[Path], masks: Sequence[Path], path: Path, *, are_copies: bool
+) -> tuple[list[Path], list[Path]]:
+    """Return the images and masks as `_locate` does; raise if two names lead to one image, or to one copy of a mask."""
+    found = [[_locate(file, path.parent) for file in group] for group in (files, masks)]
     remedy = f"in the folders that {path} lists"
-    check_files_distinct(zip((frame.file_path for frame in frames), files), "file", remedy)
-    if any(mask.parent != (path.parent / (frame.mask_path or "")).parent for frame, mask in zip(frames, masks)):
-        check_files_distinct(zip((frame.mask_path or "" for frame in frames), masks), "mask", remedy)
+    check_files_distinct(zip((frame.file_path for frame in frames), found[0]), "file", remedy)
+    if are_copies:
+        check_files_distinct(zip((frame.mask_path or "" for frame in frames), found[1]), "mask", remedy)
+    return found[0], found[1]
 
 
 def _listed(folder: Path, name: str) -> Path:
