@@ -100,8 +100,9 @@ def lift_run(
         config_or_scene: config.yml of the trained run, or a scene from `open_scene` or `open_splat`.
         source: which 2D features to compute from the images. If None, use the defaults of ns-normlift.
         features: your own features, instead of `source`. A training image has a label map [H, W] and vectors [R, D].
-            The label map has the size of the undistorted image after `lift_downscale`. Its values are regions 0..R-1,
-            or -1 for no region. Pass one pair per image, or a dictionary by image name, which may omit images.
+            The label map has the size of the undistorted image, before or after `lift_downscale`. Its values are
+            regions 0..R-1, or -1 for no region. Pass one pair per image, or a dictionary by image name, which may
+            omit images.
         texts: prompts of your own features, with their vectors [D]. The run stores them and can be queried with them.
         lift: options of the lift.
         queries: prompts to store in the run; ns-render and ns-viewer show their relevancy.

@@ -8,7 +8,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
@@ -23,7 +23,7 @@ from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
-from normlift_ns.encoders.base import FeatureSource, RegionFeatures, iterate_view_features
+from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
 from normlift_ns.errors import InputError
@@ -127,7 +127,8 @@ class EvidenceCollection:
 
     @cached_property
     def _cached_source(self) -> FeatureSource:
-        return cached(self.source, self.cache) if self.options.reuse_evidence else self.source
+        source = cached(self.source, self.cache) if self.options.reuse_evidence else self.source
+        return downscaled_source(source, self.options.lift_downscale)
 
     def collect(self, stages: StageTimer, wait_for_kernels: Callable[[], None]) -> ViewObservations:
         """Collect evidence, features and levels from all views.
@@ -232,7 +233,7 @@ def observe_views(
         ValueError, FileNotFoundError: raised by `FeatureSource.view` and `check_undistorted`. Also if an image, a mask
             or a label map differs in size from its camera.
     """
-    waiting: deque[View] = deque()
+    source, waiting = downscaled_source(source, downscale), deque[View]()
 
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
@@ -259,6 +260,17 @@ def observe_views(
         block.features.append(result.features)
         on_view(view)
     return block
+
+
+def downscaled_source(source: Any, divisor: int) -> Any:
+    """Return a feature source whose label maps may have the size of images before they were downscaled."""
+    if isinstance(source, LabelFiles | PrecomputedFeatures) and source.divisor != divisor:
+        return replace(source, divisor=divisor)
+    for name in {RegionFeatures: ("regions",), CachedRegions: ("inner",)}.get(type(source), ()):
+        part = getattr(source, name)
+        if (other := downscaled_source(part, divisor)) is not part:
+            return replace(source, **{name: other})
+    return source
 
 
 def _check_sizes(view: View) -> None:

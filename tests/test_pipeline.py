@@ -19,7 +19,7 @@ import normlift_ns as nl
 from normlift_ns.core.consensus import consensus
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
-from normlift_ns.encoders.base import FeatureSource, RegionFeatures, ViewFeatures
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures, ViewFeatures, precomputed_features
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.evaluation.lerf import run_lerf
@@ -30,7 +30,7 @@ from normlift_ns.evidence_collection import FeatureExport, RasterConfig
 from normlift_ns.pipeline import lift_scene
 from normlift_ns.progress import lift_cost
 from normlift_ns.rendering.figures import training_cameras, unique_file_names
-from normlift_ns.segmentation.regions import LabelFiles
+from normlift_ns.segmentation.regions import LabelFiles, resample_nearest
 from tests.random_scenes import Photographs, generator, made_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
@@ -170,6 +170,27 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
     mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
     with pytest.raises(nl.InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera is \(18, 24\)"):
         lifted(files(tmp_path / "maps", FULL), cache, scene(mask=mask))
+
+
+def test_maps_of_whole_images_are_downscaled_with_them(tmp_path: Path) -> None:
+    maps = torch.randint(0, 4, (HEIGHT, WIDTH), generator=generator(0)).numpy()
+    small = resample_nearest(maps[None], HEIGHT // 2, WIDTH // 2)[0]
+
+    def weights(size: np.ndarray, kind: str) -> Any:
+        vectors = torch.eye(4)
+        if kind == "given":
+            source: Any = precomputed_features({"images/a.png": (size, vectors)}, None, ["images/a.png"])
+        else:
+            source = files(tmp_path / f"maps{size.shape}", size + 1)
+        how = {"lift_downscale": 2, "reuse_evidence": kind == "cached"}
+        return lifted(source, tmp_path / f"cache{size.shape}", **how).field.scalars.n_eff
+
+    for kind in ("given", "files", "cached"):
+        expected = weights(small, kind)
+        assert float(expected.max()) > 0
+        torch.testing.assert_close(weights(maps, kind), expected, rtol=0, atol=0)
+        with pytest.raises(nl.InputError, match="lift_downscale 2"):
+            weights(maps[:-2], kind)
 
 
 def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:

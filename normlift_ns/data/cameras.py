@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.data.colmap import read_colmap, read_colmap_points
-from normlift_ns.data.frames import Frame, WorldTransform, check_frames, rescale_intrinsics
+from normlift_ns.data.frames import GIVE_IMAGES, Frame, WorldTransform, check_frames, rescale_intrinsics
 from normlift_ns.data.splat import SplatFile
 from normlift_ns.data.transforms import CameraFile, gsplat_normalization, read_transforms, read_world_transform
 from normlift_ns.errors import InputError
@@ -20,12 +20,12 @@ from normlift_ns.options import SplatOptions
 _MIN_POINTS, _PARALLEL = 4, 1e-6
 
 
-def read_camera_file(options: SplatOptions, advice: str = "give the folder of the images with --images") -> CameraFile:
+def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
     """Read the camera file that the options name, and check that its images exist.
 
     Args:
         options: locations of cameras, images and masks.
-        advice: what to do about missing images, for error messages.
+        advice: what to do about missing images, for error messages; None: what the options leave to try.
     Raises:
         FileNotFoundError: if a file, folder, image or mask is missing.
         ValueError: if the options name no camera file or two, or the file cannot be read.
@@ -39,6 +39,9 @@ def read_camera_file(options: SplatOptions, advice: str = "give the folder of th
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and not folder.is_dir():
             raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give an existing folder.")
+    if advice is None:
+        is_given = options.images is not None
+        advice = "remove them from the camera file" if is_given else GIVE_IMAGES
     if options.colmap is None:
         cameras = read_transforms(
             Path(options.transforms or "").absolute(), options.images, options.masks, advice=advice
@@ -46,7 +49,7 @@ def read_camera_file(options: SplatOptions, advice: str = "give the folder of th
     else:
         cameras = read_colmap(options.colmap.absolute(), options.images, options.masks, advice=advice)
     check_frames(cameras.frames, cameras.source)
-    return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source) for frame in cameras.frames])
+    return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source, advice) for frame in cameras.frames])
 
 
 _TURNED = "The axes of gsplat's normalization point the other way; rotated by half a turn, the splat fits its images."

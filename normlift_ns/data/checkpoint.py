@@ -21,6 +21,7 @@ from normlift_ns.data.splat import (
     GAUSSIAN_PARAMETERS,
     SplatFile,
     SplatParameters,
+    check_extra_names,
     splat_from_parameters,
     validate_splat,
 )
@@ -164,9 +165,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
     missing = [_PREFIX + name for name in GAUSSIAN_PARAMETERS if _PREFIX + name not in model]
     if missing:
         raise InputError(
-            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. "
-            "Train the capture with: ns-train splatfacto --data ..."
+            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. Give another checkpoint with "
+            "--load-step, or lift a PLY file of the scene with --load-ply."
         )
+    known = {*GAUSSIAN_PARAMETERS, "normals"}
+    extra = (name.removeprefix(_PREFIX) for name in model if name.startswith(_PREFIX))
+    check_extra_names((name for name in extra if name not in known), path)
     splat = splat_from_parameters({name: model[_PREFIX + name] for name in GAUSSIAN_PARAMETERS}, path)
     return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()}, splat)
 
@@ -383,6 +387,7 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
             f"{', '.join(sorted(map(str, splats)))}. Expected the parameters of 3D Gaussians with spherical harmonics, "
             "as gsplat's simple_trainer writes them."
         )
+    check_extra_names((str(name) for name in splats if name not in _GSPLAT_NAMES), path)
     return splats
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,14 +30,21 @@ CAMERA_MODELS = {
     "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
 }
 """Names of the parameters of COLMAP's camera models, which are in the order of their IDs in binary files."""
+_SIMPLE_IF_ZERO = {"FULL_OPENCV": ("k4", "k5", "k6"), "FOV": ("omega",)}
+"""Camera models that are one of `PERSPECTIVE_MODELS` if these parameters are zero."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
-_MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
 
 
-def find_colmap_model(folder: Path) -> Path:
+def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: None) -> Path:
     """Return the folder of the reconstruction: the given folder, its sparse/0 or a similar subfolder.
 
+    If COLMAP's mapper wrote several, it is the one with most images.
+
+    Args:
+        folder: folder of the project or of the reconstruction.
+        say: function that is called with a sentence if there are several.
     Raises:
         FileNotFoundError: if none of them holds a reconstruction; the message lists them.
     """
@@ -46,13 +53,38 @@ def find_colmap_model(folder: Path) -> Path:
             f"There is no folder {folder}. Give the folder of the COLMAP project, which holds images and sparse/0, "
             "with --colmap."
         )
-    for subfolder in _MODEL_FOLDERS:
-        if any((folder / subfolder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return folder / subfolder
-    raise FileNotFoundError(
-        f"{folder} holds no COLMAP reconstruction: neither it nor its {', '.join(_MODEL_FOLDERS[1:])} contains "
-        "cameras.bin or cameras.txt. Give the folder that holds sparse/0 with --colmap."
+    if _is_model(folder):
+        return folder
+    places = [folder / name for name in _MODEL_FOLDERS]
+    numbered = [other for place in (folder, *places) if place.is_dir() for other in sorted(place.iterdir())]
+    models = list(filter(_is_model, dict.fromkeys([*places, *(other for other in numbered if other.name.isdigit())])))
+    if len(models) == 0:
+        raise FileNotFoundError(
+            f"{folder} holds no COLMAP reconstruction: neither it nor its {', '.join(_MODEL_FOLDERS)} contains "
+            "cameras.bin or cameras.txt. Give the folder that holds sparse/0 with --colmap."
+        )
+    if len(models) == 1:
+        return models[0]
+    counts = {model: _count_images(model) for model in models}
+    largest = max(models, key=counts.__getitem__)
+    listed = ", ".join(f"{relative_name(model, folder)} with {count:,} images" for model, count in counts.items())
+    say(
+        f"{folder} holds several reconstructions: {listed}. The largest, {relative_name(largest, folder)}, is used; "
+        "give the folder of another one with --colmap."
     )
+    return largest
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def _count_images(model: Path) -> int:
+    """Return the number of registered images; 0 if the file cannot be read."""
+    try:
+        return len(_read(model, "images", _images_text, _images_binary))
+    except (InputError, OSError):
+        return 0
 
 
 class ColmapCamera(NamedTuple):
@@ -139,18 +171,22 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
 
 
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
-    """Return the intrinsics of a camera.
+    """Return the intrinsics of a camera. FULL_OPENCV and FOV may have the parameters of a simpler model.
 
     Raises:
         ValueError: if `normlift_ns` cannot undistort images of this camera model.
     """
-    if camera.model not in PERSPECTIVE_MODELS:
+    parameters: dict[str, Any] = {}
+    if camera.model in (*PERSPECTIVE_MODELS, *_SIMPLE_IF_ZERO):
+        parameters = camera.named_parameters()
+    extra = {name: parameters.pop(name) for name in _SIMPLE_IF_ZERO.get(camera.model, ())}
+    if len(parameters) == 0 or any(extra.values()):
+        numbers = "".join(f", {name} = {value:g}" for name, value in extra.items())
         raise InputError(
-            f"{model}: camera {camera.camera_id} has the model {camera.model}; supported models are "
-            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images with: colmap image_undistorter, train the scene on "
-            "those, and give that folder."
+            f"{model}: camera {camera.camera_id} has the model {camera.model}{numbers}; supported models are "
+            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, with the splat as it is, and give the new folder "
+            f"with --colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
         )
-    parameters: dict[str, Any] = camera.named_parameters()
     return Intrinsics(width=camera.width, height=camera.height, **parameters)
 
 
@@ -173,8 +209,10 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         FileNotFoundError: if the reconstruction, an image or a mask is missing.
         ValueError: as in `read_colmap_model` and `colmap_intrinsics`.
     """
-    model = find_colmap_model(folder)
+    remarks: list[str] = []
+    model = find_colmap_model(folder, remarks.append)
     cameras, registered = read_colmap_model(model)
+    _check_formats(cameras, registered, model)
     registered.sort(key=lambda image: image.name)  # as training tools sort them
     intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (images or folder / "images").absolute()
@@ -188,7 +226,35 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         Frame(file, relative_name(file, base), colmap_pose(image), intrinsics[image.camera_id], mask)
         for image, file, mask in zip(registered, files, mask_files)
     ]
-    return CameraFile(frames, frozenset(), model, folder, base)
+    return CameraFile(frames, frozenset(), model, folder, base, remarks=tuple(remarks))
+
+
+def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage], model: Path) -> None:
+    """Raise if a reconstruction in both formats has different cameras: programs differ in which of them they read."""
+    if not all((model / f"{name}.{suffix}").is_file() for name in ("cameras", "images") for suffix in ("bin", "txt")):
+        return
+    others, other_images = read_colmap_model(model, text_first=True)
+
+    def numbers(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> dict[str, list[float]]:
+        found = {}
+        for image in images:
+            camera, turned = cameras[image.camera_id], np.outer(image.rotation, image.rotation)  # q is -q
+            found[image.name] = [camera.width, camera.height, *camera.params, *turned.ravel(), *image.translation]
+        return found
+
+    first, second = numbers(cameras, images), numbers(others, other_images)
+    differ = [
+        name
+        for name in {**first, **second}
+        if not (name in first and name in second and len(first[name]) == len(second[name]))
+        or not np.allclose(first[name], second[name], rtol=1e-4, atol=1e-4)
+    ]
+    if len(differ) > 0:
+        raise InputError(
+            f"{model} can be read in two ways: the camera of {differ[0]} in its .bin files, which COLMAP and gsplat "
+            f"read, is not that in its .txt files, which nerfstudio reads ({len(differ)} of {len(first)} images). Keep "
+            f"those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
+        )
 
 
 def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:

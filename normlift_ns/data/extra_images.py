@@ -54,7 +54,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
     placed = [replace(frame, name=relative_name(frame.file, base)) for frame in transform_frames(new, world)]
     placed.sort(key=lambda frame: frame.file)  # the order in which a lifted run reads them
     identity = {**scene.identity, "added_photographs": [frame.name for frame in placed]}
-    return replace(with_frames(scene, placed), identity=identity)
+    extended_scene = with_frames(scene, placed)
+    return replace(extended_scene, identity=identity, remarks=(*extended_scene.remarks, *extended.remarks))
 
 
 def _key(name: str) -> str:

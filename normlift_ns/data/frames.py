@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from normlift_ns.errors import InputError
-from normlift_ns.io.guard import open_regular
+from normlift_ns.io.guard import check_files_distinct, open_regular
 
 _FORMATS = {"JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "DIB", "PPM", "GIF", "TGA", "JPEG2000", "AVIF"}
 """Formats that Pillow reads without other programs and that hold images rather than documents."""
@@ -44,9 +44,7 @@ def read_image_header(file: Path) -> ImageHeader:
         ValueError: if the path is not a regular file, not an image, or an image of unsupported format or size.
     """
     if not file.exists():
-        raise FileNotFoundError(
-            f"{file} is missing, but the camera file lists it. Give the folder of the images with --images."
-        )
+        raise FileNotFoundError(f"{file} is missing, but the camera file lists it. Put it back.")
     if not file.is_file():
         raise InputError(f"{file} is not a regular file. Expected an image; copy it again from the capture.")
     try:
@@ -109,7 +107,7 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
         (
             [header.mode == "CMYK" for header in headers],
             "are in CMYK, which training reads as different colors",
-            "Convert them to RGB and train again",
+            "Convert them to RGB",
         ),
         ([header.multi_frame for header in headers], "hold several images", "Only the first image of each is used"),
     )
@@ -124,8 +122,8 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a rotation from orthonormal, because files round."""
-
-
+GIVE_IMAGES = "give the folder of the images with --images"
+"""Advice about missing images, unless the folder was given."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """Camera models that `Intrinsics` covers, by the names that COLMAP and nerfstudio give them."""
 
@@ -247,27 +245,46 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
             f"{missing[0]}. Put them back, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]
-    if len(set(files)) < len(files):
-        second = next(i for i, file in enumerate(files) if file in files[:i])
-        raise InputError(
-            f"{source} lists {names[files.index(files[second])]} and {names[second]}, but {folder} has only "
-            f"{files[second]} for both. Put the images into the folders that it lists, or {advice}."
-        )
+    check_files_distinct(zip(names, files), "file", f"in the folders that {source} lists, or {advice}")
     return files
+
+
+def plain_name(name: str) -> str:
+    """Return a path with forward slashes, also if a program on Windows wrote it.
+
+    >>> plain_name("images\\left\\1.png"), plain_name("C:\\a\\1.png"), plain_name("images/1.png")
+    ('images/left/1.png', 'C:/a/1.png', 'images/1.png')
+    """
+    return PureWindowsPath(name).as_posix() if "\\" in name else name
+
+
+def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Path]:
+    """Return the paths at which a file that a camera file lists may be.
+
+    The first is its own. An absolute path may be that of another machine, so the file may also be at the end of its
+    path in the folder: images/1.png for C:\\scene\\images\\1.png.
+
+    Args:
+        folder: folder to search.
+        name: path relative to the folder, or absolute.
+        copies: also try a relative path without its leading folders, for copies in folders such as images_2.
+    """
+    plain = plain_name(name)
+    path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)
+    is_absolute = path.is_absolute()
+    ends = [folder.joinpath(*path.parts[start:]) for start in range(is_absolute, len(path.parts))]
+    if is_absolute:
+        return ends if copies else [folder / name, *ends]
+    return [folder / name, *(ends if copies else ends[:1])]
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
     """Find a file by name in a folder, also with another suffix, as downscaled copies have.
 
     Args:
-        folder: folder to search.
-        name: path relative to the folder.
-        copies: also try the name without its leading folders, for copies in folders such as images_2.
+        folder, name, copies: as in `possible_paths`.
     """
-    path = Path(name)
-    parts = path.parts[1:] if path.is_absolute() else path.parts
-    candidates = [folder.joinpath(*parts[start:]) for start in range(len(parts))] if copies else [folder / path]
-    for candidate in candidates:
+    for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
             *map(candidate.with_suffix, _SUFFIXES),
@@ -282,6 +299,7 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
 
     Raises:
         FileNotFoundError: if a mask is missing.
+        ValueError: if two images share a mask.
     """
     masks = []
     for name in names:
@@ -292,15 +310,17 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
                 "every image."
             )
         masks.append(mask.absolute())
+    check_files_distinct(zip(names, masks), "mask", "in folders named like those of the images")
     return masks
 
 
-def rescale_intrinsics(frame: Frame, source: Path) -> Frame:
+def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) -> Frame:
     """Return the frame with intrinsics for the size of its file, which may be a smaller copy of the image.
 
     Args:
         frame: the frame as the camera file describes it.
         source: the camera file, for error messages.
+        advice: what to do about an unsuitable image, for error messages.
     Raises:
         FileNotFoundError: if the file is missing.
         ValueError: if the file is not an image, its aspect ratio differs from its camera's, or its mask does not fit.
@@ -312,8 +332,8 @@ def rescale_intrinsics(frame: Frame, source: Path) -> Frame:
         if abs(camera.width * scale - width) > 1 or abs(camera.height * scale - height) > 1:
             raise InputError(
                 f"{frame.file} is {width} x {height} pixels, but its camera in {source} has {camera.width} x "
-                f"{camera.height}: the aspect ratios differ. Give the images that the cameras were computed from, or "
-                "proportionally smaller copies, with --images."
+                f"{camera.height}: the aspect ratios differ. Put the images there that the cameras were computed from, "
+                f"or proportionally smaller copies, or {advice}."
             )
         camera = camera.resized(width, height)
     if frame.mask is not None:

@@ -151,8 +151,8 @@ class SplitViews:
         scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
     """
 
-    _LISTED_IN, _ADVICE, _TRAINED = "the dataset", "give the path of the dataset with --data", "run"
-    """Phrases for messages: the list of images, the alternative to restoring one, and the output of the training."""
+    _LISTED_IN, _TRAINED = "the dataset", "run"
+    """Phrases for messages: the list of images, and the output of the training."""
 
     def __init__(
         self,
@@ -200,7 +200,7 @@ class SplitViews:
         if header.mode not in _NERFSTUDIO_MODES:
             raise InputError(
                 f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
-                "RGBA or grayscale; convert the images, and train again."
+                "RGBA or grayscale; convert the images."
             )
         self._check_size(index, header.size if self._scale == 1 else _scaled_size(header.size, self._scale))
         if mask is not None:
@@ -277,7 +277,7 @@ class SplitViews:
             image, mask = self._load(index)
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"{error.filename} is missing, but {self._LISTED_IN} lists it. Put it back, or {self._ADVICE}."
+                f"{error.filename} is missing, but {self._LISTED_IN} lists it. Put it back."
             ) from error
         except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
             mask = self._masks[index]
@@ -301,7 +301,7 @@ class ImageViews(SplitViews):
         scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
     """
 
-    _LISTED_IN, _ADVICE, _TRAINED = "the camera file", "give the folder of the images", "splat"
+    _LISTED_IN, _TRAINED = "the camera file", "splat"
 
     def __init__(self, frames: Sequence[Frame], background: Float[Tensor, " 3"]) -> None:
         self.frames = list(frames)

@@ -153,7 +153,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         run_dir / TRANSFORMS_FILE,
         None if data is None else data.absolute(),
         base=Path(saved.photographs),
-        advice="give their folder with --data",
+        advice="give their folder with --data" if data is None else "lift again without them",
     )
     check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
     train, held_out = split_views(cameras.frames, cameras.held_out, saved.background)

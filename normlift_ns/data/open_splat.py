@@ -7,6 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
 
+import numpy as np
+from jaxtyping import Float
+
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
 from normlift_ns.data.cameras import adjust_poses, candidate_worlds, read_camera_file
@@ -15,13 +18,16 @@ from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names
 from normlift_ns.data.open_scene import SplatScene, split_views
-from normlift_ns.data.splat import SplatFile, validate_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
 from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
 from normlift_ns.data.transforms import CameraFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
 from normlift_ns.options import SplatOptions
 from normlift_ns.registry import Registry
+
+_MAX_STEP = 0.1
+"""Largest distance of neighboring float32 numbers, as a fraction of the width of the median Gaussian."""
 
 
 @check_arguments
@@ -55,6 +61,9 @@ def open_splat(
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _read(path)
+    _check_coordinates(
+        file.splat, file.splat.means[:: len(file.splat) // 10_000 + 1].double().numpy(), str(path), options
+    )
     held_out = _held_out(options, cameras, file.test_every)
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
@@ -85,6 +94,9 @@ def open_splat(
         )
 
     (_, first), *others = candidate_worlds(file, options, cameras)
+    if len(others) == 0:
+        positions = np.array([frame.pose[:, 3] for frame in transform_frames(cameras.frames, first)])
+        _check_coordinates(file.splat, positions, f"The cameras of {cameras.source}", options)
     scene = scene_in(first)
     if len(others) == 0 or mean_psnr(scene) >= MIN_PSNR:
         return scene
@@ -94,6 +106,32 @@ def open_splat(
             say(text)
             return other
     return scene
+
+
+def _check_coordinates(
+    splat: SplatParameters, positions: Float[np.ndarray, "n 3"], what: str, options: SplatOptions
+) -> None:
+    """Raise if positions are so far from the origin that float32 cannot tell neighboring Gaussians apart.
+
+    Args:
+        splat: the Gaussians.
+        positions: their positions, or those of the cameras in the same world.
+        what: what has these positions, for the message.
+        options: options of the splat.
+    """
+    center, width = np.median(positions, axis=0), float(splat.scales.median().exp())
+    step = float(np.spacing(np.abs(center).max().astype(np.float32)))
+    if not step > _MAX_STEP * width:
+        return
+    x, y, z = (float(f"{value:.2g}") for value in center)
+    matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
+    place = f" Cameras: printf '{matrix}' > offset.txt, and --world-transform offset.txt"
+    raise InputError(
+        f"{what}: the middle of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
+        f"zone. Numbers in float32 are {step:.2g} apart there, too far for Gaussians {width:.2g} wide. Subtract one "
+        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Splat: export it with this offset "
+        f"from the program that wrote it.{place if options.world_transform is None else ''}"
+    )
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
@@ -251,6 +289,7 @@ def _assumptions(
         texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
     else:
         texts.append(f"All {len(frames)} images are lifted; see --test-every and --eval-images.")
+    texts += cameras.remarks
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})

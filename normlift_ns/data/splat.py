@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+import io
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -168,6 +170,39 @@ class SplatFile(NamedTuple):
     """Messages about the file, such as rounding errors of a compressed format."""
 
 
+_OTHER_PRIMITIVES = re.compile(
+    r"(?P<betas>betas?|sb_params.*)|(?P<shapes>shapes?(_\d+)?)|(?P<moving>trbf_.*|motion_.*|omega_.*|velocit.*|"
+    r"t|time|scales?_t|rot_r_\d+|t_scale)|(?P<networks>f_offset_.*|f_anchor_.*|app_.*)"
+)
+"""Names of further parameters that change what is drawn, by their kind."""
+_KINDS = {
+    "betas": "Beta kernels instead of Gaussians",
+    "shapes": "generalized exponentials instead of Gaussians",
+    "moving": "Gaussians that move",
+    "networks": "Gaussians that a network makes",
+}
+_UNUSED = ("nx", "ny", "nz", "red", "green", "blue")
+_FILTER = "filter_3D"
+
+
+def check_extra_names(names: Iterable[str], file: Path) -> tuple[str, ...]:
+    """Return a message that names further parameters of Gaussians, which are not read.
+
+    Raises:
+        ValueError: if one of them changes what is drawn.
+    """
+    names = list(names)
+    for match in filter(None, map(_OTHER_PRIMITIVES.fullmatch, names)):
+        raise InputError(
+            f"{file} has {match[0]}, a parameter of {_KINDS[match.lastgroup or '']}, which are not supported. Export "
+            "3D Gaussians from the program that wrote the file, and give that with --load-ply."
+        )
+    if len(names) == 0:
+        return ()
+    listed = ", ".join(names)[:200]
+    return (f"{file.name} has values that are not read, because they should not change what is drawn: {listed}.",)
+
+
 _MAX_HEADER_BYTES, _MAX_LINE_BYTES = 2**20, 2**16
 _PLY_BLOCK_ROWS = 2**18
 """Number of Gaussians read at a time."""
@@ -179,6 +214,8 @@ _MODES: dict[str, RasterizeMode] = {
 def read_ply(path: Path) -> SplatFile:
     """Read a splat, also of a compressed PLY file. Its properties may be in any order; other properties are ignored.
 
+    Mip-Splatting's property filter_3D is applied to scales and opacities, as Mip-Splatting does.
+
     Peak memory is a little more than one copy of the Gaussians.
 
     Raises:
@@ -187,7 +224,7 @@ def read_ply(path: Path) -> SplatFile:
             drawn. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
+        raise FileNotFoundError(f"There is no PLY file at {path}. Expected the file of a trained splat.")
     check_ply_header(path)
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
@@ -201,20 +238,63 @@ def read_ply(path: Path) -> SplatFile:
         return SplatFile(splat, mode, remarks=(rounding,))
     _check_properties(path, vertex)
     rest = _rest_names(path, {item.name for item in vertex.properties})
-    splat = _read_columns(path, vertex.data, rest)
+    splat, mode = _read_columns(path, vertex.data, rest), _mode([*data.comments, *vertex.comments])
+    remarks = _remarks(path, vertex, rest, _mode_names([*data.comments, *vertex.comments]))
+    if any(item.name == _FILTER for item in vertex.properties):
+        widths = torch.from_numpy(np.ascontiguousarray(vertex.data[_FILTER]).astype(np.float64))
+        splat, mode = _apply_filter(splat, widths, path), mode or "antialiased"
+        remarks += (
+            f"{path.name} has filter_3D, the filter of Mip-Splatting: it is applied to scales and opacities. Its other "
+            "filter, of 0.1 square pixels, is that of the rasterize mode antialiased, with 0.3.",
+        )
     validate_splat(splat, path)
-    return SplatFile(splat, mode)
+    return SplatFile(splat, mode, remarks=remarks)
+
+
+def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) -> tuple[str, ...]:
+    """Return messages about properties and rasterize modes that are not known; raise as in `check_extra_names`."""
+    known = {*(name for group in _COLUMNS.values() for name in group), *rest, *_UNUSED, _FILTER}
+    remarks = check_extra_names([item.name for item in vertex.properties if item.name not in known], path)
+    unknown = [name for name in modes if name.lower() not in _MODES]
+    if len(unknown) > 0:
+        remarks += (f"{path.name} has SplatRenderMode {unknown[0][:40]}, which is unknown; see --rasterize-mode.",)
+    return remarks
+
+
+def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Path) -> SplatParameters:
+    """Return the Gaussians after convolution with isotropic ones of these standard deviations, as Mip-Splatting draws
+    them: opacities fall as their volumes grow."""
+    if not bool((widths.isfinite() & (widths >= 0)).all()):
+        raise InputError(f"{path}: filter_3D holds negative numbers, NaN or infinity. Export the scene again.")
+    before = splat.scales.double()
+    scales = (before.mul(2).exp() + widths[:, None].square()).log() / 2
+    growth = (before - scales).nan_to_num(nan=0.0).sum(dim=1, keepdim=True)  # NaN: a flat Gaussian without a filter
+    shrunk = splat.opacities.double().sigmoid() * growth.exp()
+    return replace(splat, scales=scales.float(), opacities=shrunk.logit().float())
+
+
+class _PlainHeader(io.FileIO):
+    """PLY file whose header has the form that plyfile reads, with as many bytes: comments in ASCII, and obj_info, which
+    some programs write after the properties, as a comment."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        head, end, _ = super().read(_MAX_HEADER_BYTES).partition(b"end_header")
+        head = bytes(byte if byte < 128 else 63 for byte in head + end)  # 63: a question mark
+        self._plain = re.sub(rb"(?<=[\r\n])obj_info(?=[ \t\r\n])", b"comment ", head)
+        self.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        start, data = self.tell(), super().read(-1 if size is None else size)
+        plain = self._plain[start : start + len(data)]
+        return plain + data[len(plain) :]
 
 
 def _parse_ply(path: Path) -> PlyData:
     """Parse the header, and map the binary data."""
     try:
-        return PlyData.read(str(path), mmap="c")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"The header of {path} has non-ASCII characters, perhaps in a comment ({error}). Remove them, or rewrite "
-            f"the file, for example with: splat-transform {path.name} clean.ply"
-        ) from error
+        with _PlainHeader(path) as stream:
+            return PlyData.read(stream, mmap="c")
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
         if file_kind(path) == ".ply":
             raise InputError(
@@ -327,8 +407,9 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 def _mode(comments: list[str]) -> RasterizeMode | None:
     """Return the value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
-    for comment in comments:
-        key, _, value = comment.partition(":")
-        if key.strip().lower() == "splatrendermode":
-            return _MODES.get(value.strip().lower())
-    return None
+    return next((_MODES.get(value.lower()) for value in _mode_names(comments)), None)
+
+
+def _mode_names(comments: list[str]) -> list[str]:
+    pairs = [comment.partition(":") for comment in comments]
+    return [value.strip() for key, _, value in pairs if key.strip().lower() == "splatrendermode"]

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import tokenize
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,22 +18,26 @@ import torch
 from jaxtyping import Float
 
 from normlift_ns.data.frames import (
+    GIVE_IMAGES,
     PERSPECTIVE_MODELS,
     Frame,
     Intrinsics,
     WorldTransform,
     find_images,
     find_masks,
+    plain_name,
+    possible_paths,
     read_image_header,
 )
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
-from normlift_ns.io.guard import read_file
+from normlift_ns.io.guard import check_files_distinct, read_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
 """Largest side and largest area of an image, in pixels."""
 _MAX_VALUE = 1e30
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION_VALUES = (*DISTORTION, "k5", "k6", "distortion_params")
 _LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _MAX_JSON_BYTES = 2**27
 """Largest JSON file that is read; ten thousand frames take a tenth of that."""
@@ -52,6 +56,8 @@ class CameraEntry(msgspec.Struct):
     k2: float | None = None
     k3: float | None = None
     k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
     distortion_params: list[float] | None = None
@@ -201,6 +207,8 @@ class CameraFile(NamedTuple):
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
     applied_scale: float = 1.0
     """Scale of `applied_transform`."""
+    remarks: tuple[str, ...] = ()
+    """Messages about the choices that the file left open, in whole sentences."""
 
 
 def read_transforms(
@@ -209,7 +217,7 @@ def read_transforms(
     masks: Path | None = None,
     *,
     base: Path | None = None,
-    advice: str = "give the folder of the images with --images",
+    advice: str = GIVE_IMAGES,
 ) -> CameraFile:
     """Read the frames of a transforms.json; images are located, but only opened if the file does not give their size.
 
@@ -249,18 +257,18 @@ def read_transforms(
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
     """Return whether the file excludes each frame from the training. Like nerfstudio, reject lists of other files."""
-    files = [root / frame.file_path for frame in entries.frames]
+    files = [root / plain_name(frame.file_path) for frame in entries.frames]
     for split, names in entries.lists.items():
-        unknown = [name for name in names or () if root / name not in files]
+        unknown = [name for name in names or () if root / plain_name(name) not in files]
         if unknown:
             raise InputError(
                 f"{path}: its {split}_filenames list {unknown[0]}, which is not the file_path of any frame. Expected "
                 "the same names in both."
             )
     if entries.train_filenames is not None:
-        trained = {root / name for name in entries.train_filenames}
+        trained = {root / plain_name(name) for name in entries.train_filenames}
         return [file not in trained for file in files]
-    excluded = {root / name for name in (*(entries.val_filenames or ()), *(entries.test_filenames or ()))}
+    excluded = {root / plain_name(name) for name in (*(entries.val_filenames or ()), *(entries.test_filenames or ()))}
     return [file in excluded for file in files]
 
 
@@ -274,9 +282,16 @@ def _masks(
 ) -> Sequence[Path] | Sequence[None]:
     if masks is not None:
         return find_masks([frame.file_path for frame in entries.frames], masks)
-    names = [frame.mask_path for frame in entries.frames if frame.mask_path is not None]
-    if len(names) == 0:
+    if all(frame.mask_path is None for frame in entries.frames):
         return [None] * len(entries.frames)
+    found = _listed_masks(entries, root, images, path)
+    owned = [(frame.file_path, file) for frame, file in zip(entries.frames, found) if _is_named_like(file, frame)]
+    check_files_distinct(owned, "mask", f"in the mask_path of {path}")
+    return found
+
+
+def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, path: Path) -> list[Path]:
+    names = [frame.mask_path for frame in entries.frames if frame.mask_path is not None]
     if len(names) < len(entries.frames):
         unmasked = next(frame.file_path for frame in entries.frames if frame.mask_path is None)
         raise InputError(
@@ -294,41 +309,113 @@ def _masks(
 
 def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
     """Find a mask at its path in the file, or in a folder of the same name inside or next to the image folder."""
-    own = root / name
-    tail = Path(own.parent.name, own.name)
+    own, *ends = possible_paths(root, name)
+    tail = Path(*Path(plain_name(str(own))).parts[-2:])
     moved = () if images is None else (images / relative_name(own, root), images / tail, images.parent / tail)
-    return next((file for file in (own, *moved) if file.is_file()), None)
+    return next((file for file in (own, *ends, *moved) if file.is_file()), None)
+
+
+def _is_named_like(mask: Path, frame: FrameEntry) -> bool:
+    """Return whether a mask has the name of its image, so that it cannot be the mask of a whole camera."""
+    image = Path(plain_name(frame.file_path))
+    return mask.stem in (image.name, image.stem)
+
+
+_SAME = 1e-3
+"""Largest difference of equal intrinsics: a fraction of the longer side of the image, or a distortion parameter."""
+
+
+def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrinsics, path: Path) -> None:
+    """Raise if programs read different intrinsics, because two values of the file differ."""
+    found: dict[str, tuple[str, float]] = {}
+    differ: list[tuple[str, tuple[str, float], tuple[str, float]]] = []
+    pixels = _SAME * max(lens.width, lens.height)
+    readings = [
+        (*reading, pixels)
+        for names in (("fl_x", "fl_y", "cx", "cy", "w", "h"), ("camera_angle_x", "camera_angle_y"))
+        for entry, start in ((entries, "."), (frame, ".frames[]."))
+        for reading in _readings(entry, start, names, lens)
+    ]
+    given = [(e, s) for e, s in ((entries, "."), (frame, ".frames[].")) if _given(e, *_DISTORTION_VALUES)]
+    for entry, start in given:
+        label = ", ".join(f"{start}{name}" for name, _ in _given(entry, *_DISTORTION_VALUES))
+        values = zip(("k1", "k2", "k3", "p1", "p2"), _distortion(entry, f"{path}: {frame.file_path}"))
+        readings += [(name, label, value, _SAME) for name, value in values]
+    for name, label, value, allowed in readings:
+        first = found.setdefault(name, (label, value))
+        if abs(first[1] - value) > allowed:
+            differ.append((name, first, (label, value)))
+    if len(differ) > 0:
+        name, first, second = differ[0]
+        kept, others = (", ".join(dict.fromkeys(item[i][0] for item in differ)) for i in (1, 2))  # type: ignore[index]
+        raise InputError(
+            f"{path} can be read in two ways: for {frame.file_path}, {name} is {first[1]:g} by {first[0]}, which "
+            f"nerfstudio reads, and {second[1]:g} by {second[0]}, which other programs such as instant-ngp and Brush "
+            f"read. Remove those that the splat was not trained with, and give the new file with --transforms: "
+            f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
+        )
+
+
+def _readings(
+    entry: CameraEntry, start: str, names: Sequence[str], lens: Intrinsics
+) -> Iterator[tuple[str, str, float]]:
+    """Yield parameters in pixels: name, place in the file and value."""
+    for name, value in _given(entry, *names):
+        if name.startswith("camera_angle"):
+            if 0 < value < math.pi:
+                side = lens.width if name.endswith("x") else lens.height
+                yield f"fl_{name[-1]}", f"{start}{name}", 0.5 * side / math.tan(0.5 * value)
+        else:
+            yield name, f"{start}{name}", value
+
+
+def _check_model(entries: TransformsEntries, frame: FrameEntry, path: Path) -> None:
+    """Raise if there are two camera models, or one that cannot be undistorted."""
+    models = [item.camera_model for item in (entries, frame) if item.camera_model is not None]
+    if len(set(models)) > 1:
+        raise InputError(
+            f"{path} can be read in two ways: the camera_model is {models[0]}, but that of {frame.file_path} is "
+            f"{models[1]}. Remove the one that the splat was not trained with: jq 'del(.frames[].camera_model)' "
+            f"{path.name} > new.json, or jq 'del(.camera_model)' {path.name} > new.json"
+        )
+    model = "OPENCV_FISHEYE" if entries.value(frame, "is_fisheye") else [*models, "OPENCV"][0].upper()
+    if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE"):
+        raise InputError(
+            f"{path}: {frame.file_path}: the camera_model is {model}; supported models are "
+            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, and give their cameras, in the same world."
+        )
 
 
 def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:
-    """Return the intrinsics of a frame."""
-    value = partial(entries.value, frame)
-    model = value("camera_model") or "OPENCV"
-    model = "OPENCV_FISHEYE" if value("is_fisheye") else model
-    if model not in PERSPECTIVE_MODELS:
-        raise InputError(
-            f"{path}: the camera_model is {model}; supported models are {', '.join(PERSPECTIVE_MODELS)}. Undistort "
-            "the images, train the scene on those, and give their cameras."
-        )
+    """Return the intrinsics of a frame.
+
+    Raises:
+        ValueError: if values of the file and of the frame, or focal lengths and angles of view, differ.
+    """
+    value, source = partial(entries.value, frame), f"{path}: {frame.file_path}"
+    _check_model(entries, frame, path)
     size = (value("w"), value("h"))
     width, height = read_image_header(file).size if None in size else size
     angles = value("camera_angle_x"), value("camera_angle_y")
     for angle in angles:
         if angle is not None and not 0 < angle < math.pi:
-            raise InputError(f"{path}: a camera_angle is {angle}, expected radians between 0 and pi.")
+            raise InputError(f"{source}: a camera_angle is {angle}, expected radians between 0 and pi.")
     fx, fy = _focal(value("fl_x"), angles[0], width), _focal(value("fl_y"), angles[1], height)
     if fx is None:
-        raise InputError(f"{path} has neither fl_x nor camera_angle_x for {frame.file_path}. Expected a focal length.")
+        raise InputError(f"{source} has neither fl_x nor camera_angle_x. Expected a focal length.")
     cx, cy = value("cx"), value("cy")
-    return Intrinsics(
+    is_shared = len(_given(entries, *_DISTORTION_VALUES)) > 0
+    lens = Intrinsics(
         fx,
         fx if fy is None else fy,
         width / 2 if cx is None else cx,
         height / 2 if cy is None else cy,
         int(width),
         int(height),
-        *_distortion(entries, frame, path),
+        *_distortion(entries if is_shared else frame, source),
     )
+    _check_readings(entries, frame, lens, path)
+    return lens
 
 
 def _focal(focal: float | None, angle: float | None, side: float) -> float | None:
@@ -336,17 +423,18 @@ def _focal(focal: float | None, angle: float | None, side: float) -> float | Non
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 
-def _distortion(entries: TransformsEntries, frame: FrameEntry, path: Path) -> tuple[float, float, float, float, float]:
-    """Return k1, k2, k3, p1, p2: the values for all frames if there are any, otherwise the frame's own."""
-    source = entries if len(_given(entries, *DISTORTION, "distortion_params")) > 0 else frame
-    values = [getattr(source, name) or 0.0 for name in DISTORTION]
-    if source.distortion_params is not None:
-        values = [*source.distortion_params, *[0.0] * 6][:6]
+def _distortion(entry: CameraEntry, source: str) -> tuple[float, float, float, float, float]:
+    """Return k1, k2, k3, p1, p2."""
+    values = [getattr(entry, name) or 0.0 for name in DISTORTION]
+    if entry.distortion_params is not None:
+        values = [*entry.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values
-    if k4 != 0:
+    others = [(name, number) for name, number in (("k4", k4), *_given(entry, "k5", "k6")) if number != 0]
+    if others:
+        name, number = others[0]
         raise InputError(
-            f"{path}: {frame.file_path} has the distortion k4 = {k4:g}; only k1, k2, k3, p1 and p2 can be undistorted. "
-            "Undistort the images, train the scene on those, and give their cameras."
+            f"{source} has the distortion {name} = {number:g}; only k1, k2, k3, p1 and p2 can be undistorted. "
+            "Undistort the images, and give their cameras, in the same world."
         )
     return k1, k2, k3, p1, p2
 

@@ -11,7 +11,6 @@ An image may be segmented at several levels. Evidence is rasterized once, on the
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,7 +30,8 @@ from normlift_ns.core.arguments import as_tensor
 from normlift_ns.core.device import AdaptiveBatches, prefetch_map
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder, check_prompts, look_up_embeddings, unit_rows
 from normlift_ns.errors import InputError
-from normlift_ns.segmentation.regions import resample_nearest
+from normlift_ns.io.guard import check_files_distinct
+from normlift_ns.segmentation.regions import is_downscaled, resample_nearest
 
 
 @dataclass(frozen=True)
@@ -277,25 +277,6 @@ def check_image(image: Tensor, name: str) -> None:
         )
 
 
-def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, remedy: str) -> None:
-    """Check that no two images use the same file, with symbolic links resolved.
-
-    Args:
-        files: Pairs of an image name and one of its files.
-        description: Kind of file, for the message.
-        remedy: How to give each image its own file, for the message.
-    Raises:
-        ValueError: If two images share a file.
-    """
-    owner: dict[str, str] = {}
-    for name, file in files:
-        other = owner.setdefault(os.path.realpath(file), name)
-        if other != name:
-            raise InputError(
-                f"images {other} and {name} would share the {description} {file}; give each its own file, {remedy}"
-            )
-
-
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
     """Partition an image into cells: the sets of pixels that have the same label in every level.
 
@@ -437,6 +418,8 @@ class PrecomputedFeatures:
     """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length, 0 for none."""
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embeddings by text."""
+    divisor: int = 1
+    """Factor by which images were downscaled, lift_downscale. Labels of their size before are downscaled, too."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -459,11 +442,13 @@ class PrecomputedFeatures:
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         labels, vectors = self.views[name]
-        if labels.shape != image.shape[:2]:
-            raise InputError(
-                f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
-                "width, undistorted, after lift_downscale); pass labels of that size"
-            )
+        if not is_downscaled(labels.shape, image.shape[:2], 1):
+            if not is_downscaled(labels.shape, image.shape[:2], self.divisor):
+                raise InputError(
+                    f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
+                    f"width, undistorted, after lift_downscale {self.divisor}); pass labels of the undistorted image"
+                )
+            labels = torch.from_numpy(resample_nearest(labels.numpy()[None], *image.shape[:2])[0])
         vectors, labels = drop_zero_rows(vectors, labels.int())
         return ViewFeatures(labels, torch.from_numpy(unit_rows(vectors)))
 

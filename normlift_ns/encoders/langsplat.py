@@ -31,14 +31,13 @@ from normlift_ns.encoders.base import (
     FeatureSource,
     RegionFeatures,
     ViewFeatures,
-    check_files_distinct,
     joint_partition,
 )
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.atomic import atomic_file
-from normlift_ns.io.guard import read_file
+from normlift_ns.io.guard import check_files_distinct, read_file
 from normlift_ns.options import MissingFeatures
 from normlift_ns.segmentation.regions import resample_nearest
 

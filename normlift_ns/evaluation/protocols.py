@@ -21,10 +21,10 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.metrics import NO_CLASS, class_scores, classify, confusion
 from normlift_ns.core.scene import Scene, Views
-from normlift_ns.encoders.base import check_files_distinct
 from normlift_ns.encoders.text_files import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import Evaluation, MaskOptions, PromptText, read_document
+from normlift_ns.io.guard import check_files_distinct
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles

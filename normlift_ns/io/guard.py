@@ -224,3 +224,22 @@ def _is_json(file: BufferedReader) -> bool:
     except (ValueError, RecursionError):
         return False
     return True
+
+
+def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, remedy: str) -> None:
+    """Check that no two images use the same file, with symbolic links resolved.
+
+    Args:
+        files: Pairs of an image name and one of its files.
+        description: Kind of file, for the message.
+        remedy: How to give each image its own file, for the message.
+    Raises:
+        ValueError: If two images share a file.
+    """
+    owner: dict[str, str] = {}
+    for name, file in files:
+        other = owner.setdefault(os.path.realpath(file), name)
+        if other != name:
+            raise InputError(
+                f"images {other} and {name} would share the {description} {file}; give each its own file, {remedy}"
+            )

@@ -6,7 +6,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -152,6 +152,8 @@ class LabelFiles(RegionDefaults):
     """Index of the map that counts in an NPY file [levels, H, W]; None for files [H, W]."""
     resample: bool = False
     """Resize maps of another size to the image's by nearest neighbor, instead of raising an error."""
+    divisor: int = 1
+    """Factor by which images were downscaled, lift_downscale. Maps of their size before are downscaled, too."""
     description: str = "label map"
     """Name of a file in messages."""
     flag: str = "--regions-dir"
@@ -217,11 +219,12 @@ class LabelFiles(RegionDefaults):
         path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
         if maps.shape[1:] != (height, width):
-            if not self.resample:
+            if not self.resample and not is_downscaled(maps.shape[1:], (height, width), self.divisor):
+                downscaled = f" after lift_downscale {self.divisor}" if self.divisor > 1 else ""
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
-                    f"{name} is {width}x{height}; make {self.description}s of the size of the image (undistortion "
-                    "crops images), or resample them by nearest neighbor: --regions-resample True"
+                    f"{name} is {width}x{height}{downscaled}; make {self.description}s of the size of the image "
+                    "(undistortion crops images), or resample them by nearest neighbor: --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
@@ -266,6 +269,15 @@ class LabelFiles(RegionDefaults):
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         return maps.reshape(-1, *maps.shape[-2:])
+
+
+def is_downscaled(before: Sequence[int], after: Sequence[int], divisor: int) -> bool:
+    """Return whether one size is the other after downscaling.
+
+    >>> is_downscaled((7, 10), (3, 5), 2), is_downscaled((3, 5), (3, 5), 1), is_downscaled((8, 10), (3, 5), 2)
+    (True, True, False)
+    """
+    return tuple(side // divisor for side in before) == tuple(after)
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -1,15 +1,18 @@
 import os
+import shutil
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.colmap import (
     colmap_intrinsics,
     colmap_pose,
     find_colmap_model,
+    read_colmap,
     read_colmap_model,
     read_colmap_points,
 )
@@ -65,6 +68,60 @@ def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
     for name, message in (("b", "COLMAP"), ("c", "no folder")):
         with pytest.raises(FileNotFoundError, match=message):
             find_colmap_model(tmp_path / name)
+
+
+def test_the_largest_of_several_reconstructions_is_read(tmp_path: Path) -> None:
+    for name, count in (("0", 2), ("1", 5), ("10", 3)):
+        model = write_colmap(tmp_path / name, frames(count), binary=name != "1") / "sparse" / "0"
+        (tmp_path / "p" / "sparse").mkdir(parents=True, exist_ok=True)
+        model.rename(tmp_path / "p" / "sparse" / name)
+    said: list[str] = []
+    for folder in (tmp_path / "p", tmp_path / "p" / "sparse"):
+        assert find_colmap_model(folder, said.append) == tmp_path / "p" / "sparse" / "1"
+        assert all(part in said[-1] for part in ("0 with 2 images", "1 with 5 images", "10 with 3 images", "--colmap"))
+    assert find_colmap_model(tmp_path / "p" / "sparse" / "0", said.append).name == "0"
+    (tmp_path / "p" / "sparse" / "1" / "images.txt").write_text("damaged")
+    assert find_colmap_model(tmp_path / "p").name == "10"
+    assert len(said) == 2
+
+
+def test_two_formats_must_agree(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(5):
+        Image.new("RGB", (4, 4)).save(tmp_path / "images" / f"photo {i}.jpg")
+    folder = write_colmap(tmp_path, frames()) / "sparse" / "0"
+    text = write_colmap(tmp_path / "text", frames(), binary=False) / "sparse" / "0"
+    for name in ("cameras.txt", "images.txt"):
+        shutil.copy(text / name, folder)
+    assert len(read_colmap(tmp_path, None, None, advice="").frames) == 5
+    for name, old, new in (("cameras.txt", "500.5", "600.5"), ("images.txt", "photo 3", "photo 7")):
+        whole = (folder / name).read_text()
+        (folder / name).write_text(whole.replace(old, new))
+        with pytest.raises(InputError, match=r"two ways: .* rm .*\*\.txt, or rm .*\*\.bin"):
+            read_colmap(tmp_path, None, None, advice="")
+        (folder / name).write_text(whole)
+
+
+def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
+    for line, kept in (
+        ("FULL_OPENCV 640 480 500 501 320 240 0.1 0.2 0.01 0.02 0.3 0 0 0", (0.1, 0.2, 0.3, 0.01, 0.02)),
+        ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0 0", (0, 0, 0, 0, 0)),
+        ("FOV 640 480 500 501 320 240 0", (0, 0, 0, 0, 0)),
+        ("OPENCV 640 480 500 501 320 240 0 0 0 0", (0, 0, 0, 0, 0)),
+    ):
+        folder = find_colmap_model(write_colmap(tmp_path / line, frames(1), "PINHOLE", binary=False))
+        (folder / "cameras.txt").write_text(f"1 {line}\n")
+        camera = read_cameras(folder)[1]
+        assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (500, 501, 320, 240, kept)
+    for line, message in (
+        ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"FULL_OPENCV, k4 = 0, k5 = 0\.1"),
+        ("FOV 640 480 500 501 320 240 0.5", r"FOV, omega = 0\.5"),
+        ("OPENCV_FISHEYE 640 480 500 501 320 240 0 0 0 0", "OPENCV_FISHEYE; "),
+    ):
+        (folder / "cameras.txt").write_text(f"1 {line}\n")
+        with pytest.raises(InputError, match=f"{message}.*colmap image_undistorter .*--input_path") as caught:
+            read_cameras(folder)
+        assert "train" not in str(caught.value)
 
 
 def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:

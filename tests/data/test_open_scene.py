@@ -336,6 +336,28 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
         assert scene.train.names == [name for name in names if name not in expected]
 
 
+def test_coordinates_of_a_utm_zone_are_named_with_an_offset(splat, frames, given, tmp_path: Path) -> None:
+    for shift, fails in ((np.array([500_000.0, 5_200_000, 300]), True), (np.array([40.0, -900, 3]), False)):
+        far = [replace(frame, pose=np.column_stack([frame.pose[:, :3], frame.pose[:, 3] + shift])) for frame in frames]
+        project = write_colmap(tmp_path / f"p{fails}", far, "PINHOLE")
+        moved = replace(splat, means=(splat.means.double() + torch.from_numpy(shift)).float())
+        for name, gaussians in (("here.ply", splat), ("far.ply", moved)):
+            path = write_ply(tmp_path / name, ply_columns(gaussians))
+            if not fails:
+                nl.open_splat(path, replace(given, colmap=project))
+                continue
+            what = "The cameras of .*" if name == "here.ply" else r"far\.ply"
+            with pytest.raises(nl.InputError, match=rf"{what}: .*float32 are 0\.5 apart.*500000 5200000 3") as caught:
+                nl.open_splat(path, replace(given, colmap=project))
+            assert "printf '1 0 0 -500000\\n0 1 0 -5200000\\n" in str(caught.value)
+    (tmp_path / "offset.txt").write_text(f"1 0 0 {-shift[0]}\n0 1 0 {-shift[1]}\n0 0 1 {-shift[2]}\n0 0 0 1\n")
+    scene = nl.open_splat(
+        write_ply(tmp_path / "a.ply", ply_columns(splat)),
+        replace(given, colmap=project, world_transform=tmp_path / "offset.txt"),
+    )
+    assert np.allclose(scene.train.frames[0].pose, frames[0].pose, atol=1e-6)
+
+
 def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
     """Two cameras with images of the same names, in copies outside the dataset, which are moved later."""
     entries = []
@@ -363,7 +385,7 @@ def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
         nl.lift_run(again, export=FeatureExport(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
     (tmp_path / "moved" / "left" / "0001.png").rename(tmp_path / "moved" / "0001.png")
     (tmp_path / "moved" / "right" / "0001.png").unlink()
-    with pytest.raises(nl.InputError, match=r"moved/0001\.png for both"):
+    with pytest.raises(nl.InputError, match=r"share the file .*moved/0001\.png"):
         nl.open_splat(path, replace(options, images=tmp_path / "moved"))
 
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import check_frames
 from normlift_ns.data.transforms import read_transforms, write_transforms
 from normlift_ns.errors import InputError
+from normlift_ns.options import SplatOptions
 
 INTRINSICS = {"fl_x": 50.0, "fl_y": 51.0, "cx": 20.5, "cy": 14.5, "w": 40, "h": 30}
 
@@ -31,13 +33,32 @@ def test_frames_stand_in_the_order_of_their_files(tmp_path: Path) -> None:
     assert found.held_out == frozenset()
 
 
-def test_what_stands_in_the_file_counts_before_what_stands_in_a_frame(tmp_path: Path) -> None:
-    path = capture(tmp_path, {"fl_x": 50.0, "k1": 0.1}, fl_x=70.0, fl_y=71.0, k1=0.5, k2=0.6, w=40, h=30)
-    camera = read_transforms(path).frames[0].intrinsics
+def test_what_stands_in_the_file_and_in_a_frame_must_agree(tmp_path: Path) -> None:
+    own = {"fl_x": 50.001, "fl_y": 71.0, "k1": 0.5, "k2": 0.6, "w": 40, "h": 30}
+    camera = read_transforms(capture(tmp_path, {"fl_x": 50.0, "k1": 0.5, "k2": 0.6}, **own)).frames[0].intrinsics
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 71, 20, 15)
-    assert camera.distortion == (0.1, 0, 0, 0, 0)  # any distortion in the file replaces that of the frames
+    assert camera.distortion == (0.5, 0.6, 0, 0, 0)
+    angle = 2 * math.atan(20 / 70)
+    for shared, frame, places in (
+        ({"fl_x": 50.0}, {"fl_x": 70.0}, (".fl_x", ".frames[].fl_x")),
+        ({"fl_x": 50.0}, {"camera_angle_x": angle}, (".fl_x", ".frames[].camera_angle_x")),
+        ({"fl_x": 50.0, "camera_angle_x": angle}, {}, (".fl_x", ".camera_angle_x")),
+        ({"cx": 20.0}, {"cx": 21.0}, (".cx", ".frames[].cx")),
+        ({"k1": 0.1, "k2": 0.2}, {"k1": 0.1}, (".k1, .k2", ".frames[].k1")),
+        ({"w": 40, "h": 30}, {"w": 80, "h": 60}, (".w, .h", ".frames[].w, .frames[].h")),
+        ({"camera_model": "OPENCV"}, {"camera_model": "PINHOLE"}, (".camera_model", ".frames[].camera_model")),
+    ):
+        path = capture(tmp_path, {"fl_x": 50.0, **shared}, **frame)
+        with pytest.raises(InputError, match=r"two ways: .*images/b\.png") as caught:
+            read_transforms(path)
+        for place in places:
+            assert f"jq 'del({place})' transforms.json > new.json" in str(caught.value), place
     path = capture(tmp_path, {}, distortion_params=[0.1, 0.2, 0.3, 0.0, 0.5, 0.6], fl_x=1.0)
     assert read_transforms(path).frames[0].intrinsics.distortion == (0.1, 0.2, 0.3, 0.5, 0.6)
+    path = capture(tmp_path, {"camera_model": "full_opencv", "k3": 0.1, "k6": 0}, fl_x=1.0)
+    assert read_transforms(path).frames[0].intrinsics.k3 == 0.1
+    with pytest.raises(InputError, match=r"k6 = 0\.2"):
+        read_transforms(capture(tmp_path, {"k6": 0.2}, fl_x=1.0))
 
 
 def test_blenders_scenes_have_an_angle_and_names_without_suffix(tmp_path: Path) -> None:
@@ -73,6 +94,59 @@ def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
     (tmp_path / "b/masks/b.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"no mask for .*b\.png in .*masks"):
         read_transforms(path, None, tmp_path / "b" / "masks")
+
+
+def test_a_file_that_two_images_share_is_refused(tmp_path: Path) -> None:
+    names = ("images/left/1.png", "images/right/1.png")
+    masks = tmp_path / "masks"
+    for name in ("1.png", "static.png"):
+        masks.mkdir(exist_ok=True)
+        Image.new("L", (40, 30)).save(masks / name)
+    path = capture(tmp_path, names=names)
+    with pytest.raises(InputError, match=r"left/1\.png and .*right/1\.png would share the mask .*masks/1\.png"):
+        read_transforms(path, None, masks)
+    path = capture(tmp_path, names=names, mask_path="masks/1.png")
+    with pytest.raises(InputError, match=r"share the mask .*mask_path of .*transforms\.json"):
+        read_transforms(path)
+    path = capture(tmp_path, names=names, mask_path="masks/static.png")  # of the whole camera
+    assert {frame.mask for frame in read_transforms(path).frames} == {masks / "static.png"}
+    for suffix in (".png.png", ".png"):
+        for side in ("left", "right"):
+            (masks / side).mkdir(exist_ok=True)
+            (masks / side / f"1{suffix}").unlink(missing_ok=True)
+            (masks / side / f"1{suffix}").symlink_to(masks / "static.png")
+        with pytest.raises(InputError, match="share the mask"):
+            read_transforms(path, None, masks)
+    (tmp_path / names[0]).unlink()
+    (tmp_path / names[0]).symlink_to(tmp_path / names[1])
+    with pytest.raises(InputError, match=r"share the file .*1\.png"):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize("start", ["C:\\Users\\me\\scene\\", "D:/scene/", "/home/me/scene/", ".\\", "\\\\nas\\x\\"])
+def test_paths_of_another_machine(tmp_path: Path, start: str) -> None:
+    names = ("images/left/1.png", "images/right/1.png")
+    path = capture(tmp_path / "scene", {**INTRINSICS, "test_filenames": [names[1]]}, names=names)
+    Image.new("L", (40, 30)).save(tmp_path / "scene" / "mask.png")
+    content = json.loads(path.read_text())
+
+    def there(name: str) -> str:
+        return start + (name.replace("/", "\\") if "\\" in start else name)
+
+    for frame in content["frames"]:
+        frame["file_path"], frame["mask_path"] = there(frame["file_path"]), there("mask.png")
+    content["test_filenames"] = [there(name) for name in content["test_filenames"]]
+    path.write_text(json.dumps(content))
+    for images in (None, tmp_path / "scene" / "images"):
+        found = read_transforms(path, images)
+        assert [frame.name for frame in found.frames] == list(names)
+        assert {frame.mask.name for frame in found.frames} == {"mask.png"}
+        assert found.held_out == {names[1]}
+    (tmp_path / "scene" / names[0]).unlink()
+    options = SplatOptions(transforms=path, images=tmp_path / "scene" / "images")
+    with pytest.raises(FileNotFoundError, match=r"1 of the 2 images .*remove them from the camera file") as caught:
+        read_camera_file(options)
+    assert "--images" not in str(caught.value)  # which was given
 
 
 def test_other_content_is_refused(tmp_path: Path) -> None:

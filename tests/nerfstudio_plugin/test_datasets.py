@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -211,6 +212,93 @@ def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
             opened(copied)
 
 
+def test_lists_without_test_images(copied: Path) -> None:
+    path = scene_of(copied) / "transforms.json"
+    names = [f"images/{i:03d}.jpg" for i in range(10)]
+    whole, trained = json.loads(path.read_text()), opened(copied).train.names
+    rest = [name for name in names if name not in trained]
+    for lists, held_out in (
+        ({"train_filenames": trained, "val_filenames": rest}, rest),
+        ({"train_filenames": trained}, []),
+        ({"train_filenames": trained, "val_filenames": [], "test_filenames": rest}, rest),
+    ):
+        path.write_text(json.dumps(whole | lists))
+        scene = opened(copied)
+        assert (scene.train.names, scene.held_out.names) == (trained, held_out)
+    path.write_text(json.dumps(whole | {"val_filenames": rest}))
+    with pytest.raises(InputError, match="split train"):
+        opened(copied)
+
+
+def test_lists_of_a_project_without_test_images(moved: Path) -> None:
+    scene = opened(moved)
+    expected = sorted(scene.train.names), sorted(scene.held_out.names)
+    for name in ("validation", "val"):
+        for split, listed in (("train", expected[0]), (name, expected[1])):
+            text = "\n".join(item.removeprefix("images/") for item in listed)
+            (scene_of(moved) / f"{split}_list.txt").write_text(text)
+        scene = opened(moved)
+        assert (sorted(scene.train.names), sorted(scene.held_out.names)) == expected
+        (scene_of(moved) / f"{name}_list.txt").unlink()
+    model, folder = scene_of(moved) / "sparse" / "0", scene_of(moved) / "images"
+    (model / "images.bin").write_bytes((model / "images.bin").read_bytes().replace(b"00", b"a\\00"))
+    shutil.copytree(folder, folder / "a")
+    (scene_of(moved) / "train_list.txt").unlink()
+    assert sum(name.startswith("images/a/00") for name in opened(moved).train.names) >= 8  # names of Windows
+
+
+@pytest.mark.parametrize("start", ["C:\\scene\\", "/home/me/scene/"])
+def test_datasets_of_another_machine(copied: Path, start: str) -> None:
+    folder = scene_of(copied)
+    path, trained = folder / "transforms.json", opened(copied).train.names
+    whole = json.loads(path.read_text())
+    for frame in whole["frames"]:
+        name = start + frame["file_path"]
+        frame["file_path"] = name.replace("/", "\\") if "\\" in start else name
+    path.write_text(json.dumps(whole))
+    assert opened(copied, data=folder).train.names == trained
+    file = folder / trained[2]
+    file.rename(folder / "elsewhere.jpg")
+    for how in ({}, {"data": folder}):
+        with pytest.raises(FileNotFoundError, match=r"1 of 9 image files.*002|003") as caught:
+            opened(copied, **how)
+        assert ("--data" in str(caught.value)) == (how == {})  # not what was done already
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json is missing.* as it was in the training"):
+        opened(copied, data=folder)
+    whole["frames"][0]["file_path"] = whole["frames"][1]["file_path"].replace("images", "right")
+    path.write_text(json.dumps(whole))
+    (folder / "right").mkdir()
+    (folder / "right" / "001.jpg").symlink_to(folder / "images" / "001.jpg")
+    with pytest.raises(InputError, match=r"share the file .*001\.jpg"):
+        opened(copied)
+
+
+def test_settings_of_other_versions(copied: Path) -> None:
+    text = copied.read_text()
+    for old, new, said in (
+        ("cache_images: gpu", "cache_images: disk", "cache_images is 'disk', .*changes nothing"),
+        ("profiler: basic", "profiler: full", "profiler is 'full'"),
+        ("masks_on_gpu: false", "masks_on_gpu: false\n\\1prefetch_factor: 4", r"Config\.prefetch_factor"),
+        ("sh_degree: 3", "sh_degree: 3\n\\1strategy: mcmc\n\\1max_gs_num: 9", r"Config\.strategy, .*max_gs_num"),
+    ):
+        changed, count = re.subn(rf"^( *){old}", rf"\1{new}", text, flags=re.MULTILINE)
+        assert count == 1
+        copied.write_text(changed)
+        remark, *_ = opened(copied).remarks
+        assert re.search(said, remark), remark
+    for name, value in (("kernel_size", "0.1"), ("render_mode", "RGB+2D"), ("use_2dgs", "true")):
+        copied.write_text(re.sub(r"^( *)sh_degree: 3", rf"\1sh_degree: 3\n\1{name}: {value}", text, flags=re.MULTILINE))
+        with pytest.raises(
+            InputError, match=rf"{name}: .*ns-export gaussian-splat .*--load-ply .*--world-transform"
+        ) as caught:
+            opened(copied)
+        assert "ns-train" not in str(caught.value)
+    copied.write_text(text.replace("NerfstudioDataParserConfig", "ScanNetppDataParserConfig"))
+    with pytest.raises(InputError, match=r"ScanNetpp.*ns-export gaussian-splat --load-config .*--load-ply"):
+        opened(copied)
+
+
 def test_damage_of_json_is_a_message(copied: Path) -> None:
     def load() -> None:
         scene = opened(copied)
@@ -220,3 +308,20 @@ def test_damage_of_json_is_a_message(copied: Path) -> None:
         whole = file.read_bytes()
         fuzz(6, hostile_json(json.loads(whole)), file, load)
         file.write_bytes(whole)
+
+
+def test_smaller_copies_of_images_of_one_name_are_refused(copied: Path) -> None:
+    """nerfstudio looks for all of them in images_2, without their folders."""
+    folder = scene_of(copied)
+    path, config = folder / "transforms.json", copied.read_text()
+    whole = json.loads(path.read_text())
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+        shutil.copy(folder / "images" / "000.jpg", folder / side / "000.jpg")
+    shutil.copytree(folder / "images", folder / "images_2")
+    for i, side in enumerate(("left", "right")):
+        whole["frames"][i]["file_path"] = f"{side}/000.jpg"
+    path.write_text(json.dumps(whole))
+    copied.write_text(config.replace("downscale_factor: null", "downscale_factor: 2"))
+    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg would share the file .*images_2/000\.jpg"):
+        opened(copied)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import types
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
@@ -271,8 +272,17 @@ class ConfigLoader(yaml.SafeLoader):
 
     nerfstudio reads config.yml with `yaml.Loader`, which imports any module and calls any function that the file names.
     This loader imports nothing and calls only the constructors of paths and of one enum; objects are instances of the
-    mirrors of nerfstudio's classes.
+    mirrors of nerfstudio's classes. `unknown` collects the fields that these do not have, with their values.
     """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self.unknown: list[tuple[str, str, Any]] = []
+        """Class, field and value."""
+
+    def pass_over(self, cls: type, known: dict[str, Any], values: dict[str, Any]) -> None:
+        """Record the values whose fields a class does not know."""
+        self.unknown += [(cls.__name__, name, value) for name, value in values.items() if name not in known]
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Reject merge keys (`<<`). Configs do not use them, and a few nested ones would fill the memory."""
@@ -309,8 +319,9 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # translates the field names of version 0.1
         values = dict(vars(config))
+    loader.pass_over(cls, known, values)
     vars(config).clear()
-    for key, field in known.items():  # fields that only newer nerfstudio versions have are dropped
+    for key, field in known.items():
         if key in values:
             vars(config)[key] = values[key]
         elif field.default is not MISSING:
@@ -388,12 +399,42 @@ _RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 """Ranges of the numbers that a lift depends on, each with its description; not every data parser has all of them."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
-_REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
+_REMEDY = "Restore the config.yml that ns-train wrote."
+_TRAINING_ONLY = re.compile(
+    r"(machine|logging|viewer)\..*|pipeline\.datamanager\.(cache_images|cache_images_type|train_cameras_sampling_strategy)"
+)
+"""Fields that change neither what is drawn nor which images are lifted."""
+_DRAWN = re.compile(
+    r"2d|3dgut|unscented|kernel|filter|near_plane|far_plane|radius_clip|eps2d|camera_model|raster|render|modifier|"
+    r"activation|antialias|appearance|embed|deform|motion|exposure|blur|distort"
+)
+"""Words in the names of fields that change what is drawn, or where cameras are."""
+_CLASSES_OF_DRAWN = ("SplatfactoModelConfig", "NormLiftModelConfig", "CameraOptimizerConfig")
+_NOTHING = (None, False, 0, "", "off", "none", "default")
 
 
-def check_config_values(config: Any, path: Path) -> None:
+def export_advice(path: Path) -> str:
+    """Return the commands that lift the Gaussians of a run whose config or dataset is not read.
+
+    Args:
+        path: config.yml of the run.
+    """
+    return (
+        f"Export its Gaussians with: ns-export gaussian-splat --load-config {path} --output-dir exports, and lift them "
+        "with: ns-normlift --load-ply exports/splat.ply --transforms transforms.json (or --colmap PROJECT) "
+        f"--world-transform {path.parent / 'dataparser_transforms.json'}"
+    )
+
+
+def check_config_values(config: Any, path: Path, say: Callable[[str], None] = lambda text: None) -> None:
     """Raise if a config holds values with which stock splatfacto cannot have been trained.
 
+    Unknown choices of newer versions that change nothing are replaced by the default.
+
+    Args:
+        config: the config.
+        path: its file.
+        say: function that is called with a sentence for each choice that was replaced.
     Raises:
         ValueError: if a value does not match its type, a number is out of range, a folder name is invalid, or a
             component is not splatfacto's.
@@ -404,6 +445,12 @@ def check_config_values(config: Any, path: Path) -> None:
     for name, value, expected in chain(
         _type_errors(config, TrainerConfig, "", 0), _name_errors(config), _range_errors(config)
     ):
+        if isinstance(value, str) and _TRAINING_ONLY.fullmatch(name) and expected.startswith("'"):  # names of choices
+            part, _, field = name.rpartition(".")
+            owner: Any = attrgetter(part)(config)
+            setattr(owner, field, next(item.default for item in fields(owner) if item.name == field))
+            say(f"{path}: {name} is {_format(value)}, which changes nothing in a lift and is passed over.")
+            continue
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     pipeline: Any = config.pipeline
     if hasattr(pipeline, "lift"):
@@ -423,7 +470,7 @@ def check_components(config: Any, path: Path) -> None:
             raise InputError(
                 f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
                 f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
-                "Train the capture with: ns-train splatfacto --data ..."
+                f"If its Gaussians are standard ones: {export_advice(path)}"
             )
 
 
@@ -555,9 +602,12 @@ SUPPORTED_METHODS = (
 )
 
 
-def read_trainer_config(path: Path) -> TrainerConfig:
+def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: None) -> TrainerConfig:
     """Read the config.yml of a splatfacto or normlift run, with its paths unchanged.
 
+    Args:
+        path: the file.
+        say: function that is called with a sentence for each setting that is passed over.
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
@@ -568,18 +618,28 @@ def read_trainer_config(path: Path) -> TrainerConfig:
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
-            "Train the capture with: ns-train splatfacto --data ...; or, if the run's Gaussians are standard ones, "
-            "export them with ns-export gaussian-splat and lift that file with --load-ply"
+            "Train the capture with: ns-train splatfacto --data ...; or, if the run's Gaussians are standard ones: "
+            f"{export_advice(path)}"
         )
+    loader = ConfigLoader("")
     try:
-        config = ConfigLoader("").construct_document(root)
+        config = loader.construct_document(root)
     except Exception as error:  # PyYAML converts values to dates, numbers and sets without catching their errors
         raise InputError(
             f"{path} cannot be read: {describe_yaml_error(error)}. Only the configuration classes of splatfacto and "
             "normlift_ns are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
-            "blender-data. Convert other datasets to one of those formats with ns-process-data, and train on that."
+            f"blender-data. {export_advice(path)}"
         ) from error
-    check_config_values(config, path)
+    for cls, name, value in loader.unknown:
+        if cls in _CLASSES_OF_DRAWN and _DRAWN.search(name) and value not in _NOTHING:
+            raise InputError(
+                f"{path}: {cls} has the setting {name}: {_format(value)}, which changes what is drawn and is not known "
+                f"here. If its Gaussians are standard ones: {export_advice(path)}"
+            )
+    if len(loader.unknown) > 0:
+        names = ", ".join(f"{cls}.{name}" for cls, name, _ in loader.unknown)
+        say(f"{path} has settings of another version of nerfstudio, which are passed over: {names[:1000]}.")
+    check_config_values(config, path, say)
     return config
 
 

@@ -17,11 +17,17 @@ from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from normlift_ns.data.colmap import ColmapCamera, ColmapImage, read_colmap_model
-from normlift_ns.data.frames import PERSPECTIVE_MODELS, read_image_header
+from normlift_ns.data.frames import PERSPECTIVE_MODELS, plain_name, possible_paths, read_image_header
 from normlift_ns.data.nerfstudio import config_classes
-from normlift_ns.data.transforms import DISTORTION, FrameEntry, TransformsEntries, read_transforms_entries
+from normlift_ns.data.transforms import (
+    DISTORTION,
+    FrameEntry,
+    TransformsEntries,
+    read_transforms_entries,
+    relative_name,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.io.guard import read_text
+from normlift_ns.io.guard import check_files_distinct, read_text
 
 _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
 
@@ -262,12 +268,15 @@ def split_files(
 ) -> tuple[Any, Any]:
     """Return the indices of the training and the evaluation images: by the dataset's lists, or else by eval_mode.
 
+    Evaluation images are those of the test list, else those that ns-train itself evaluates on: of the validation list.
+
     Raises:
-        ValueError: if only one of the train and test lists exists, a listed file is missing, or eval_mode is filename
-            and a file name does not contain its split.
+        ValueError: if there are lists, but not that of the training images, a listed file is missing, or eval_mode is
+            filename and a file name does not contain its split.
     """
     if any(names is not None for names in lists.values()):
-        return _listed_files(files, lists["train"], "train"), _listed_files(files, lists["test"], "test")
+        held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]
+        return _listed_files(files, lists["train"], "train"), _listed_files(files, (*held_out, ())[0], "test")
     indices = np.arange(len(files))
     if parser.eval_mode == "fraction":
         count = math.ceil(len(files) * parser.train_split_fraction)
@@ -297,6 +306,7 @@ def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarr
 
 MAX_AUTO_RESOLUTION = 1600
 _ADVICE = "Restore it, or give the path of the dataset with --data."
+_ADVICE_IF_GIVEN = "Restore the dataset as it was in the training."
 _COLMAP_MODELS = (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """COLMAP's camera models that nerfstudio reads."""
 _FLIP = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
@@ -315,29 +325,32 @@ _CAMERA_TYPES = {
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
-def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig) -> ParsedDataset:
+def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig, *, data_given: bool = False) -> ParsedDataset:
     """Read the dataset of a run.
 
     If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts
     all numbers in the files. Here, these are errors with advice instead.
 
+    Args:
+        datamanager: the config.
+        data_given: True if the path of the dataset was given with --data, which messages then do not advise.
     Raises:
         FileNotFoundError: if a camera file, an image folder or an image whose size matters is missing.
         ValueError: if a camera file is damaged or holds invalid numbers, or nerfstudio could not read the dataset.
     """
-    parser = datamanager.dataparser
+    parser, advice = datamanager.dataparser, _ADVICE_IF_GIVEN if data_given else _ADVICE
     try:
         dataset = _PARSERS[type(parser)](parser)
         if len(dataset.train) == 0:
             raise InputError("no image is left for the training")
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error} {advice}") from error
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy on unusable numbers
         if isinstance(error, InputError) and str(parser.data) in str(error):
-            raise
+            raise InputError(f"{str(error).removesuffix('.')}. {advice}") from error
         raise InputError(
             f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
-            "that the run was trained with; give its path with --data."
+            f"that the run was trained with. {advice}"
         ) from error
     scale = datamanager.camera_res_scale_factor
     return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))
@@ -345,14 +358,14 @@ def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig) -> Par
 
 def _entries(path: Path, data: Path) -> TransformsEntries:
     if not path.exists():
-        raise FileNotFoundError(f"{path} is missing from the dataset {data}. {_ADVICE}")
+        raise FileNotFoundError(f"{path} is missing from the dataset {data}.")
     return read_transforms_entries(path)
 
 
 def _image_size(file: Path, data: Path) -> tuple[int, int]:
     """Return the width and height of an image."""
     if not file.exists():
-        raise FileNotFoundError(f"{file} is missing from the dataset {data}. {_ADVICE}")
+        raise FileNotFoundError(f"{file} is missing from the dataset {data}.")
     return read_image_header(file).size
 
 
@@ -385,7 +398,7 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classe
     if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
         raise InputError(
             f"{path}: all {len(meta.frames)} cameras have the same position, so nerfstudio cannot scale them. Expected "
-            "the cameras that the run was trained with; give the path of the dataset with --data."
+            "the cameras that the run was trained with."
         )
     _check_files([path.parent / frame.file_path for frame in meta.frames], path)
     count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
@@ -397,26 +410,57 @@ def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedData
     path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
     folder, meta = path.parent, _entries(path, parser.data)
     _check_transforms(meta, path, parser)
-    first = folder / meta.frames[0].file_path
-    factor = _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
+    factor = _transforms_factor(folder, meta, parser)
 
     def resolve(name: str, prefix: str = "images_") -> Path:
-        return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
+        file = _listed(folder, name)
+        return folder / f"{prefix}{factor}" / file.name if factor > 1 else file
 
     order = np.argsort([resolve(frame.file_path) for frame in meta.frames])  # type: ignore[arg-type]
     frames = [meta.frames[i] for i in order]
     files = [resolve(frame.file_path) for frame in frames]
     masks = [resolve(frame.mask_path, "masks_") for frame in frames if frame.mask_path is not None]
-    resolved = {split: None if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
-    split_indices = split_files(files, resolved, parser)
+    lists = {split: names if names is None else list(map(resolve, names)) for split, names in meta.lists.items()}
+    split_indices = split_files(files, lists, parser)
     orientation = parser.orientation_method if meta.orientation_override is None else meta.orientation_override
     poses, transform, scale = normalize_poses([frame.transform_matrix for frame in frames], parser, orientation)
+    files, masks = _locate_all(frames, files, masks, path, are_copies=factor > 1)
     split = DatasetSplit(
         files, masks or None, _camera_type(meta), poses[:, :3, :4], *_lenses([_row(meta, frame) for frame in frames])
     )
     train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
     transform = compose_applied_transform(transform, meta.applied_rows(parser.data))
     return ParsedDataset(train, held_out, transform, scale * float(meta.applied_scale))
+
+
+def _transforms_factor(folder: Path, meta: TransformsEntries, parser: config_classes.NerfstudioDataParserConfig) -> int:
+    first = _locate(_listed(folder, meta.frames[0].file_path), folder)
+    return _downscale_factor(first, parser, lambda factor: (folder / f"images_{factor}" / first.name).exists())
+
+
+def _locate_all(
+    frames: Sequence[FrameEntry], files: Sequence[Path], masks: Sequence[Path], path: Path, *, are_copies: bool
+) -> tuple[list[Path], list[Path]]:
+    """Return the images and masks as `_locate` does; raise if two names lead to one image, or to one copy of a mask."""
+    found = [[_locate(file, path.parent) for file in group] for group in (files, masks)]
+    remedy = f"in the folders that {path} lists"
+    check_files_distinct(zip((frame.file_path for frame in frames), found[0]), "file", remedy)
+    if are_copies:
+        check_files_distinct(zip((frame.mask_path or "" for frame in frames), found[1]), "mask", remedy)
+    return found[0], found[1]
+
+
+def _listed(folder: Path, name: str) -> Path:
+    """Return the path of a file in a folder by a name that may have been written on Windows."""
+    return folder / (name if (folder / name).exists() else plain_name(name))
+
+
+def _locate(file: Path, folder: Path) -> Path:
+    """Return a listed file, or the one in the folder if its path is that of another machine."""
+    if file.exists():
+        return file
+    name = relative_name(file, folder)
+    return next((other for other in possible_paths(folder, name) if other.is_file()), file)
 
 
 def _camera_type(meta: TransformsEntries) -> str:
@@ -459,7 +503,7 @@ def _blender_split(parser: config_classes.BlenderDataParserConfig, split: str) -
     meta = _entries(path, parser.data)
     angle = meta.camera_angle_x
     if angle is None or not 0 < angle < math.pi:
-        raise InputError(f"{path}: camera_angle_x is {angle}, expected radians between 0 and pi. {_ADVICE}")
+        raise InputError(f"{path}: camera_angle_x is {angle}, expected radians between 0 and pi.")
     files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in meta.frames]
     _check_files(files, path)
     width, height = _image_size(files[0], parser.data)
@@ -475,21 +519,19 @@ def _blender_split(parser: config_classes.BlenderDataParserConfig, split: str) -
 def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDataset:
     model, images_dir = parser.data / parser.colmap_path, parser.data / parser.images_path
     if not model.is_dir():
-        raise FileNotFoundError(
-            f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
-        )
+        raise FileNotFoundError(f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}.")
     cameras, images = read_colmap_model(model, text_first=True)
     images.sort(key=lambda image: image.image_id)
-    full_size = [images_dir / image.name for image in images]
+    full_size = [_listed(images_dir, image.name) for image in images]
     _check_files(full_size, model)
     factor = _downscale_factor(full_size[0], parser)
     files = _downscaled(full_size, images_dir, factor)
+    check_files_distinct(zip((image.name for image in images), files), "file", f"in the folders that {model} lists")
     missing = sorted({file.parent for file in files if factor > 1 and not file.parent.is_dir()})
     if missing:  # nerfstudio would offer to create it
         raise FileNotFoundError(
             f"There is no folder {missing[0]} of images at 1/{factor} of their size, with which the run was trained. "
-            f"Copy it from the machine of the training, or create it by resizing the images in {images_dir}. "
-            "normlift_ns does not write into datasets."
+            f"Create it by resizing the images in {images_dir}; normlift_ns does not write into datasets."
         )
     masks = None
     if parser.masks_path is not None:
@@ -545,9 +587,11 @@ def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
 
 def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]:
     folder, lists = parser.data / parser.images_path, {}
-    for split in ("train", "test", "validation"):
-        path = parser.data / f"{split}_list.txt"
-        lists[split] = [folder / name for name in read_text(path).splitlines()] if path.is_file() else None
+    for split, name in (("train", "train"), ("test", "test"), ("val", "validation"), ("val", "val")):
+        path = parser.data / f"{name}_list.txt"
+        if lists.get(split) is not None or (name == "val" and lists["train"] is None):
+            continue  # nerfstudio reads val_list.txt, but looks for validation_list.txt
+        lists[split] = [_listed(folder, name) for name in read_text(path).splitlines()] if path.is_file() else None
     return lists
 
 

@@ -216,7 +216,8 @@ def load_nerfstudio_scene(
         ValueError: if the config belongs to another method or program, the checkpoint is damaged, or the dataset is not
             the one of the run.
     """
-    stored = read_trainer_config(load_config)
+    said: list[str] = []
+    stored = read_trainer_config(load_config, said.append)
     location = locate_run(stored, load_config, data)
     config = with_absolute_paths(stored, location)
     checkpoint = read_checkpoint(find_checkpoint(config.relative_model_dir, load_step))
@@ -232,18 +233,19 @@ def load_nerfstudio_scene(
     if not bool(gaussians.drawable.any()):
         raise InputError(
             f"{checkpoint.path}: none of its {len(gaussians):,} Gaussians can be drawn, because all have parameters "
-            "that are NaN or infinite, or zero quaternions. Give another checkpoint with --load-step, or train again."
+            "that are NaN or infinite, or zero quaternions. Give another checkpoint with --load-step."
         )
-    dataset = parse_dataset(datamanager)
+    dataset = parse_dataset(datamanager, data_given=data is not None)
+    advice = "" if data is not None else ", or give the path of the dataset with --data"
     files = [*dataset.train.files, *(dataset.train.masks or ())]
     missing = [file for file in files if not file.is_file()]
     if missing:  # found before a lift that takes minutes
         raise FileNotFoundError(
             f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing; the first is "
-            f"{missing[0]}. Put them back, or give the path of the dataset with --data."
+            f"{missing[0]}. Put them back{advice}."
         )
-    remarks = _check_transform(dataset.transform, dataset.scale, location)
-    poses = _training_poses(dataset.train, model, checkpoint)
+    remarks = _check_transform(dataset.transform, dataset.scale, location, advice)
+    poses = _training_poses(dataset.train, model, checkpoint, advice)
     color = _background_color(model)
     if dataset.train.camera_type == "FISHEYE624":  # Aria's cameras, which only nerfstudio can undistort
         from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
@@ -252,16 +254,22 @@ def load_nerfstudio_scene(
     else:
         train = TrainedViews(dataset.train, location.folder, poses, color, datamanager)
         held_out = TrainedViews(dataset.held_out, location.folder, dataset.held_out.poses, color, datamanager)
-    remarks += train.check_files()
+    remarks = (*said, *remarks, *train.check_files())
     identity = {"source_config": str(location.run_dir / "config.yml"), "source_step": checkpoint.step}
     return NerfstudioScene(
         stored, location, checkpoint, gaussians, train, held_out, dataset.transform, dataset.scale, identity, remarks
     )
 
 
-def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: RunLocation) -> tuple[str, ...]:
+def _check_transform(
+    transform: Float[Tensor, "3 4"], scale: float, location: RunLocation, advice: str
+) -> tuple[str, ...]:
     """Raise if the dataset does not lead to the world of the Gaussians, which nerfstudio derives from all poses.
 
+    Args:
+        transform, scale: map from the poses in the dataset to the world of the Gaussians.
+        location: paths of the run.
+        advice: what to do besides restoring the dataset, for error messages.
     Returns:
         Warnings in whole sentences.
     """
@@ -278,8 +286,7 @@ def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: Ru
         raise InputError(
             f"The dataset {location.data} is not the one that {location.run_dir} was trained with: its poses give "
             f"scale {scale:.6g}, the training had {trained.scale:.6g}, and the world coordinates differ by up to "
-            f"{gap:.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json, or give the right "
-            "dataset with --data."
+            f"{gap:.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json{advice}."
         )
     return ()
 
@@ -290,7 +297,7 @@ def _in_scene_units(transform: Tensor, scale: float) -> Tensor:
 
 
 def _training_poses(
-    split: DatasetSplit, model: config_classes.SplatfactoModelConfig, checkpoint: Checkpoint
+    split: DatasetSplit, model: config_classes.SplatfactoModelConfig, checkpoint: Checkpoint, advice: str
 ) -> Float[Tensor, "v 3 4"]:
     """Return the poses that the Gaussians were fitted to; splatfacto applies optimized poses during training only."""
     if model.camera_optimizer.mode == "off":
@@ -300,8 +307,8 @@ def _training_poses(
     if adjustment is None or count != len(split):
         raise InputError(
             f"The run optimized its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
-            f"{count} pose adjustments for {len(split)} training images. Use the checkpoint and the dataset of the "
-            "run; give the path of the dataset with --data."
+            f"{count} pose adjustments for {len(split)} training images. Restore the checkpoint and the dataset "
+            f"of the run{advice}."
         )
     if adjustment.shape[1:] != (6,) or not bool(adjustment.isfinite().all()):
         raise InputError(
