@@ -250,7 +250,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
 
 
 def plain_name(name: str) -> str:
-    """Return a path with forward slashes, also if a program on Windows wrote it.
+    r"""Return a path with forward slashes, also if a program on Windows wrote it.
 
     >>> plain_name("images\\left\\1.png"), plain_name("C:\\a\\1.png"), plain_name("images/1.png")
     ('images/left/1.png', 'C:/a/1.png', 'images/1.png')

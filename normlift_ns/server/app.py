@@ -326,7 +326,7 @@ class WarmServer:
         """Start to serve in a thread, and return the port: that of the options, or the next free one."""
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
-            self.app(extra_routes, lifespan), log_config=None, access_log=False, server_header=False,
+            self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
             ws="websockets-sansio", ws_max_size=MAX_BODY, ws_per_message_deflate=False, ws_ping_interval=20.0,
             timeout_keep_alive=20, timeout_graceful_shutdown=2, limit_concurrency=MAX_CONNECTIONS,
         )  # fmt: skip

@@ -178,6 +178,7 @@ def test_bodies_are_bounded_headers_are_strict_and_no_file_outside_is_served(cli
     (tmp_path / "page" / "assets" / "a.js").write_text("1")
     (tmp_path / "secret").write_text("2")
     (tmp_path / "page" / "assets" / "link").symlink_to(tmp_path / "secret")
+    monkeypatch.setattr(app_module, "PAGE_FOLDER", tmp_path / "none")
     assert "build" in client.get("/").text
     monkeypatch.setattr(app_module, "PAGE_FOLDER", tmp_path / "page")
     assert client.get("/").text == "<p>the page" and client.get("/assets/a.js").text == "1"
