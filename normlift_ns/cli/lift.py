@@ -19,7 +19,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from normlift_ns.cli import common, preflight
-from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.distributed.launch import LAUNCHED_VARIABLE, distributed_context, launch_processes, rank_and_world_size
 from normlift_ns.errors import InputError
 from normlift_ns.io.memory import refuse_small_memory
@@ -221,6 +220,8 @@ class NormLift(CheckedOptions):
             InputError, OSError: The config is invalid or cannot be read.
         """
         if self.load_config is not None:
+            from normlift_ns.data.nerfstudio.config import read_config_paths  # noqa: PLC0415 (as --help)
+
             paths = read_config_paths(self.load_config)
             return paths.experiment, self.output_dir or paths.output_dir
         cameras = (self.splat.colmap or self.splat.transforms or Path()).absolute()

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import complete_interrupted_writes, refuse_existing
 from normlift_ns.io.guard import protect_inputs
@@ -117,6 +116,8 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
         complete_interrupted_writes(run_dir.parent)  # finish a replacement of the run that was killed
+    from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths  # noqa: PLC0415 (as --help)
+
     check_config_exists(config, written_by)
     _check_access(config, "--load-config")
     if data is not None and not data.exists():

@@ -13,8 +13,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from rich.table import Table
-
 from normlift_ns.cli import common
 from normlift_ns.cli.preflight import (
     check_lifted_run,
@@ -38,6 +36,8 @@ from normlift_ns.options import (
 )
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
     from normlift_ns.analysis.objects import Catalogue
     from normlift_ns.data.open_scene import StoredRun
@@ -486,6 +486,8 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         threshold: Threshold that each histogram marks with a bar |.
         narrow: Leave out the histograms and the verdicts.
     """
+    from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
+
     from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
     result = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
@@ -522,6 +524,8 @@ _MAX_ROWS = 40
 
 def print_catalog(catalog: Catalogue) -> None:
     """Print a table of the largest objects, in capture coordinates."""
+    from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
+
     table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if common.CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
@@ -609,6 +613,8 @@ def explanation_table(
     names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False
 ) -> Table:
     """Return a table of the images of every prompt; a narrow table leaves out weights and region counts."""
+    from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
+
     result = Table(title="Why", padding=(0, 0 if narrow else 1))
     for name in ("text", "", "image"):
         result.add_column(name, overflow="fold")
@@ -636,6 +642,8 @@ def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> No
 
     limit = max(row["min_reliability"] for row in rows)
     reliable = f" and reliability at least {limit:g}" if limit > 0 else ""
+    from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
+
     table = Table(
         title=f"SAM 3: Gaussians with more than {MIN_MASK_FRACTION:.0%} of their weight in its masks{reliable}"
     )
