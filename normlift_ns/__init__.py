@@ -1,6 +1,6 @@
 """Training-free open-vocabulary semantics for trained Gaussian splats. See README.md and docs/method.md.
 
-The names below are imported lazily, on first use, so importing the package is fast.
+The public names are imported on first use, so importing the package itself is fast.
 """
 
 from importlib import import_module

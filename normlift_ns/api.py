@@ -1,4 +1,4 @@
-"""Lifting into a new run: the function `lift_run`, its request and its checks, and the directory that it writes."""
+"""Lifting of a trained scene into a new run: `lift_run`, its request, its checks, and the directory that it writes."""
 
 from __future__ import annotations
 
@@ -98,29 +98,28 @@ def lift_run(
 
     Args:
         config_or_scene: config.yml of the trained run, or a scene from `open_scene` or `open_splat`.
-        source: which 2D features to compute from the images. If None, use the defaults of ns-normlift.
-        features: your own features, instead of `source`. A training image has a label map [H, W] and vectors [R, D].
-            The label map has the size of the undistorted image, before or after `lift_downscale`. Its values are
-            regions 0..R-1, or -1 for no region. Pass one pair per image, or a dictionary by image name, which may
-            omit images.
-        texts: prompts of your own features, with their vectors [D]. The run stores them and can be queried with them.
-        lift: options of the lift.
+        source: options of the 2D features to compute from the images. If None, use the defaults of ns-normlift.
+        features: your own features, instead of `source`. Each training image has a pair of a label map [H, W] and
+            vectors [R, D]. The label map has the size of the undistorted image, before or after `lift_downscale`. Its
+            values are regions 0..R-1, or -1 for no region. Pass a list with one pair per training image, or a
+            dictionary by image name, which may omit images.
+        texts: prompts for your own features, with their vectors [D]. The run stores them for later queries.
+        lift: options of the lift. If None, use the defaults.
         queries: prompts to store in the run; ns-render and ns-viewer show their relevancy.
-        data: as in `open_scene`, for a config only.
-        load_step: as in `open_scene`, for a config only.
+        data: as in `open_scene`; for a config only.
+        load_step: as in `open_scene`; for a config only.
         output_dir: output folder, instead of the outputs folder of the trained run.
         timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
-        overwrite: replace a run directory of that name, and exported files with other content.
-        check_alignment: compare three training images with renders of the scene first. Warn if they differ; raise if
-            the splat does not show what the images show.
+        overwrite: replace an existing run directory of that name, and exported files whose content differs.
+        check_alignment: compare three training images with renders of the scene before the lift. Warn if they differ,
+            and raise if they do not show the same scene.
         device: auto, cpu or cuda.
-        export: LangSplat files to also write the 2D features to; None: none.
-        report: called with (stage, steps done, total steps).
-        say: called with each status line and warning, for example `print`.
+        export: folder to also write the 2D features to, as LangSplat files. If None, do not write them.
+        report: progress callback, called with (stage, steps done, total steps).
+        say: callback for status lines and warnings, such as `print`.
     Raises:
         FileExistsError: the run directory exists and `overwrite` is False.
-        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if an image, a label map or an
-            option is not valid.
+        FileNotFoundError, ValueError: as in `open_scene`; also if an image, a label map or an option is not valid.
         MemoryError: the lift does not fit into GPU memory.
         TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
 
@@ -152,7 +151,7 @@ class LiftRequest:
     """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
 
     open_scene: Callable[[], Scene]
-    """Opens the trained scene. It is called after all checks that do not need the scene."""
+    """Function that opens the trained scene, called after all checks that do not need the scene."""
     source: SourceOptions | None = None
     features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None
     texts: Mapping[str, Float[Tensor, " d"]] | None = None
@@ -169,16 +168,16 @@ class LiftRequest:
 
     def __post_init__(self) -> None:
         if self.features is None and self.texts is not None:
-            raise InputError("texts are for your own features; pass features, too, or omit texts")
+            raise InputError("texts apply to your own features only; pass features as well, or omit texts")
         if self.features is not None and self.source is not None:
-            raise InputError("features replace source; pass only one of the two")
+            raise InputError("got both features and source; pass only one of them, because features replace source")
         check_prompt_list("queries", self.queries)
         check_bool("check_alignment", self.check_alignment)
         check_bool("overwrite", self.overwrite)
         if self.output_dir is not None:
             check_path("output_dir", self.output_dir)
         if self.timestamp is not None:
-            run_directory(Path(), "run", self.timestamp)  # raise for a bad name before the scene loads
+            run_directory(Path(), "run", self.timestamp)  # raises for an invalid name before the scene loads
         for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
@@ -187,7 +186,7 @@ class LiftRequest:
 
 @dataclass(frozen=True)
 class PreparedLift:
-    """Lift whose scene is open and whose inputs are checked."""
+    """Lift with an open scene and checked inputs."""
 
     request: LiftRequest
     scene: NerfstudioScene | SplatScene
@@ -199,7 +198,7 @@ class PreparedLift:
     texts: Mapping[str, Float[Tensor, " d"]] | None
     """The user's own text embeddings by prompt; None if the encoder embeds prompts."""
     encoder: Mapping[str, Any]
-    """Options that queries need to encode prompts as the features were encoded."""
+    """Options with which queries encode prompts to match the features."""
 
 
 def run_lift(request: LiftRequest) -> LiftedRun:
@@ -218,7 +217,7 @@ def run_lift(request: LiftRequest) -> LiftedRun:
 
 
 def prepare_lift(request: LiftRequest) -> PreparedLift:
-    """Load encoders, open the scene, and name the new run; nothing is written."""
+    """Load encoders, open the scene and choose the run directory, without writing any file."""
     device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
     source = None
@@ -256,7 +255,7 @@ def check_target(prepared: PreparedLift) -> None:
 
 
 def announce(prepared: PreparedLift) -> None:
-    """Report the size of the lift, the 2D features that were chosen automatically, and the warnings of the scene."""
+    """Report the size of the lift, the automatic choice of 2D features, and the warnings about the scene."""
     request, scene, most, say = prepared.request, prepared.scene, prepared.lift.max_views, prepared.request.say
     used = "" if most is None else f"{min(most, len(scene.train))} of "
     say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
@@ -269,14 +268,20 @@ def announce(prepared: PreparedLift) -> None:
 
 
 def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
-    """Compare training images with renders of the scene; return a warning if they differ, and raise if nothing fits."""
+    """Compare training images with renders of the scene.
+
+    Returns:
+        A warning if they differ, else None.
+    Raises:
+        ValueError: they do not show the same scene.
+    """
     settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, options))
     match = measure_alignment(scene, settings, device=device)
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
 def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
-    """Compare training images with renders of the scene, if the request says so; warn or raise if they differ."""
+    """Report the warning of `compare_with_images`, unless the request disables the comparison."""
     if not prepared.request.check_alignment:
         return
     with stages("check") as step:
@@ -314,18 +319,18 @@ def query_to_store(
     """Return the query that a new run stores for these prompts; None without prompts.
 
     Raises:
-        ValueError: the source encodes the prompts in another dimension than the features.
+        ValueError: the vectors of the prompts and the features have different lengths.
     """
     if len(queries) == 0:
         return None
     length = source.text(queries).shape[1]
     if length != field.dimension:
         raise InputError(
-            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; name the model "
+            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; give the model "
             "of the features with --encoder-model and --encoder-pretrained, or give --text-embeddings"
         )
     negatives = None
-    if isinstance(source, PrecomputedFeatures):  # the file with its prompts is not written yet
+    if isinstance(source, PrecomputedFeatures):  # the file with these prompts does not exist yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
     return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
 
@@ -342,31 +347,31 @@ def write_run(
 ) -> Path:
     """Write a lifted run, completely or not at all, and return its directory.
 
-    The directory holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
+    The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
     without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
-    checkpoint also has its cameras in transforms.json, and other settings for reopening it in splat.json.
+    checkpoint also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
 
-    Relative paths in the config of the source run stay relative. Stock ns-* commands therefore run from the directory
-    that the source run was trained in; ns-normlift commands run from any directory.
+    Relative paths in the config of the source run stay relative. nerfstudio's own commands must therefore run in the
+    directory in which the source run was trained. The ns-normlift commands run in any directory.
 
     Args:
         run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
-        question: query to render as relevancy_0, relevancy_1, …
-        text_embeddings: embeddings provided by the user, by prompt.
+        question: query to store, which nerfstudio renders as relevancy_0, relevancy_1, …
+        text_embeddings: the user's own text embeddings, by prompt.
         overwrite: replace an existing directory.
         exact_name: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
     Raises:
         FileExistsError: the directory exists, `exact_name` is True and `overwrite` is False.
         ValueError: the field was lifted from other Gaussians.
-        OSError: writing failed, for instance because the disk is full; no files are left then.
+        OSError: a file cannot be written, for instance because the disk is full. No files remain in that case.
     """
     complete_interrupted_lifts(run_dir)
     if exact_name:
         refuse_existing_run(run_dir, overwrite, source.checkpoint_path)
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
         raise InputError(
-            f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
-            f"{source.checkpoint_path}; lift that checkpoint again."
+            f"The semantic field of {len(field)} Gaussians was not lifted from the {len(source.gaussians)} Gaussians "
+            f"of {source.checkpoint_path}; lift that checkpoint again."
         )
     with draft_directory(run_dir) as folder:
         if isinstance(source, SplatScene):
@@ -399,7 +404,7 @@ def write_run(
             if commit_directory(folder, path, replaced=written_files if overwrite and exact_name else None):
                 return path
     refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
-    raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
+    raise FileExistsError(f"another process created and removed {run_dir} during the lift; run the lift again")
 
 
 def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.TrainerConfig:
@@ -413,7 +418,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
         **{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
     )
     if location.data_moved or config.output_dir.is_absolute():
-        set_dataset(config, location.data)  # a relative path would not be found
+        set_dataset(config, location.data)  # relative paths would not lead to the dataset
     skip_seed_points(config)
     # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
     config.pipeline.datamanager.cache_images = "gpu"
@@ -421,11 +426,10 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
-    """Return the config of a run lifted from a PLY file or gsplat checkpoint, for which nerfstudio has written none.
+    """Return a nerfstudio config for a run lifted from a PLY file or gsplat checkpoint, which has no config of its own.
 
-    Stock nerfstudio loads the cameras in the run directory with it, without transforming them.
-
-    All paths except that of the field are absolute, because there is no training directory for relative paths.
+    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths except
+    that of the field are absolute, because there is no training directory for relative paths.
     """
     cameras = run_dir / TRANSFORMS_FILE
     dataparser = config_classes.NerfstudioDataParserConfig(

@@ -1,4 +1,4 @@
-"""Errors, exit codes and crash logs: user errors as opposed to internal errors."""
+"""Exceptions for user errors, messages and exit codes for all errors, and crash logs for internal errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class InputError(ValueError):
     """Error for an invalid file or argument.
 
     The message names the file or argument, what was found, what was expected and what to do. Missing files raise
-    `FileNotFoundError`, and files that cannot be written `OSError`; any other exception is an internal error.
+    `FileNotFoundError` instead, and files that cannot be written raise `OSError`. All other exceptions are internal
+    errors.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:
@@ -30,28 +31,28 @@ class InputError(ValueError):
 
 
 class ArgumentError(InputError, TypeError):
-    """InputError for an argument of the wrong kind, which Python's own functions report as a TypeError."""
+    """InputError for an argument of the wrong type; also a TypeError, as in Python's own functions."""
 
 
 class PathError(InputError, OSError):
-    """InputError for a path that no file can have, which Python's own functions report as an OSError."""
+    """InputError for a path that no file can have; also an OSError, as in Python's own functions."""
 
 
 class MissingImageError(InputError, KeyError, IndexError):
-    """InputError for a training image that does not exist."""
+    """InputError for a training image that does not exist; also a KeyError and an IndexError."""
 
     __str__ = Exception.__str__  # KeyError would quote the message
 
 
 class OutputError(Exception):
-    """Failed write to standard output. Not an OSError, which loaders would attribute to the file that they read."""
+    """Error for a failed write to standard output. It is not an OSError, because loaders treat those as read errors."""
 
 
 def escape_unprintable(text: str, keep: str = "") -> str:
     r"""Escape unprintable characters, which could move the cursor, hide text or reverse it.
 
     Args:
-        text: Text from outside, such as a prompt or a path.
+        text: Untrusted text, such as a prompt or a path.
         keep: Unprintable characters to keep, for example a line break.
 
     >>> print(escape_unprintable("red\x1b[31m mug\n"))
@@ -66,7 +67,7 @@ _MAX_SUMMARY = 300
 
 
 def truncate_text(text: str, max_length: int = 40) -> str:
-    """Cut a text to at most `max_length` characters.
+    """Cut a text to at most `max_length` characters, with an ellipsis at the cut.
 
     >>> truncate_text("a red bowl", 8)
     'a red b…'
@@ -75,7 +76,7 @@ def truncate_text(text: str, max_length: int = 40) -> str:
 
 
 def summarize_error(error: BaseException) -> str:
-    """Return the beginning of a third-party error message, for use in an error message."""
+    """Return the type and the first line of another package's error, to quote in a message; about 300 characters."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
     lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
     text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
@@ -83,13 +84,13 @@ def summarize_error(error: BaseException) -> str:
 
 
 EXIT_USER_ERROR, EXIT_INTERNAL_ERROR = 1, 70
-"""Exit codes of user errors and internal errors; 70 is EX_SOFTWARE of sysexits.h."""
+"""Exit codes for user errors and internal errors. 70 is EX_SOFTWARE in sysexits.h."""
 
 
 def describe_error(error: BaseException) -> tuple[str, int]:
     """Return the message for the user and the exit code of a command that fails with this error.
 
-    Unexpected errors also get a log file with their traceback.
+    For internal errors, also write the traceback to a log file.
 
     >>> describe_error(InputError("beta must be positive, got -1"))
     ('beta must be positive, got -1', 1)
@@ -99,7 +100,7 @@ def describe_error(error: BaseException) -> tuple[str, int]:
 
 
 _NO_MEMORY = re.compile(r"DefaultCPUAllocator|can't allocate memory|can't start new thread|std::bad_alloc")
-"""Errors of torch and of Python that mean a full memory."""
+"""Messages of torch and Python that report full memory."""
 
 
 def _user_message(error: BaseException) -> str | None:
@@ -111,7 +112,7 @@ def _user_message(error: BaseException) -> str | None:
         return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         own = str(error) if type(error) is MemoryError else ""
-        advice = "close other programs, or lift fewer or smaller views: --max-views, --lift-downscale"
+        advice = "close other programs, or lift fewer or smaller views with --max-views or --lift-downscale"
         return own or f"the memory is full; {advice}"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
@@ -138,7 +139,7 @@ def _report_bug(error: BaseException) -> str:
 
 
 def log_traceback(error: BaseException) -> Path | None:
-    """Write a traceback to a new file that only the user can read; return None if no folder is writable."""
+    """Write a traceback to a new file that only the user can read, and return its path; None if that fails."""
     text = "".join(traceback.format_exception(error))
     header = f"Python {platform.python_version()}, {platform.platform()}\n{escape_unprintable(' '.join(sys.argv))}\n\n"
     name = f"{time.strftime('%Y-%m-%d_%H%M%S')}_{os.getpid()}_{secrets.token_hex(4)}.log"
@@ -154,7 +155,7 @@ def log_traceback(error: BaseException) -> Path | None:
 
 
 def _log_folders() -> list[Path]:
-    """Return possible folders of log files in order of preference."""
+    """Return the candidate folders for log files, in order of preference."""
     folders = [folder] if (folder := user_state_folder()) is not None else []
     with suppress(OSError):  # no folder for temporary files
         folders.append(Path(tempfile.gettempdir()))

@@ -40,23 +40,23 @@ _MAX_CHUNK = 16
 _READERS = 8
 """Number of images that are read in parallel while one is processed or a network loads."""
 _MIN_SIDE = 8
-"""Minimum side of a downscaled image, in pixels; smaller ones show too little."""
+"""Minimum side length of a downscaled image, in pixels."""
 _CACHE_VERSION = "normlift_ns.block/6"
 """Version in every cache key; increase it when evidence changes for the same input."""
 
 
 @dataclass(frozen=True)
 class RasterConfig:
-    """Rasterization of the evidence of a lift."""
+    """Rasterization settings of a lift."""
 
     gsplat_version: str
-    """Version of gsplat whose rasterization rules apply."""
+    """gsplat version whose rasterization rules apply."""
     backend: BackendName
-    """Backend that rasterizes."""
+    """Rasterization backend, already resolved from auto."""
     dtype: torch.dtype
     rasterize_mode: RasterizeMode
     weight_power: int
-    """Exponent of the summed weights."""
+    """Exponent of the weights in the sums, 1 or 2."""
 
     @property
     def settings(self) -> RasterSettings:
@@ -65,7 +65,7 @@ class RasterConfig:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keywords of `rasterize_evidence`."""
+        """Keyword arguments for `rasterize_evidence`."""
         names = ("backend", "rasterize_mode", "weight_power", "settings", "dtype")
         return {name: getattr(self, name) for name in names}
 
@@ -76,11 +76,11 @@ class RasterConfig:
 
 
 class FeatureExport(NamedTuple):
-    """Export of 2D features to files, in addition to the lift."""
+    """Export of 2D features to LangSplat files, in addition to the lift."""
 
     folder: Path
     overwrite: bool
-    """Replace files with other content."""
+    """Replace existing files whose content differs."""
 
 
 class ViewObservations(NamedTuple):
@@ -92,13 +92,13 @@ class ViewObservations(NamedTuple):
 
     @staticmethod
     def of_block(block: ViewBatch, evidence: Evidence) -> ViewObservations:
-        """Join the features of a block to the evidence of its regions."""
+        """Combine the evidence of a block with the features and levels of its regions."""
         levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
         return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
 
     @staticmethod
     def merge(parts: Iterable[ViewObservations]) -> ViewObservations:
-        """Join several groups of views, in this order."""
+        """Concatenate several groups of views, in the given order."""
         evidence, features, level = zip(*parts)
         return ViewObservations(Evidence.merge(*evidence), torch.cat(features), torch.cat(level))
 
@@ -134,8 +134,8 @@ class EvidenceCollection:
         """Collect evidence, features and levels from all views.
 
         Args:
-            stages: progress of the lift.
-            wait_for_kernels: function that waits until kernels are compiled.
+            stages: timer of the lift, which reports progress.
+            wait_for_kernels: function that waits until the kernels are compiled.
         """
         parts = [self.collect_chunk(chunk, stages, wait_for_kernels) for chunk in chunk_views(self.views)]
         with stages("evidence", len(self.views)):
@@ -165,7 +165,7 @@ class EvidenceCollection:
 
 
 def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
-    """Return the level of each of `count` regions: the first that contains it, 0 for a region without cells.
+    """Return the first level that contains each of `count` regions; 0 for a region without cells.
 
     >>> region_levels(torch.tensor([[0, 0, -1], [1, 2, 2]], dtype=torch.int32), 3).tolist()
     [0, 1, 1]
@@ -177,18 +177,19 @@ def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tenso
 
 
 class ViewBatch(NamedTuple):
-    """Views in the form that the rasterizer and the lift need."""
+    """Batch of views, as input of the rasterizer and the lift."""
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Cell of every pixel; -1 is unlabeled, -2 masked. The pixels of a cell share their region on every level."""
+    """Cell of every pixel; -1 for unlabeled, -2 for masked. On each level, the pixels of a cell have the same region.
+    """
     regions: list[Int32[Tensor, "levels c"]]
-    """Region of every cell, -1 for none."""
+    """Region of every cell on every level; -1 for no region."""
     features: list[Float[Tensor, "r d"]]
 
 
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
-    """Split views into chunks. Each chunk has one evidence file, and is the most that an interrupted lift can lose.
+    """Split views into chunks of at most 16. Each chunk has one evidence file; an interrupted lift loses one at most.
 
     Every process gets the same number of chunks. The evidence of a view does not depend on the other views in its
     chunk.
@@ -225,13 +226,13 @@ def observe_views(
     """Compute labels and features of some training views.
 
     Args:
-        render_settings: rasterizer settings to render the trained scene from the cameras, as a substitute for the
-            images. If None, use the images.
-        downscale: factor by which to downscale images and cameras.
-        on_view: called after every view, with the view as the source received it.
+        render_settings: rasterization rules for renders of the trained scene, which replace the images. If None, use
+            the images.
+        downscale: divisor of the size of images and cameras.
+        on_view: called after every view, with the view that the source received.
     Raises:
-        ValueError, FileNotFoundError: raised by `FeatureSource.view` and `check_undistorted`. Also if an image, a mask
-            or a label map differs in size from its camera.
+        ValueError, FileNotFoundError: as in `FeatureSource.view` and `check_undistorted`; also if an image, a mask or
+            a label map differs in size from its camera.
     """
     source, waiting = downscaled_source(source, downscale), deque[View]()
 
@@ -251,8 +252,8 @@ def observe_views(
         view, labels = waiting.popleft(), result.labels
         if labels.shape != view.image.shape[:2]:
             raise InputError(
-                f"labels of {view.name} are {tuple(labels.shape)}, but the image is {tuple(view.image.shape[:2])} "
-                "(height x width); a feature source must label every pixel"
+                f"the labels of {view.name} are {tuple(labels.shape)}, but the image is {tuple(view.image.shape[:2])} "
+                "(height x width); make the feature source label every pixel"
             )
         block.cameras.append(view.camera)
         block.labels.append(labels if view.mask is None else labels.where(view.mask, MASKED))
@@ -263,7 +264,7 @@ def observe_views(
 
 
 def downscaled_source(source: Any, divisor: int) -> Any:
-    """Return a feature source whose label maps may have the size of images before they were downscaled."""
+    """Return a feature source that also accepts label maps in the image size before downscaling."""
     if isinstance(source, LabelFiles | PrecomputedFeatures) and source.divisor != divisor:
         return replace(source, divisor=divisor)
     for name in {RegionFeatures: ("regions",), CachedRegions: ("inner",)}.get(type(source), ()):
@@ -278,8 +279,8 @@ def _check_sizes(view: View) -> None:
     for name, size in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
         if tuple(size) != expected:
             raise InputError(
-                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); undistort "
-                "both in the same way"
+                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); give an "
+                "image, a mask and a camera of the same size"
             )
 
 
@@ -292,10 +293,10 @@ def batch_evidence(
     reuse: bool,
     on_view: Callable[[], None],
 ) -> Evidence:
-    """Return evidence of the regions in a block.
+    """Return the evidence of the regions in a block, from the evidence of cells.
 
-    It is computed from the evidence of each view's cells, which the folder caches. A view is read from the cache if its
-    scene, camera and labels are the same. Its regions, features and the other views of its block may differ.
+    The folder caches the cell evidence of each view. The function reads a view from the cache if `reuse` is True and
+    its scene, camera and labels are the same. Its regions, its features and the other views of its block may differ.
     """
     keys = evidence_keys(gaussians, block, config)
     cached = find_cached_views(folder, keys) if reuse else {}
@@ -319,13 +320,13 @@ def batch_evidence(
 def cached_batch_evidence(
     gaussians: GaussianScene, block: ViewBatch, folder: Path, config: RasterConfig
 ) -> Evidence | None:
-    """Return the evidence of a block from the cache, or None if a view would have to be rasterized again."""
+    """Return the evidence of a block from the cache, or None if a view is missing there."""
     cached = find_cached_views(folder, evidence_keys(gaussians, block, config))
     return cells_to_regions(join_cached_views(cached), block) if len(cached) == len(block.cameras) else None
 
 
 def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConfig) -> list[str]:
-    """Return the cache key of each view's cell evidence: a digest of everything it depends on."""
+    """Return the cache key of each view's cell evidence, which is a digest of all its inputs."""
     scene = _digest(
         [_CACHE_VERSION, *config.key], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     )
@@ -354,7 +355,7 @@ def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
 
 
 def _downscaled(view: View, divisor: int) -> View:
-    """Downscale a view, and raise if hardly any pixels would be left."""
+    """Downscale a view; raise InputError if a side would be shorter than 8 pixels."""
     camera = view.camera
     height, width = camera.height // divisor, camera.width // divisor
     if min(height, width) < _MIN_SIDE:
@@ -369,12 +370,12 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     """Check that the label map of an undistorted image was not made from the original, distorted image.
 
     Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
-    show the distorted image, so only maps of exactly the undistorted size are accepted.
+    show the distorted image, so the function accepts only maps of exactly the undistorted size.
 
     Args:
-        views: The same view at every size at which the source may have processed it.
+        views: The same view at every size that the label map may have.
     Raises:
-        ValueError: If a map has another size, unless the source resamples maps; then the function warns.
+        ValueError: The map has another size. If the source resamples maps, the function warns instead.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
@@ -383,34 +384,34 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         return
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]
-    reason = "training undistorted the image, which moves and crops its content"
+    reason = "training undistorted the image"
     if (width, height) not in sizes:
         kind = "the size of the original image" if (width, height) == original_size else "another size"
-        mismatch = f"is {width}x{height} (width x height), {kind}; {reason}, to {sizes[0][0]}x{sizes[0][1]}"
+        mismatch = f"is {width}x{height} (width x height), {kind}; {reason} to {sizes[0][0]}x{sizes[0][1]}"
         if not maps.resample:
             raise InputError(
-                f"label map {file} of {name} {mismatch}. Make the maps from the undistorted images, or accept an error "
-                "of some pixels: --regions-resample True"
+                f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
+                "--regions-resample True and accept an error of some pixels"
             )
-        warnings.warn(f"label map {file} {mismatch}; it is stretched, and may be some pixels off", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by some pixels", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
-            f"{reason} without changing its size: make sure that the label maps in {file.parent} were made from the "
+            f"{reason} without changing its size. Make sure that the label maps in {file.parent} were made from the "
             "undistorted images",
             stacklevel=2,
         )
 
 
-# Cache of the evidence of rasterized views. A file holds several views, and each view is looked up on its own.
+# Cache of the evidence of rasterized views. A file contains several views, and each view is looked up on its own.
 #
-# A file is named after the keys of its views, and its header lists them. So a view is found whichever views surround
-# it: if images are added between old ones, only the new images are rasterized.
+# The name of a file is a digest of the keys of its views, and its header lists these keys. A view is therefore found
+# in any file: if images are added between old ones, only the new images are rasterized.
 
 
 _VIEWS = "views"
-"""Header entry that holds the keys of the views, in their order."""
+"""Header entry with the keys of the views, in order."""
 _CACHED_HEADERS = 2**14
-"""File headers that a process keeps in memory."""
+"""Maximum number of file headers that a process keeps in memory."""
 CachedView = tuple[Evidence, int]
 """Evidence of several views, and the index of one view in it."""
 
@@ -424,14 +425,14 @@ def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
         keys: Digests of the inputs of each view, in the order of the views.
 
     Raises:
-        OSError: If the file cannot be written, for instance because the disk is full.
+        OSError: The file cannot be written, for instance because the disk is full.
     """
     path = _cache_path(folder, keys)
     evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)}, own=True)
 
 
 def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView]:
-    """Return the cached views by index into `keys`; files that are damaged or have the wrong name are skipped."""
+    """Return the cached views, keyed by their index in `keys`; skip files that are damaged or have a wrong name."""
     places: dict[int, CachedView] = {}
     for path, file_keys in _cached_files(folder, keys):
         wanted = [number for number, key in enumerate(keys) if number not in places and key in file_keys]
@@ -445,7 +446,7 @@ def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView
 
 
 def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
-    """Return for each view whether the header of a file in a folder lists it; only headers are read."""
+    """Return a boolean for each view, which is True if the header of a file in the folder lists its key."""
     listed = {key for keys in _cache_headers(folder).values() for key in keys}
     return [key in listed for key in keys]
 
@@ -473,9 +474,9 @@ def _cache_path(folder: Path, keys: Sequence[str]) -> Path:
 
 
 def _cached_files(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
-    """Yield the files that hold any of the views, with the keys of their views.
+    """Yield the files that contain any of the views, with the keys of all their views.
 
-    The file of exactly these views comes first, then those that hold the most of them.
+    The file with exactly these views comes first. The others follow by decreasing number of these views.
     """
     exact = _cache_path(folder, keys)
     if exact.is_file():
@@ -487,7 +488,7 @@ def _cached_files(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, lis
 
 
 def _cache_headers(folder: Path) -> dict[Path, list[str]]:
-    """Return the keys that the header of each file lists."""
+    """Return the view keys in the header of each file of a folder, by path."""
     try:
         with os.scandir(folder) as entries:
             files = [(entry.path, entry.stat()) for entry in entries if entry.name.endswith(".safetensors")]
@@ -498,7 +499,7 @@ def _cache_headers(folder: Path) -> dict[Path, list[str]]:
 
 @lru_cache(_CACHED_HEADERS)
 def _cache_header(path: str, modified: int, size: int) -> str:
-    """Return the keys in the header of a file, or an empty string if it is damaged."""
+    """Return the view keys in the header of a file, separated by spaces; empty if the file is damaged."""
     try:
         return read_metadata(Path(path)).get(_VIEWS, "")
     except (FileNotFoundError, ValueError):

@@ -33,29 +33,30 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.registry import Registry
 from normlift_ns.rendering.figures import write_masks
 
-# Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties, and as files in
-# other formats.
+# Gaussians as PLY files in the layout of other splat tools, with semantics as additional vertex properties, and as
+# files in other formats.
 
 
 SplatFormat = Literal["ply", "compressed_ply", "glb", "spz", "spz4"]
-"""Format of an exported splat; spz is version 3 of SPZ, which more programs read, and spz4 version 4."""
+"""File format of an exported splat. spz is version 3 of SPZ, which more programs support; spz4 is version 4."""
 _FORMATS: dict[str, SplatFormat] = {".compressed.ply": "compressed_ply", ".glb": "glb", ".spz": "spz"}
-"""Formats by the end of a file name; all other names are those of PLY files."""
+"""Formats by the ending of a file name. All other endings mean PLY."""
 _UNWRITTEN = (".splat", ".sog", ".ksplat", ".gltf")
 MIN_OPACITY_LOGIT = -5.5373
-"""Logit of `MIN_OPACITY` as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
+"""Logit of the opacity 1/255 as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
 INSTANCE_PROPERTIES = ("class_id", "instance_id")
 _MAX_COMMENT_LENGTH = 60
 
 
 def semantic_columns(field: SemanticField, answer: Answer | None, instances: Instances | None) -> dict[str, np.ndarray]:
-    """Return reliability, n_eff, relevancy_0, … as float32, and class_id and instance_id as uint32.
+    """Return columns by name: reliability, n_eff, relevancy_0, … in float32, and class_id and instance_id in uint32.
 
     Ids are unsigned because splat converters turn -1 into 4294967295.
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
-            f"answer has {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; ask this run"
+            f"answer has {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; pass an answer from "
+            "this run"
         )
     scores = {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
     if answer is not None:
@@ -69,25 +70,25 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
 def answer_instances(
     answer: Answer, max_gap: float = OBJECT_MAX_GAP, min_gaussians: int = OBJECT_MIN_GAUSSIANS
 ) -> Instances:
-    """Return class and object of every Gaussian; see `find_instances`."""
+    """Return the class and the object of every Gaussian; see `find_instances`."""
     return find_instances(answer.texts, answer.means, answer.relevancy, answer.selected, max_gap, min_gaussians)
 
 
 def exportable_rows(columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:
-    """Return indices of the kept Gaussians that ns-export would write: parameters finite, opacity at least 1/255."""
+    """Return the indices of kept Gaussians with finite parameters and an opacity of at least 1/255, as in ns-export."""
     finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
     return np.flatnonzero(finite & (columns["opacity"] >= MIN_OPACITY_LOGIT) & keep.cpu().numpy())
 
 
 class TrainedSplat(NamedTuple):
-    """Trained Gaussians, and how to render them."""
+    """Trained Gaussians with their rendering settings."""
 
     parameters: Mapping[str, Tensor]
     """Parameters as in `Scene.parameters`."""
     spherical_harmonics: bool
     """False if colors do not depend on the view (sh_degree 0) and are stored as logits."""
     rasterize_mode: RasterizeMode
-    """Mode that the scene was trained with."""
+    """Rasterization mode that the scene was trained with."""
 
     @staticmethod
     def of(scene: Scene) -> TrainedSplat:
@@ -95,7 +96,7 @@ class TrainedSplat(NamedTuple):
         return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
 
     def with_harmonics(self) -> SplatParameters:
-        """Return the Gaussians on the CPU in float32, with spherical harmonics of degree 0 in place of plain colors."""
+        """Return the Gaussians on the CPU in float32; plain colors become spherical harmonics of degree 0."""
         values = {name: value.detach().float().cpu() for name, value in self.parameters.items()}
         if not self.spherical_harmonics:
             values["features_dc"] = (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
@@ -123,21 +124,21 @@ class TrainedSplat(NamedTuple):
 
 
 class SplatLabels(NamedTuple):
-    """Semantics of all Gaussians, as far as a format has columns for them."""
+    """Semantics of all Gaussians. A file contains those that its format has columns for."""
 
     field: SemanticField
     answer: Answer | None = None
     instances: Instances | None = None
     """Classes and objects of the answer (default: those of `answer_instances`)."""
     objects: Mapping[str, Any] | None = None
-    """Content of <stem>_objects.json. None: no such file, and `overwrite` removes that of an earlier export."""
+    """Content of <stem>_objects.json. If None, there is no such file, and `overwrite` removes an earlier one."""
 
 
 class WrittenSplat(NamedTuple):
     """Summary of an exported splat."""
 
     rows: Int64[np.ndarray, " m"]
-    """Scene indices in the order of the file."""
+    """Indices of the Gaussians in the scene, in the order of the file."""
     remarks: tuple[str, ...]
     """Messages about rounding errors."""
 
@@ -151,20 +152,20 @@ def write_splat(
     file_format: SplatFormat | None = None,
     overwrite: bool = False,
 ) -> WrittenSplat:
-    """Write a splat and, next to it, the scene index of every Gaussian in the order of the file as <stem>_rows.npy.
+    """Write a splat, and the scene indices of its Gaussians in the order of the file to <stem>_rows.npy next to it.
 
-    With an answer, also write the names of its classes and objects as <stem>_names.json. PLY and GLB files contain
+    With an answer, also write the names of its classes and objects to <stem>_names.json. PLY and GLB files contain
     reliabilities, relevancies and labels; the other formats have no columns for them.
 
     Args:
         path: path of the file.
         splat: the Gaussians. The file records the mode "antialiased", because other tools assume "classic" by default.
-        keep: Gaussians to write; those that ns-export would leave out are skipped, see `exportable_rows`.
-        file_format: None: the format that the file name ends with, .glb, .spz or .compressed.ply, else PLY.
+        keep: mask of the Gaussians to write. Those that `exportable_rows` leaves out are skipped.
+        file_format: format of the file. If None, the ending of the file name selects it; see `_FORMATS`.
         overwrite: replace existing files.
     Raises:
         FileExistsError: a file exists, and `overwrite` is False.
-        ValueError: there is no Gaussian to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
+        ValueError: no Gaussian is left to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
             from the origin for SPZ.
         OSError: a file cannot be written, for instance because the disk is full.
     """
@@ -173,7 +174,9 @@ def write_splat(
     if len(rows) == 0:
         count, why = int(keep.sum()), "opacity below 1/255, or parameters that are not finite"
         reason = f"all {count:,} selected Gaussians are invisible ({why})"
-        raise InputError(f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}")
+        raise InputError(
+            f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}; select other Gaussians"
+        )
     if labels.answer is not None and labels.instances is None:
         labels = labels._replace(instances=answer_instances(labels.answer))
     kind = file_format or _named_format(path)
@@ -203,7 +206,7 @@ def write_splat(
 
 def _named_format(path: Path) -> SplatFormat:
     if path.suffix.lower() in _UNWRITTEN:
-        raise InputError(f"{path} is not written: expected a name ending with .ply, {', '.join(_FORMATS)}")
+        raise InputError(f"{path} is not written; give a name that ends with .ply, {', '.join(_FORMATS)}")
     for end, kind in _FORMATS.items():
         if path.name.lower().endswith(end):
             return kind
@@ -223,7 +226,7 @@ def _to_ply(
 def _encode(
     name: str, kind: SplatFormat, splat: TrainedSplat, labels: SplatLabels, rows: Int64[np.ndarray, " m"]
 ) -> tuple[bytes, Int64[np.ndarray, " m"] | slice, tuple[str, ...]]:
-    """Return the bytes of a file, the order of the rows in it, and messages about rounding errors."""
+    """Return the bytes of a file, the order of its rows, and messages about rounding errors."""
     values = {key: value[torch.from_numpy(rows)] for key, value in splat.with_harmonics().parameters.items()}
     visible = SplatParameters(**values)
     if kind == "compressed_ply":
@@ -250,11 +253,11 @@ def _to_json(content: Any) -> str:
     try:
         return json.dumps(content, indent=2, allow_nan=False) + "\n"
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"objects cannot be encoded as JSON: {error}") from None
+        raise InputError(f"objects cannot be encoded as JSON ({error}); pass JSON types only") from None
 
 
 def export_paths(path: Path) -> tuple[Path, Path, Path, Path]:
-    """Return the paths of an export: PLY file, scene indices, names of classes and objects, and table of objects.
+    """Return the paths of an export: the splat, its scene indices, names of classes and objects, and object table.
 
     >>> [file.name for file in export_paths(Path("fox.ply"))]
     ['fox.ply', 'fox_rows.npy', 'fox_names.json', 'fox_objects.json']
@@ -268,13 +271,13 @@ def _comment(text: str) -> str:
     return " ".join(text.encode("ascii", "replace").decode().split())[:_MAX_COMMENT_LENGTH]
 
 
-# Export of Gaussian labels as NPY arrays, in the layout of Pointcept and of SceneSplat's benchmark.
+# Export of labels as NPY arrays, in the layout of Pointcept and of SceneSplat's benchmark.
 
 
 def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
-    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, all or none.
+    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, or no file at all.
 
-    Classes and objects are numbered from 0 here, as class_id - 1 and instance_id - 1; evaluations ignore -1.
+    These files number classes and objects from 0, as class_id - 1 and instance_id - 1. Evaluations ignore -1.
 
     Raises:
         FileExistsError: a file exists, and `overwrite` of the job is False.
@@ -297,7 +300,7 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
 
 
 class CloudTransfer(NamedTuple):
-    """Point cloud to label, with the distance limit and the transform to its coordinates."""
+    """Point cloud to label, with the distance limit and the transform into its coordinates."""
 
     cloud: PlyData
     max_distance: float
@@ -319,12 +322,13 @@ class LabelTransfer(NamedTuple):
 def nearest_gaussians(
     points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], max_distance: float
 ) -> tuple[Int64[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-    """Find the Gaussian whose center is nearest to each point, with a k-d tree, and whether it is within the maximum
-    distance.
+    """Find the nearest center of a Gaussian to each point, with a k-d tree.
 
     Args:
         means: centers of at least one Gaussian.
         max_distance: maximum distance, inclusive.
+    Returns:
+        The row of the nearest center for each point, and True if it is within the maximum distance.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
     (array([1, 0]), array([ True, False]))
@@ -346,7 +350,7 @@ def read_cloud(path: Path) -> PlyData:
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
-        raise FileNotFoundError(f"There is no point cloud at {path}, given with --transfer. {expected}")
+        raise FileNotFoundError(f"{path}, given with --transfer, does not exist. {expected}")
     check_ply_header(path)
     try:
         cloud = PlyData.read(str(path), mmap="c")
@@ -378,14 +382,14 @@ def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
 def label_cloud(
     transfer: CloudTransfer, path: Path, means: np.ndarray, columns: dict[str, np.ndarray], *, overwrite: bool = False
 ) -> LabelTransfer:
-    """Write a cloud with the labels of the nearest Gaussians, and with zeros for points that are too far from any.
+    """Write a cloud with the labels of the nearest Gaussians; points that are too far from all Gaussians get zeros.
 
     Args:
         path: path of the new PLY file.
         means: centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
         columns: labels of these Gaussians, by property name.
     Raises:
-        ValueError: there are no Gaussians at different positions, or as in `write_cloud`.
+        ValueError: there is no Gaussian, all Gaussians are at one position, or as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
@@ -405,7 +409,7 @@ def label_cloud(
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
-    """Write a cloud with additional vertex properties, appended to the existing ones; everything else is unchanged.
+    """Write a cloud with additional vertex properties after the existing ones, and with all other content unchanged.
 
     Raises:
         ValueError: the vertices already have a property of one of these names.
@@ -424,7 +428,7 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
         labeled.write(file)
 
 
-# Exporters of ns-normlift-export, by kind of output. Other packages register theirs as entry points.
+# Exporters of ns-normlift-export, by kind of output. Other packages register their exporters as entry points.
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,7 +438,7 @@ class ExportJob:
     scene: Scene
     field: SemanticField
     keep: Bool[Tensor, " n"]
-    """Gaussians to export, of which exporters leave out invisible ones; see `rows`."""
+    """Mask of the Gaussians to export. Exporters leave out invisible ones; see `rows`."""
     answer: Answer | None = None
     instances: Instances | None = None
     """Classes and objects of the answer; None without an answer."""
@@ -454,13 +458,13 @@ class ExportJob:
 
 @dataclass(frozen=True)
 class Exporter:
-    """Writer of one kind of output; the object that an entry point of the group `normlift_ns.exporters` names."""
+    """Writer of one kind of output, registered as an entry point of the group `normlift_ns.exporters`."""
 
     write: Callable[[ExportJob, Path], Sequence[str]]
-    """Writes all files of the output or none, and returns the lines that report them. It raises FileExistsError if a
-    file exists and `overwrite` of the job is False."""
+    """Function that writes all files of the output or none, and returns the lines to print about them. It raises
+    FileExistsError if a file exists and `overwrite` of the job is False."""
     suffix: str = ""
-    """Suffix of the output, such as ".csv"; "": the output is a folder."""
+    """Suffix of the output file, such as ".csv"; empty if the output is a folder."""
     needs_answer: bool = True
     """True if the job must have an answer."""
 

@@ -1,4 +1,4 @@
-"""Opening of a lifted run, and methods to query, export and render it."""
+"""Lifted runs: opening, queries, exports and renders."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
 
 _MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
-"""Compared with at least 100 words, so many objects of an inventory may have a wrong name by chance; the scene is
-represented by about 5,000 Gaussians."""
+"""Settings of `inventory`: the minimum number of words for its test against chance, the expected number of wrong names
+that this test allows, and the approximate number of Gaussians in its sample of the scene."""
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class LiftedRun:
-    """A trained scene with its semantics, on disk and in memory.
+    """Trained scene with its lifted semantics, on disk and in memory.
 
     >>> from normlift_ns import open_run
     >>> run = open_run(config)
@@ -100,10 +100,10 @@ class LiftedRun:
 
     @cached_property
     def texts(self) -> LazyTextEncoder:
-        """Text encoder that fits the field. It loads its network on first use.
+        """Text encoder that matches the field. It loads its network on first use.
 
         Raises:
-            ValueError, FileNotFoundError: for the same reasons as `text_encoder_for`.
+            ValueError, FileNotFoundError: as in `text_encoder_for`.
         """
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
@@ -122,16 +122,16 @@ class LiftedRun:
 
         Args:
             texts: prompts.
-            negatives: prompts to compare with. If None, use LERF's canonical negatives if the encoder knows them.
-            relevancy: how to compute relevancy from cosines, see `normlift_ns.relevancy`. "auto" is lerf with
-                negatives, else cosine.
+            negatives: negative prompts to compare with. If None, use those of the encoder.
+            relevancy: formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
+                the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for bare cosines of encoders other than
-                "color".
-            min_reliability: minimum R of a selected Gaussian, in 0..1.
-            refined: use the refined features, after the vote.
+                relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for the rule cosine with encoders other
+                than "color".
+            min_reliability: minimum reliability R of selected Gaussians, in 0..1.
+            refined: use the directions after the vote.
         Raises:
-            ValueError: there is no prompt, a prompt is empty, or the encoder does not understand one.
+            ValueError: there is no prompt, a prompt is empty, or the encoder cannot encode a prompt.
         """
         question = make_query(
             self.field,
@@ -146,23 +146,25 @@ class LiftedRun:
         return run_query(self.field, self.scene.gaussians.means, question)
 
     def ask_stored(self) -> Answer | None:
-        """Return the answer to the question stored in the run; None if there is none."""
+        """Answer the query that is stored in the run; return None if the run stores no query."""
         question = load_query(self.folder / FIELD_FOLDER)
         return None if question is None else run_query(self.field, self.scene.gaussians.means, question)
 
     @check_arguments
     def save(self, question: Query | Answer) -> Path:
-        """Store a question in the run, replacing an earlier one. ns-render and ns-viewer draw its answer.
+        """Store a query in the run in place of an earlier one, and return the path of its file.
+
+        ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: the vectors have another length than the field's directions.
+            ValueError: the vectors of the query and the directions of the field have different lengths.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
-                f"the question has vectors of {question.embeddings.shape[1]} numbers, but the features of "
+                f"the query has vectors of {question.embeddings.shape[1]} numbers, but the features of "
                 f"{self.folder} "
-                f"have {self.field.dimension}; query this run, then save its answer"
+                f"have {self.field.dimension}; query this run again, and save that answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
 
@@ -185,21 +187,21 @@ class LiftedRun:
         contain reliabilities, relevancies and labels.
 
         Args:
-            path: file to write: GLB, SPZ or compressed PLY if its name ends with .glb, .spz or .compressed.ply, else
-                PLY.
-            part: Gaussians selected by an answer or finding, or a mask of Gaussians. If None, write the whole scene.
-            answer: answer that provides relevancies, class_id and instance_id. If None, use that of `part`, if it has
-                one.
+            path: file to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
+                names select PLY.
+            part: answer or finding that selects the Gaussians, or a mask of Gaussians. If None, write the whole scene.
+            answer: answer that provides relevancies, class_id and instance_id. If None, use the answer of `part`, if
+                there is one.
             objects: table to write to <stem>_objects.json, with JSON types only.
-            object_max_gap: largest gap between Gaussians of one object, as in `find_objects`.
+            object_max_gap: maximum gap between Gaussians of one object, as in `find_objects`.
             object_min_gaussians: minimum number of Gaussians in an object, as in `find_objects`.
             overwrite: replace files of these names. Without `objects`, also remove an earlier table of objects.
         Returns:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: no Gaussian of `part` is ever drawn, the mask has another type or length, the name is reserved
-                for a file of a run, or there is no answer that `object_max_gap` and `object_min_gaussians` apply to.
+            ValueError: all Gaussians of `part` are invisible, the mask has the wrong type or length, the name is
+                reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -211,10 +213,12 @@ class LiftedRun:
             check_number("object_min_gaussians", object_min_gaussians, int),
         )
         if answer is None and limits != (OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS):
-            raise InputError("object_max_gap and object_min_gaussians have no effect without an answer; give one")
+            raise InputError(
+                "object_max_gap and object_min_gaussians have no effect without an answer; pass an answer, or omit them"
+            )
         for file, written in zip(exports.export_paths(path), (True, True, answer is not None, objects is not None)):
             if written and file.exists() and not overwrite:
-                raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
+                raise FileExistsError(f"{file} exists; give another name, or pass overwrite=True")
         instances = None if answer is None else exports.answer_instances(answer, *limits)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         labels = exports.SplatLabels(self.field, answer, instances, objects)
@@ -233,16 +237,16 @@ class LiftedRun:
         """Write a PNG mask for each training image, with the size of the image, and return the paths.
 
         A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
-        Lens distortion is removed, as in training.
+        The masks fit the images after the undistortion of the training.
 
         Args:
             folder: folder to write to.
-            part: Gaussians selected by an answer or finding, or a mask of Gaussians.
-            rest: invert the masks. Pixels without any Gaussian are then 255, too.
+            part: answer or finding that selects the Gaussians, or a mask of Gaussians.
+            rest: invert the masks. Pixels without any Gaussian are then 255 as well.
             overwrite: replace files of these names.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: the mask has another type or length.
+            ValueError: the mask has the wrong type or length.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -264,18 +268,18 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
     ) -> exports.LabelTransfer:
-        """Label a point cloud or mesh from the nearest Gaussians, and write it to a new PLY file.
+        """Label a point cloud or mesh with the nearest Gaussians, and write it to a new PLY file.
 
-        Each point gets the relevancies, class_id and instance_id of its Gaussian.
+        Each point gets the relevancies, class_id and instance_id of its nearest Gaussian.
 
         Args:
             cloud: PLY file to read.
             path: PLY file to write.
-            part: an answer, or a finding, which stands for its answer.
+            part: answer that provides the labels, or a finding of that answer.
             transfer_distance: maximum distance from a point to the center of its Gaussian, in units of the median
                 spacing of the Gaussians.
-            coordinates: coordinate system of the cloud. "capture": the cameras' coordinates before nerfstudio rotated
-                and scaled them. "scene": the Gaussians' coordinates.
+            coordinates: coordinate system of the cloud. "capture" is the system of the cameras before nerfstudio
+                rotated and scaled them, and "scene" that of the Gaussians.
             overwrite: replace a file of that name.
         Raises:
             FileNotFoundError: the cloud does not exist.
@@ -293,12 +297,12 @@ class LiftedRun:
         answer, path = _answer_of(part), check_path("path", path)
         if answer is None:
             raise InputError(
-                f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
+                f"part must be an answer from this run, or its finding for one prompt, got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
         cloud = check_path("cloud", cloud)
         if path.exists() and path.samefile(cloud):
-            raise InputError(f"{path} is the cloud to read, so the labeled cloud cannot be written there")
+            raise InputError(f"{path} is the cloud to read; give another path for the labeled cloud")
         points = exports.read_cloud(cloud)
         rule = exports.CloudTransfer(points, transfer_distance, self.to_capture if coordinates == "capture" else None)
         return exports.transfer_labels(
@@ -307,22 +311,22 @@ class LiftedRun:
 
     @cached_property
     def votes(self) -> RecordedVotes:
-        """Evidence of the lift by training image.
+        """Evidence of the lift for each training image.
 
-        `votes.pictures(why.views[:3])` draws that of the three images with the largest share.
+        `votes.pictures(why.views[:3])` renders the evidence of the three images with the largest share.
         """
         return RecordedVotes(self.scene, self.field, cache_folder(self.folder))
 
     @check_arguments
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
-        """Explain a selection: which images and regions voted for it, and how far they agree.
+        """Explain a selection by the images and regions that voted for it, and by their agreement.
 
         Args:
-            part: Gaussians selected by an answer or finding, or a mask of Gaussians, for which refined features are
-                used.
+            part: answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
+                refined directions.
         Raises:
-            ValueError: the selection is empty, the mask has another type or length, or the cache of a run that stores
-                only directions no longer holds the evidence or the features.
+            ValueError: the selection is empty, or the mask has the wrong type or length. Also if the run stores only
+                directions, and the evidence or the features are no longer in its cache.
             FileNotFoundError: the run stores only directions, and an image is missing.
 
         >>> from normlift_ns import open_run
@@ -343,16 +347,16 @@ class LiftedRun:
     ) -> Catalogue:
         """List the objects of a selection, in the coordinates of the capture and in those of the scene.
 
-        Each has a number, size, oriented box, centroid, extent, R and the images that show it. docs/objects.md explains
-        every value.
+        Each object has a number, size, oriented box, centroid, extent, reliability R and the images that show it.
+        docs/objects.md explains every value.
 
         Args:
-            part: Gaussians selected by an answer or finding, or a mask of Gaussians, whose objects have no text. A
-                Gaussian that several prompts select belongs to the one with the largest relevancy.
-            meters_per_unit: length of one unit of the capture in meters. With it, positions in the capture are in
+            part: answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
+                A Gaussian that several prompts select belongs to the prompt with the largest relevancy.
+            meters_per_unit: length of one unit of the capture in meters. If given, positions in the capture are in
                 meters.
         Raises:
-            ValueError: the mask has another type or length, the unit length is not positive, or
+            ValueError: the mask has the wrong type or length, `meters_per_unit` is not positive, or
                 dataparser_transforms.json is damaged.
             FileNotFoundError: the run has no dataparser_transforms.json.
 
@@ -373,18 +377,19 @@ class LiftedRun:
 
     @check_arguments
     def inventory(self, vocabulary: Sequence[str] | None = None, *, meters_per_unit: float | None = None) -> Inventory:
-        """List at most 20 objects of the scene without prompts, see `analysis.inventory`.
+        """List at most 20 objects of the scene without prompts; see `analysis.inventory`.
 
-        An object has a name only if the verdict on the best word of the vocabulary is "found" and the word selects more
-        than half of the object; else it is called "object 3". The word must also stand out, from the 200 unrelated
-        words of the encoder or from at least 100 of the vocabulary, by more than chance would allow. Colors need not.
+        An object is named after the best word of the vocabulary if the verdict on that word is "found" and the word
+        selects more than half of the object. Other objects are called "object 1", "object 2" and so on. Except for
+        colors, the match of the word must also exceed chance, compared with the 200 unrelated words of the encoder or
+        with a vocabulary of at least 100 words.
 
         Args:
-            vocabulary: words to name objects by. If None, use those of the encoder: the 1,000 classes of imagenet, the
-                names of colors, or the texts given with features of your own. Others have none.
+            vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
+                imagenet, the names of colors, or the texts of your own features. Other encoders have no words.
             meters_per_unit: as in `catalogue`.
         Raises:
-            ValueError: the encoder does not understand a word, or as in `why` and `catalogue`.
+            ValueError: the encoder cannot encode a word, or as in `why` and `catalogue`.
             FileNotFoundError: as in `why` and `catalogue`.
 
         >>> from normlift_ns import open_run
@@ -400,8 +405,8 @@ class LiftedRun:
         unknown = [word for word in words if kind is not None and not kind.known_words(word)]
         if len(unknown) > 0:
             raise InputError(
-                f"the encoder of the run does not know {len(unknown)} of the {len(words)} words of the vocabulary; "
-                f"leave them out: {truncate_text(', '.join(unknown), 400)}"
+                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
+                f"remove them: {truncate_text(', '.join(unknown), 400)}"
             )
         (evidence, features), norm = self.votes.table, self.field.scalars.norm
         spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
@@ -418,7 +423,7 @@ class LiftedRun:
     def _names(
         self, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], words: tuple[str, ...]
     ) -> tuple[str, ...]:
-        """Return the name of every object of an inventory."""
+        """Return a name for every object of an inventory."""
         names = [f"object {number}" for number in range(1, len(directions) + 1)]
         if len(words) == 0 or len(names) == 0:
             return tuple(names)
@@ -442,10 +447,10 @@ class LiftedRun:
     def to_capture(self) -> SimilarityTransform:
         """Transform from the coordinates of the Gaussians to those of the capture.
 
-        It inverts the transform that training applied.
+        It is the inverse of the transform that the training applied to the cameras.
 
         Raises:
-            FileNotFoundError, ValueError: for the same reasons as `catalogue`.
+            FileNotFoundError, ValueError: as in `catalogue`.
         """
         return similarity_to_capture(self.folder, self.scene.identity)
 
@@ -458,12 +463,12 @@ class LiftedRun:
 
     @check_arguments
     def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
-        """Find Gaussians that likely belong to no surface, see `analysis.objects`.
+        """Find Gaussians that likely belong to no surface; see `analysis.objects`.
 
         `run.export(path, ~floaters.mask)` writes the scene without them.
 
         Args:
-            limit: score above which a Gaussian is a likely floater.
+            limit: floater score above which a Gaussian is a likely floater.
         Raises:
             ValueError: the limit is not finite.
 
@@ -475,10 +480,10 @@ class LiftedRun:
         return find_floaters(self.scene.gaussians, self.field.scalars, limit=limit)
 
     def _mask(self, part: Any) -> Bool[Tensor, " n"]:
-        """Return the Gaussians of an answer or finding as a mask, or a given mask after a check.
+        """Return an answer, finding or mask as a mask [N] of Gaussians.
 
         Raises:
-            ValueError: `part` does not belong to this run.
+            ValueError: `part` has another type or length.
         """
         mask = part.mask if isinstance(part, Answer | Finding) else None
         if mask is None:
@@ -488,7 +493,7 @@ class LiftedRun:
             actual = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
             raise InputError(
                 f"part must be an answer from this run, its finding for one prompt, or a mask of {len(self.field)} "
-                f"booleans; got {actual}"
+                f"booleans, got {actual}"
             )
         return mask
 
@@ -499,8 +504,8 @@ class LiftedRun:
         Args:
             view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: there is no such image (it is also a KeyError and an IndexError), or several images have this
-                name; include the folder.
+            ValueError: several images have this name, or no image does. The latter is also a KeyError and an
+                IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
@@ -527,8 +532,8 @@ class LiftedRun:
         With an answer, selected Gaussians are colored by relevancy and the others are gray.
 
         Args:
-            view: training image, as in `camera`, or any camera.
-            found: answer, or its finding for one prompt.
+            view: training image as in `camera`, or any camera.
+            found: answer, or its finding for one prompt. If None, render the colors of the scene.
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
         settings = RasterSettings.recorded(self.field.manifest)
@@ -545,12 +550,12 @@ class LiftedRun:
 
 def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
     return MissingImageError(
-        f"view must be a training image: there is no {name}; there are {len(names)}, {names[0]} to {names[-1]}"
+        f"view must be a training image, got {name}; give one of the {len(names)} images {names[0]} to {names[-1]}"
     )
 
 
 def _answer_of(part: Any) -> Answer | None:
-    """Return the answer that `part` is or belongs to; None for a mask."""
+    """Return an answer itself, the answer of a finding, or None for a mask."""
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
@@ -564,18 +569,17 @@ def open_run(
     text_embeddings: str | Path | None = None,
     prompt_template: str | None = None,
 ) -> LiftedRun:
-    """Open a lifted run, from any working directory.
+    """Open a lifted run. The working directory does not matter.
 
     Args:
         load_config: config.yml of the run.
         data: current path of the dataset, if it was moved.
         device: device of the text encoder (auto, cpu or cuda).
         text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
-        prompt_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
-            lift.
+        prompt_template: template for prompts, such as "a photo of {}". If None, use the template of the lift.
     Raises:
-        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if the run has no semantics, or
-            those of other Gaussians.
+        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or those of other
+            Gaussians.
 
     >>> run = open_run(config)
     >>> answer = run.ask("red", "yellow", min_reliability=0.3)

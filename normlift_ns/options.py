@@ -1,9 +1,9 @@
-"""Options of a lift, of queries and of exports as dataclasses, with the table of their ranges.
+"""Options of lifts, queries and exports, as dataclasses that check their values.
 
-Validation of options: one table of ranges, and the declared types. Imports no heavy package.
+The dataclasses call `check_options` in `__post_init__`, which compares each value with its declared type and its range
+in `OPTION_RANGES`. Commands, `ns-train normlift` and Python code therefore report invalid values before they load data.
 
-Options are dataclasses that call `check_options` in `__post_init__`. Wrong values are therefore reported before
-anything is loaded, in the commands, in `ns-train normlift` and in Python.
+This module imports no heavy package, to keep --help fast.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from normlift_ns.errors import InputError, PathError
 from normlift_ns.registry import installed_names
 
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
-"""Default bounds of integers and floats: larger numbers overflow in int32 and float32."""
+"""Default upper bounds of integer and float options, which avoid overflow in int32 and float32."""
 _MIN_DIVISOR = 1e-6
-"""Smallest value of options that the code divides by."""
+"""Lower bound of options that are used as divisors."""
 MAX_PROMPT_LENGTH = 10_000
-"""Largest number of characters in a prompt. CLIP reads about 70 words of it."""
+"""Maximum number of characters in a prompt. CLIP encodes only about the first 70 words."""
 _INVALID = re.compile("[\0\ud800-\udfff]")
-"""Characters that files and encoders cannot hold: NUL, and surrogates, which have no UTF-8."""
+"""Characters that files and encoders cannot store: NUL, and surrogates, which UTF-8 cannot encode."""
 _IMPOSSIBLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
-"""Errors of paths with a name that is too long, links in a loop, or a file in place of a folder."""
+"""Error numbers for a name that is too long, a loop of links, and a file that is used as a folder."""
 _hints = cache(get_type_hints)
 _MAX_SHOWN = 60
-"""Largest number of characters of a value in a message."""
+"""Maximum number of characters of a value that a message quotes."""
 
 
 @dataclass(frozen=True)
 class OptionRange:
-    """Smallest and largest value of an option, and their description in messages."""
+    """Inclusive range of an option, with its description for messages."""
 
     low: float
     high: float
@@ -83,14 +83,14 @@ _OPTIONS_BY_RANGE = {
     OptionRange(1.0, 86400.0, "in 1..86400"): ("patience",),
 }
 OPTION_RANGES = {name: limits for limits, names in _OPTIONS_BY_RANGE.items() for name in names}
-"""Range of every numeric option, by name. No range contains nan or infinity."""
+"""Range of each numeric option, by name. All ranges exclude NaN and infinity."""
 
 _show_flags: ContextVar[bool] = ContextVar("flags", default=False)
 
 
 @contextmanager
 def named_as_flags() -> Iterator[None]:
-    """Let messages name options as flags (--vote-sigma-d) instead of fields (sigma_d)."""
+    """Make messages name options as flags (--vote-sigma-d) instead of fields (sigma_d) in this context."""
     token = _show_flags.set(True)
     try:
         yield
@@ -99,11 +99,11 @@ def named_as_flags() -> Iterator[None]:
 
 
 VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "prior")}
-"""Names of the fields of `RefineConfig` on the command line."""
+"""Command-line names of the fields of `RefineConfig`."""
 
 
 def option_name(name: str) -> str:
-    """Return the name of an option for a message.
+    """Return the name of an option for a message: the field, or the flag inside `named_as_flags`.
 
     >>> option_name("sigma_d")
     'sigma_d'
@@ -114,19 +114,19 @@ def option_name(name: str) -> str:
     return f"--{VOTE_FLAGS.get(name, name).replace('_', '-')}" if _show_flags.get() else name
 
 
-# Renamed options and keywords. The old names work for one version, in Python and on the command line.
+# Renamed options and keyword arguments. The old names work for one version, in Python and on the command line.
 
 
 _Target = TypeVar("_Target")
 
 
 def renamed(**names: str) -> Callable[[_Target], _Target]:
-    """Accept old keywords of a function, or old names of the fields of a dataclass, with a DeprecationWarning.
+    """Make a function accept old keyword arguments, or a dataclass old field names, with a DeprecationWarning.
 
-    Objects that are restored with `__setstate__`, as from a config.yml, may have old names without a warning.
+    `__setstate__` accepts old names without a warning, because the config.yml files of earlier versions have them.
 
     Args:
-        names: New name by old name.
+        names: New names, keyed by old names.
 
     >>> @renamed(part="select")
     ... def export(select): return select
@@ -172,12 +172,12 @@ def _warn_renamed(old: str, new: str) -> None:
 
 
 def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored values of an options dataclass with the names of this version."""
+    """Return the stored values of an options dataclass, keyed by the field names of this version."""
     return {options.old_names.get(name, name): value for name, value in stored.items()}
 
 
 def names_of_0_2(options: Any) -> dict[str, Any]:
-    """Return options as a dictionary with the names of version 0.2, which keys and manifests keep."""
+    """Return options as a dictionary with the field names of version 0.2, which cache keys and manifests still use."""
     old_names = {new: old for old, new in getattr(options, "old_names", {}).items()}
     values = {old_names.get(field.name, field.name): getattr(options, field.name) for field in fields(options)}
     if values.get("encoder") == "color":
@@ -186,10 +186,10 @@ def names_of_0_2(options: Any) -> dict[str, Any]:
 
 
 def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
-    """Return the renamed flags of an options dataclass and of its groups: the new flag by the old one.
+    """Return the renamed flags of an options dataclass and its groups, as a dictionary from old to new flags.
 
     Args:
-        prefix: Start of the flags. In commands of other packages, those of `RefineConfig` have no other names.
+        prefix: Prefix of the flags. With another prefix than "--", the flags of `RefineConfig` have no old names.
     """
     names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
     flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
@@ -199,11 +199,11 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
 
 
 def rename_flags(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:
-    """Return a command line with the new names of its flags; print a line on standard error for each old name.
+    """Replace old flags in a command line by new ones, and print one line per old flag on standard error.
 
     Args:
-        words: The command line. Words after "--" are for another command and stay as they are.
-        flags: The new flag by the old one.
+        words: Command line. Words after "--" belong to another command and stay unchanged.
+        flags: New flags, keyed by old flags.
 
     >>> rename_flags(["--beta=2", "--text_vectors", "a", "--", "--beta"], {"--beta": "--reliability-beta"})
     ['--reliability-beta=2', '--text_vectors', 'a', '--', '--beta']
@@ -234,14 +234,14 @@ def check_options(options: Any) -> None:
 
 
 class CheckedOptions:
-    """Base of options dataclasses whose fields are checked by `check_options` when they are made."""
+    """Base class of options dataclasses; checks the fields of new instances with `check_options`."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
 
 def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -> Any:
-    """Return the value of a numeric option in `OPTION_RANGES` as int or float.
+    """Check the value of a numeric option against `OPTION_RANGES`, and return it as int or float.
 
     Raises:
         InputError: The value is not a number, not finite, or out of range.
@@ -261,16 +261,16 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
 
 
 def check_bool(name: str, value: object) -> None:
-    """Raise InputError unless the value is True or False; the string "False" would be truthy."""
+    """Raise InputError unless the value is True or False. Strings raise too, because even "False" is truthy."""
     if not isinstance(value, bool):
         raise _error(name, "True or False", value)
 
 
 def check_device(device: Any) -> str:
-    """Return the name of a device: auto, cpu, cuda, or cuda:1 for the second GPU.
+    """Check the name of a device, and return it: auto, cpu, cuda, or cuda:1 for the second GPU.
 
     Raises:
-        InputError: The device has another name.
+        InputError: The name is not valid.
 
     >>> check_device("cuda:0")
     'cuda:0'
@@ -284,10 +284,10 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
     """Check a list of prompts.
 
     Args:
-        name: Name of the option.
+        name: Name of the option, for messages.
         texts: The prompts.
     Raises:
-        InputError: A prompt is empty, repeated, too long, or contains an invalid character.
+        InputError: The prompts are not a list, or a prompt is empty, repeated, too long or has an invalid character.
     """
     if isinstance(texts, str):
         raise InputError(f"{option_name(name)} must be a list of prompts, got the single prompt {short_repr(texts)}")
@@ -299,23 +299,23 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
         if text.strip() == "":
             raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write what to search for")
         if len(text) > MAX_PROMPT_LENGTH:
-            raise InputError(f"{label} has {len(text):,} characters; give at most {MAX_PROMPT_LENGTH:,}")
+            raise InputError(f"{label} has {len(text):,} characters; shorten it to at most {MAX_PROMPT_LENGTH:,}")
         if _INVALID.search(text):
-            raise InputError(f"{label} contains an invalid character ({short_repr(text)}); remove it")
+            raise InputError(f"{label} contains an invalid character ({short_repr(text)}); remove that character")
         if text in previous:
-            raise InputError(f"{label}, {short_repr(text)}, is a duplicate; give every prompt once")
+            raise InputError(f"{label}, {short_repr(text)}, is a duplicate; give each prompt only once")
         previous.add(text)
 
 
 def short_repr(value: object) -> str:
-    """Return a short description of a value for a message, even if its repr fails.
+    """Return the repr of a value for a message, cut to 60 characters, or the type if the repr fails.
 
     >>> short_repr("x" * 100)[-5:], short_repr(10**5000)
     ('xxx …', 'a number of type int')
     """
     try:
         text = repr(value)
-    except Exception:  # the repr of unknown objects, or of integers with thousands of digits
+    except Exception:  # from objects of other packages, or integers with thousands of digits
         return f"a number of type {type(value).__name__}" if isinstance(value, Real) else type(value).__name__
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]} …"
 
@@ -325,7 +325,7 @@ def _error(name: str, expected: str, value: object) -> InputError:
 
 
 def _convert(name: str, value: Any, hint: Any) -> Any:
-    """Return the value in the declared type of the field."""
+    """Convert a value to the declared type of its field; raise InputError if that is not possible."""
     origin, choices = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return _convert_union(name, value, choices)
@@ -357,7 +357,9 @@ def _convert_scalar(name: str, value: Any, hint: type) -> Any:
     if not isinstance(value, hint):
         raise _error(name, {bool: "True or False", str: "a string"}.get(hint, f"of type {hint.__name__}"), value)
     if hint is str and _INVALID.search(value):
-        raise InputError(f"{option_name(name)} contains an invalid character ({short_repr(value)}); remove it")
+        raise InputError(
+            f"{option_name(name)} contains an invalid character ({short_repr(value)}); remove that character"
+        )
     return value
 
 
@@ -369,13 +371,13 @@ def _check_choice(name: str, value: object, choices: Sequence[Any]) -> Any:
 
 
 def check_path(name: str, value: object) -> Path:
-    """Return a string or a path as a path.
+    """Check a string or a path, and return it as a Path, which need not exist.
 
     Args:
-        name: Name of the option.
+        name: Name of the option, for messages.
         value: The string or path.
     Raises:
-        InputError: The value is neither, or contains a NUL character or one that cannot be encoded.
+        InputError: The value has another type, or contains NUL or a character that the file system cannot encode.
         PathError: A name is too long, the path leads through a file, or its links form a loop.
 
     >>> check_path("data", "fox").name
@@ -389,20 +391,18 @@ def check_path(name: str, value: object) -> Path:
         raise _error(name, "a path", value)
     wrong = f"{option_name(name)} is not a valid path:"
     if "\0" in path:
-        raise InputError(f"{wrong} it contains a NUL character ({short_repr(path)})")
+        raise InputError(f"{wrong} it contains a NUL character ({short_repr(path)}); remove that character")
     try:
         os.stat(path)
     except UnicodeEncodeError:
-        raise InputError(f"{wrong} {short_repr(path)} cannot be encoded") from None
+        raise InputError(f"{wrong} the file system cannot encode {short_repr(path)}; give another path") from None
     except OSError as error:
         if error.errno in _IMPOSSIBLE:
-            raise PathError(f"{wrong} {short_repr(path)} ({error.strerror}); give another") from None
+            raise PathError(f"{wrong} {short_repr(path)} ({error.strerror}); give another path") from None
     return Path(path)
 
 
-# User options as plain dataclasses. Imports no heavy package, to keep --help fast.
-#
-# The docstring under a field is the help text of its flag.
+# Options that users set. The docstring under each field is the help text of its flag.
 
 
 RasterizeMode = Literal["classic", "antialiased"]
@@ -410,56 +410,56 @@ RasterizeMode = Literal["classic", "antialiased"]
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
 """Rasterization backend; see `normlift_ns.rasterize_evidence`."""
 GSPLAT_VERSIONS = ("1.4", "1.5", "1.6")
-"""gsplat versions that rasterize differently."""
+"""gsplat versions with different rasterization rules."""
 GsplatVersion = Literal["auto", "1.4", "1.5", "1.6", "installed"]
-"""gsplat version whose rasterization a scene needs."""
+"""gsplat version whose rasterization rules to apply."""
 Background = Literal["black", "white"]
-"""Background color behind a splat without a nerfstudio run."""
+"""Background color of a splat that has no nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
-"""Storage of directions: the evidence itself (exact), float16, or float16 coordinates in a basis."""
+"""Storage format of directions: exact evidence, float16 vectors, or float16 coordinates in a low-rank basis."""
 RelevancyRule = Literal["contrast", "cosine", "lerf", "margin"]
-"""Formula for the relevancy of a prompt from its cosines; see `normlift_ns.relevancy`."""
+"""Formula that computes the relevancy of a prompt from cosines; see `normlift_ns.relevancy`."""
 UnlabeledMode = Literal["ignore", "dilute"]
-"""Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
+"""Treatment of pixels without a region: ignored, or counted as observations of the zero vector."""
 
 RegionKind = Literal["auto", "sam", "sam3", "edges", "patches", "superpixel", "grid", "files"]
-"""Built-in regions."""
+"""Built-in kinds of image regions."""
 MASK_GROUP = "normlift_ns.masks"
-"""Entry point group of mask sources, whose names are further regions."""
+"""Entry point group of mask sources; their names are further values of --regions."""
 FeatureKind = Literal["none", "langsplat"]
 SamPrecision = Literal["auto", "float32", "float16", "bfloat16"]
 CropFill = Literal["black", "white"]
 MissingFeatures = Literal["error", "skip"]
 
 DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
-"""OpenCLIP architecture and pretrained weights."""
+"""Default OpenCLIP architecture and pretrained weights."""
 DEFAULT_SAM, DEFAULT_SAM3 = "facebook/sam-vit-huge", "facebook/sam3"
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
-"""LERF's negative prompts."""
+"""Canonical negative prompts of LERF."""
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
-"""Weighting of a Gaussian's own evidence against its neighbors in a vote; see `normlift_ns.refine`."""
+"""Weighting of a Gaussian's own evidence against that of its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
-"""Class of a Gaussian without a direction in a score: none, or the first."""
+"""Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
 OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20
-"""Largest gap between Gaussians of one object, in units of the selection's median spacing, and its smallest size."""
+"""Maximum gap within an object, in units of the selection's median spacing, and minimum number of Gaussians in it."""
 LABEL_ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
-"""Files of exported label arrays."""
+"""Names of the files of exported label arrays."""
 MAX_TRANSFER_DISTANCE = 6.0
-"""Largest distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
+"""Maximum distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
 CATALOG_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
-"""Files of an object catalog: everything, its table, and its boxes in capture and in scene coordinates."""
+"""Files of an object catalog: all values, the table, and boxes in capture and in scene coordinates."""
 WEAK_RELIABILITY = 0.6
-"""R below which the evidence of a Gaussian is weak."""
+"""Reliability R below which the evidence of a Gaussian counts as weak."""
 FLOATER_THRESHOLD = 1.9
-"""Score above which a Gaussian is a likely floater, see `analysis.objects`."""
+"""Floater score above which a Gaussian is a likely floater; see `analysis.objects`."""
 
 
 @renamed(text_template="prompt_template", text_vectors="text_embeddings", region_texts="sam3_prompts")
 @dataclass(frozen=True)
 class SourceOptions:
-    """2D features: the encoder, and the image regions that it encodes.
+    """Options of the 2D features: the encoder, and the image regions that it encodes.
 
     Raises:
         ValueError: A value has the wrong type or is out of range.
@@ -472,62 +472,62 @@ class SourceOptions:
     """
 
     encoder: str = "auto"
-    """Encoder of regions and prompts. auto: the first of open_clip, siglip2, siglip, metaclip2, imagenet and color
-    whose default weights are on this machine; nothing is downloaded. open_clip: CLIP, on masked crops or on patches.
-    siglip, siglip2, metaclip2: the same with networks of the transformers library. imagenet: a small classifier of
-    1,000 things, whose weights ns-normlift-weights --get imagenet fetches; prompts are names of these things or of
-    groups, such as dog. color: mean colors compared with color names, without learned weights. Any other name: an
-    encoder from an installed plugin."""
+    """Encoder of regions and prompts. open_clip: CLIP, applied to masked crops or to patches. siglip, siglip2,
+    metaclip2: networks of the transformers library, applied in the same way. imagenet: a small classifier; prompts are
+    names of its 1,000 classes, or of groups of classes such as dog. Fetch its weights with ns-normlift-weights --get
+    imagenet. color: mean colors, compared with color names; needs no weights. auto: the first of open_clip, siglip2,
+    siglip, metaclip2, imagenet and color whose default weights are on this machine. Any other name: an encoder from an
+    installed plugin."""
     encoder_model: str = DEFAULT_MODEL
-    """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
-    defaults are google/siglip-base-patch16-224, google/siglip2-base-patch16-224 and
-    facebook/metaclip-2-worldwide-huge-quickgelu."""
+    """Network of the encoder. open_clip: the name of an architecture. siglip, siglip2, metaclip2: a Hugging Face model
+    name or a local folder. Without this option, these three use google/siglip-base-patch16-224,
+    google/siglip2-base-patch16-224 and facebook/metaclip-2-worldwide-huge-quickgelu."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
-    """open_clip: pretrained weights, as a tag to download or a local file of the same architecture."""
+    """Pretrained weights for open_clip: a tag to download, or a local file for the same architecture."""
     crop_fill: CropFill = "black"
-    """Color that replaces everything outside the region in a crop."""
+    """Color of the pixels of a crop that lie outside the region."""
     prompt_template: str = "{}"
-    """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
-    mean over seven OpenCLIP templates. {} alone is the bare prompt."""
+    """Template of the text that the network encodes. {} stands for the prompt, as in "a photo of a {}". {} alone
+    encodes the bare prompt. ensemble: average the vectors of seven OpenCLIP templates."""
     regions: str = "auto"
-    """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
-    edges: regions between the edges that a small network finds, whose weights ns-normlift-weights --get edges fetches.
-    patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
-    --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
-    neural network uses sam on a GPU if SAM's weights are on this machine, else edges if those are, else its patches if
-    it has them; on a CPU, one that encodes crops prefers its patches to edges. All other cases use superpixel. Any
-    other name: a mask source from an installed plugin."""
+    """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for the prompts of
+    --queries. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights --get
+    edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
+    --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto depends on the encoder. For
+    a neural network on a GPU, auto selects the first of sam, edges and patches that this machine and the network
+    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders of crops. In all other cases,
+    auto selects superpixel. Any other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
-    """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
+    """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
-    """Approximate number of regions per image, for superpixel, grid, patches and edges; larger values give smaller
-    regions. Default: 256 for superpixel and grid, 1024 for patches, the --level for edges."""
+    """Approximate number of regions per image for superpixel, grid, patches and edges. Larger values give smaller
+    regions. None: 256 for superpixel and grid, 1024 for patches, and the number that --level sets for edges."""
     sam_model: str | None = None
-    """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of Meta's first SAM, or a name to
-    download (such as facebook/sam2.1-hiera-large). Default: facebook/sam-vit-huge, as in LangSplat. --regions sam3
-    needs weights of SAM 3, by default facebook/sam3."""
+    """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of the original SAM, or a model
+    name to download, such as facebook/sam2.1-hiera-large. --regions sam3 needs weights of SAM 3. None:
+    facebook/sam-vit-huge as in LangSplat, or facebook/sam3 for --regions sam3."""
     sam_precision: SamPrecision = "auto"
     """Floating-point precision of the SAM network. auto: float16 on a GPU, float32 otherwise."""
     regions_dir: Path | None = None
     """Folder with one label map per image: a PNG or NPY file with the same stem as the image."""
     regions_background: int = 0
-    """Label map value of pixels without a region. Pixels with negative values never have a region."""
+    """Value of label map pixels that belong to no region. Negative values never belong to a region."""
     regions_resample: bool = False
-    """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
+    """Resize label maps to the image size with nearest-neighbor sampling. False: stop with an error if the sizes
+    differ."""
     level: str | None = None
-    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for about
-    300, 120 or 40 regions per image (m if not given). sam and langsplat: s, m or l for subparts, parts or wholes (l if
-    not given), or default for all of SAM's masks in one map. langsplat also accepts sum, the sum of the vectors of all
-    levels."""
+    """Level of the regions. files: the index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for
+    about 300, 120 or 40 regions per image (None: m). sam and langsplat: s, m or l for subparts, parts or wholes (None:
+    l), or default for all masks of SAM in one map. langsplat also accepts sum, which adds the vectors of all levels."""
     features: FeatureKind = "none"
-    """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
-    as written by LangSplat's preprocessing."""
+    """Precomputed regions and features to use instead of encoding the images. langsplat: files in --features-dir that
+    LangSplat's preprocessing wrote. none: encode the images."""
     features_dir: Path | None = None
-    """Folder with the precomputed features of --features."""
+    """Folder with the precomputed features that --features selects."""
     features_missing: MissingFeatures = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
+    """NPZ file with one vector per prompt, for prompts of precomputed features. It replaces the text encoder."""
 
     def __post_init__(self) -> None:
         if self.regions not in get_args(RegionKind):
@@ -538,11 +538,11 @@ class SourceOptions:
 
     @classmethod
     def stored(cls, values: Mapping[str, Any]) -> SourceOptions:
-        """Return options that a manifest records, in the names of this version or of version 0.2."""
+        """Return the options recorded in a manifest, with field names of this version or of version 0.2."""
         return cls(**new_names(cls, values))
 
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
-        """Return options whose sam3 prompts are filled in from `queries` if none are set."""
+        """Return the options with `queries` as SAM 3 prompts if the regions are sam3 and no prompts are set."""
         missing = self.regions == "sam3" and len(self.sam3_prompts) == 0
         return replace(self, region_texts=tuple(queries)) if missing else self
 
@@ -550,7 +550,7 @@ class SourceOptions:
 @renamed(holdout="eval_images")
 @dataclass(frozen=True)
 class SplatOptions:
-    """Cameras and images of a splat without a nerfstudio run.
+    """Cameras and images of a splat that has no nerfstudio run.
 
     Raises:
         ValueError: A value has the wrong type or is out of range.
@@ -563,30 +563,30 @@ class SplatOptions:
     colmap: Path | None = None
     """Folder of a COLMAP project that contains images/ and sparse/0/."""
     transforms: Path | None = None
-    """transforms.json file of nerfstudio, instant-ngp or Blender, instead of --colmap."""
+    """Camera file transforms.json of nerfstudio, instant-ngp or Blender, instead of --colmap."""
     images: Path | None = None
-    """Folder of the images, or of smaller copies such as images_4. Default: images/ of the COLMAP project, or the
-    paths in transforms.json."""
+    """Folder of the images, or of smaller copies such as images_4. None: images/ of the COLMAP project, or the paths in
+    transforms.json."""
     masks: Path | None = None
-    """Folder with one mask per image; pixels whose mask value is zero are ignored."""
+    """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | None = None
     """File with the similarity transform from camera to splat coordinates: a 4 x 4 matrix, or the
-    dataparser_transforms.json of the run that exported the PLY file. Default: the coordinates are the same."""
+    dataparser_transforms.json of the run that exported the PLY file. None: the coordinates are the same."""
     gsplat_normalize: bool = True
-    """Assume that gsplat's trainer normalized the world, as it does by default; the transform is computed again from
-    the COLMAP project. A PLY file counts as normalized only if the images then match the splat."""
+    """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
+    COLMAP project. A PLY file counts as normalized only if its images then match the splat."""
     views: Literal["train", "all"] = "train"
-    """Images to lift. train: those that were not held out of training. all: held-out images too."""
+    """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
-    """Interval n of held-out images: training left out every n-th image, starting with the first. It is 8 in gsplat's
-    trainer, and in Inria's with --eval. Default: as in the cfg.yml of gsplat's trainer, else those that
-    transforms.json lists."""
+    """Interval n of held-out images: training left out every n-th image, starting with the first. gsplat's trainer uses
+    8, and so does Inria's with --eval. None: the value in the cfg.yml of gsplat's trainer, or else the held-out images
+    in transforms.json."""
     eval_images: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
-    0.1 (the default of ns-train)."""
+    0.1, which is the default of ns-train."""
     rasterize_mode: RasterizeMode | None = None
-    """Rasterization mode that the splat was trained with. Default: as recorded in the file or in the cfg.yml of
-    gsplat's trainer, else classic."""
+    """Rasterization mode that the splat was trained with. None: the mode recorded in the file or in the cfg.yml of
+    gsplat's trainer, or else classic."""
     background: Background = "black"
     """Background color behind the splat, and behind images with an alpha channel."""
 
@@ -609,15 +609,15 @@ VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
     "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
     "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
 }
-"""Defaults of each kind of vote; the help texts of `RefineConfig` repeat them."""
+"""Default parameters of each kind of vote. The help texts of `RefineConfig` repeat them."""
 
 
 @dataclass(frozen=True)
 class RefineConfig(CheckedOptions):
     """Parameters of the vote among neighboring Gaussians.
 
-    The paper publishes no values. The defaults were tuned on scenes with ground truth: see docs/accuracy.md. The two
-    kinds of vote need different values, so a parameter that is None takes the default of its kind.
+    The paper publishes no values, so the defaults were tuned on scenes with ground truth; see docs/accuracy.md. A
+    parameter that is None takes the default of the kind of vote.
 
     Raises:
         ValueError: A value is out of range.
@@ -628,34 +628,34 @@ class RefineConfig(CheckedOptions):
     """
 
     vote: VoteKind = "posterior"
-    """Weight of a Gaussian's own evidence in the vote. posterior: the number of views that saw it, against --vote-prior
-    views for all neighbors together. paper: one voter among its neighbors (equations 9 and 10 of the paper)."""
+    """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views, compared with
+    --vote-prior for all neighbors together. paper: the weight of one of its neighbors (equations 9 and 10 of the
+    paper)."""
     k: int = 36
-    """Number of neighbors K in the vote, at least 1; larger values use a wider neighborhood and take longer."""
+    """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer."""
     sigma_d: float | None = None
-    """Width of the spatial decay of votes, > 0; larger values give distant neighbors more weight. In units of the
-    scene's median distance from a Gaussian to the nearest one at another position, because scenes are rescaled.
-    Default: 2 for posterior, 1 for paper."""
+    """Width of the spatial decay of votes, > 0. Larger values give distant neighbors more weight. The unit is the
+    median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
-    """Cosine at which two directions count as half agreeing in the vote, in -1..1; larger values require more similar
-    directions. Default: 0.9 for posterior, 0.95 for paper."""
+    """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
+    directions. None: 0.9 for posterior, 0.95 for paper."""
     gamma: float | None = None
-    """Softness of the agreement around the cosine --vote-tau, > 0; larger values blur the distinction between similar
-    and different directions. Default: 0.05 for posterior, 0.4 for paper."""
+    """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
+    and different directions. None: 0.05 for posterior, 0.4 for paper."""
     delta: float | None = None
-    """Margin Delta by which the best neighbor must win the vote, >= 0; larger values change fewer Gaussians.
-    Default: 0."""
+    """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
+    None: 0."""
     prior: float = 4.0
-    """Weight of all neighbors together in a posterior vote, in views, >= 0; larger values overrule Gaussians that more
-    views saw."""
+    """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
+    overrule Gaussians with more views."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Read configs of version 0.1, which had only the paper's vote."""
+        """Restore the state. Configs of version 0.1 name no kind of vote and mean the paper's."""
         vars(self).update({"vote": "paper", **state})
 
     @property
     def numbers(self) -> VoteParameters:
-        """Vote parameters, with the defaults of this kind of vote in place of None."""
+        """Vote parameters in which the defaults of this kind of vote replace None."""
         values = {name: getattr(self, name) for name in VoteParameters._fields}
         return VOTE_DEFAULTS[self.vote]._replace(**{name: value for name, value in values.items() if value is not None})
 
@@ -663,7 +663,7 @@ class RefineConfig(CheckedOptions):
 @renamed(beta="reliability_beta", consensus_least="consensus_min_agreement", gsplat_rules="gsplat_version")
 @dataclass(frozen=True)
 class LiftOptions(CheckedOptions):
-    """Views, consensus, storage and rasterization of a lift.
+    """Options of a lift: views, consensus, vote, storage and rasterization.
 
     Raises:
         ValueError: A value has the wrong type or is out of range.
@@ -674,56 +674,57 @@ class LiftOptions(CheckedOptions):
     """
 
     image_source: Literal["photos", "render"] = "photos"
-    """Images that the encoder sees. photos: the training images. render: renders of the trained scene from the same
+    """Images that the encoder encodes. photos: the training images. render: renders of the trained scene from the same
     cameras."""
     max_views: int | None = None
-    """Number of training views to use at most, evenly spaced; more views are slower and more reliable. Default: all."""
+    """Maximum number of training views, which are evenly spaced. More views are slower and more reliable. None: all."""
     lift_downscale: int = 1
-    """Factor that divides the size of images and cameras, at least 1; larger values are faster and coarser."""
+    """Divisor of the size of images and cameras, at least 1. Larger values are faster and coarser."""
     reliability_beta: float = 1.0
-    """Strength of the prior in the reliability, in virtual views, >= 0; larger values lower the reliability of
-    Gaussians that few views see."""
+    """Strength of the prior in the reliability, in virtual views, >= 0. Larger values lower the reliability of
+    Gaussians with few views."""
     unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""
     weight_power: Literal[1, 2] = 1
-    """Power of the rasterization weights A_ij: 1 as in the paper, or 2 for their squares."""
+    """Exponent of the rasterization weights A_ij: 1 as in the paper, or 2 for squared weights."""
     consensus: bool = True
-    """Before the lift, replace the feature of every region by the consensus of regions in other views that cover the
+    """Before the lift, replace the feature of each region by the consensus of regions in other views that cover the
     same Gaussians."""
     consensus_power: float = 1.0
-    """Exponent on the overlap fraction in the consensus, >= 0; larger values down-weight regions that cover more than
+    """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""
     consensus_sample: int = 50
-    """Number of Gaussians that the consensus samples in every region (all of them in smaller regions); larger values
-    are more exact and slower. Needs --consensus True."""
+    """Maximum number of Gaussians that the consensus samples in each region, at least 1. Larger values are more exact
+    and slower. Needs --consensus True."""
     consensus_min_agreement: float = 0.4
-    """Agreement of regions across views, in 0..1, up to which overlaps count as chance and features stay unchanged;
-    larger values switch the consensus off in more scenes. Use 0 if each mask shows one object, even roughly. Needs
-    --consensus True."""
+    """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
+    may be random. Larger values disable the consensus in more scenes. Use 0 if each mask shows one object, even
+    roughly. Needs --consensus True."""
     refine: bool = True
-    """Let neighboring Gaussians vote to repair directions: a Gaussian copies the direction that wins."""
+    """Repair directions by a vote among neighboring Gaussians. Each Gaussian copies the direction that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
-    """Largest error that storage may add to any cosine, > 0; larger values give smaller files."""
+    """Maximum error that storage may add to any cosine, > 0. Larger values give smaller files."""
     storage: Storage | Literal["auto"] = "auto"
-    """Storage format of directions. evidence: exact. float16: half-precision vectors. low_rank: coordinates in a basis.
-    auto: the smallest format within --tolerance."""
+    """Storage format of directions. evidence: the exact evidence. float16: half-precision vectors. low_rank:
+    coordinates in a low-rank basis. auto: the smallest format within --tolerance."""
     precision: Literal["standard", "double"] = "standard"
-    """Floating-point precision of the lift. standard: float32, with float64 sums where digits cancel. double: float64
-    throughout, slow on a GPU."""
+    """Floating-point precision of the lift. standard: float32, with float64 for sums that lose digits. double: float64
+    throughout, which is slow on a GPU."""
     backend: BackendName = "auto"
-    """Rasterization backend. triton: our own kernels, on a GPU. gsplat: gsplat's compiled kernels, on a GPU. numba:
-    compiled code for the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
+    """Rasterization backend. triton: kernels of this package for a GPU. gsplat: kernels of gsplat for a GPU. numba:
+    compiled code for the CPU. torch: PyTorch code for any device, which is slow. auto: the fastest backend for the
+    device and the precision."""
     gsplat_version: GsplatVersion = "auto"
-    """gsplat version whose rasterization to reproduce, because it decides the weights that a scene was trained with.
-    installed: the gsplat version on this machine. auto: the version recorded with the scene, else 1.4. Version 1.6 is
-    not released yet and may still change."""
+    """gsplat version whose rasterization rules the lift reproduces; it must be the version that trained the scene.
+    installed: the version on this machine. auto: the version recorded with the scene, or else 1.4. Version 1.6 is not
+    released yet and may still change."""
     reuse_evidence: bool = True
-    """Reuse cached 2D features and evidence of earlier lifts if they match."""
+    """Reuse cached 2D features and evidence of earlier lifts if their inputs are the same."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Read configs of version 0.1, which call `storage` `form` and have no consensus."""
+        """Restore the state. Configs of version 0.1 name `storage` `form` and have no consensus."""
         options = {"storage" if name == "form" else name: value for name, value in state.items()}
         vars(self).update({"consensus": False, **options})
 
@@ -731,41 +732,42 @@ class LiftOptions(CheckedOptions):
 @renamed(rule="relevancy", text_vectors="text_embeddings", text_template="prompt_template")
 @dataclass(frozen=True)
 class AskOptions:
-    """Comparison of prompts with the scene, and selection of Gaussians.
+    """Options of queries: the comparison of prompts with the scene, and the selection of Gaussians.
 
     Raises:
         ValueError: A value has the wrong type or is out of range, or a prompt is empty.
     """
 
     negatives: tuple[str, ...] | None = None
-    """Negative prompts to compare with. Default: set by the encoder. Networks: LERF's (object, things, stuff,
-    texture). color: none."""
+    """Negative prompts to compare with. None: the negatives of the encoder, which are object, things, stuff and texture
+    (from LERF) for text encoders. imagenet and color have none."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
-    lerf: the smallest softmax against any negative. margin: the cosine minus that of the best negative. auto: set by
-    the lift, which is contrast if it compared with unrelated words, else lerf with negatives, else cosine."""
+    lerf: the smallest softmax against any negative. margin: the cosine minus that of the best negative. auto: contrast
+    if the lift compared the scene with unrelated words, else lerf if there are negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
-    """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
-    relevancies. Default: set by the encoder (color: 0.7), else 0.5 for contrast and lerf, 0.02 for margin and auto
-    for cosine. A prompt that is probably not in the scene selects nothing, unless a number is given."""
+    """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
+    histogram of relevancies. None: the threshold of the encoder (0.7 for color), or else 0.5 for contrast and lerf,
+    0.02 for margin and auto for cosine. Unless a number is given, prompts that are probably not in the scene select
+    nothing."""
     min_reliability: float = 0.0
-    """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""
+    """Minimum reliability of selected Gaussians, in 0..1. Larger values drop Gaussians that few views support."""
     refined: bool = True
-    """Use the directions after the vote. False: the directions of the lift alone."""
+    """Use the directions after the vote. False: use the directions before the vote."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per prompt, used instead of the encoder that lifted the run."""
+    """NPZ file with one vector per prompt, used instead of the text encoder of the run."""
     prompt_template: str | None = None
-    """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
-    mean over seven OpenCLIP templates. Default: the template of the lift."""
+    """Template of the text that the network encodes. {} stands for the prompt, as in "a photo of a {}". ensemble:
+    average the vectors of seven OpenCLIP templates. None: the template of the lift."""
 
     def __post_init__(self) -> None:
         check_options(self)
         check_prompt_list("negatives", self.negatives or ())
 
     def rules(self) -> dict[str, Any]:
-        """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
+        """Return the keyword arguments for `LiftedRun.ask`, which are all options except those of `encoding`."""
         return {name: value for name, value in vars(self).items() if name not in self.encoding()}
 
     def encoding(self) -> dict[str, Any]:
-        """Return the other options, which encode prompts, as keyword arguments of `open_run`."""
+        """Return the options that encode prompts, as keyword arguments for `open_run`."""
         return {"text_embeddings": self.text_embeddings, "prompt_template": self.prompt_template}

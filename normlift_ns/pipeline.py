@@ -1,8 +1,8 @@
 """Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first.
 
-`lift_scene` has the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `api.run_lift` opens
-the scene before them, and writes the run after them. Both run in one process; `distributed.lift` runs the same steps in
-several.
+`lift_scene` runs the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `api.run_lift` opens
+the scene before these steps and writes the run after them. Both use one process; `distributed.lift` runs the same steps
+in several processes.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
-"""Share of Gaussians with features below which to warn: something is wrong, or almost no pixel was labeled."""
+"""Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
 
 
 class LiftResult(NamedTuple):
-    """Semantic field of a lift, and the time it took."""
+    """Semantic field of a lift, with the seconds of its stages."""
 
     field: SemanticField
     seconds: dict[str, float]
@@ -77,11 +77,10 @@ def lift_scene(
         cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: device for rasterizing, lifting and voting.
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
-        export: LangSplat files to also write the 2D features to; None: none.
-        report: called with the progress.
+        export: folder to also write the 2D features to, as LangSplat files. If None, do not write them.
+        report: progress callback, see `ProgressCallback`.
     Raises:
-        ValueError, FileNotFoundError: an image, a label map or an option does not fit, which the message names, or no
-            pixel is labeled.
+        ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
     """
     stages, facts = StageTimer(report), {}
@@ -115,7 +114,7 @@ def lift_scene(
 
 
 def add_null_level(field: SemanticField, source: FeatureSource, encoder: Mapping[str, Any]) -> SemanticField:
-    """Return the field with the null level of its encoder's null vocabulary, or as it is if there is none."""
+    """Add the null level of the encoder's null vocabulary to a field; return the field unchanged if there is none."""
     vectors = null_vectors(source, encoder)
     return field if vectors is None else with_null_level(field, vectors)
 
@@ -129,7 +128,7 @@ def plan_collection(
     device: str,
     export: FeatureExport | None,
 ) -> EvidenceCollection:
-    """Choose views and rasterizer of a lift, and raise before any image is read if the lift is impossible.
+    """Choose the views and the rasterizer of a lift. If the lift is impossible, raise before any image is read.
 
     Args:
         scene, source, options, cache, device, export: as in `lift_scene`.
@@ -156,7 +155,7 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
 
 
 def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> RasterConfig:
-    """Choose how to rasterize, and raise before any image is read if that is impossible."""
+    """Choose rasterization rules, backend and precision. If none fit, raise before any image is read."""
     rules, mode = resolve_gsplat_version(scene, options), scene.rasterize_mode
     dtype = torch.float64 if options.precision == "double" else torch.float32
     config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power)
@@ -164,13 +163,13 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 
 
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
-    """Return the options of a lift for `consensus`."""
+    """Return the keyword arguments for `consensus`."""
     least = options.consensus_min_agreement
     return {"power": options.consensus_power, "sample": options.consensus_sample, "least": least}
 
 
 def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
-    """Return the entry of the manifest about the consensus."""
+    """Return the manifest entry for the consensus."""
     facts = {"seed": SAMPLING_SEED, "gaussians": result.gaussians, "agreement": result.agreement}
     return {"consensus": {**consensus_options(options), **facts}}
 
@@ -178,10 +177,12 @@ def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
 def lift_features(
     views: ViewObservations, table: Float[Tensor, "s d"], options: LiftOptions
 ) -> tuple[Lifted, Float[Tensor, " n"]]:
-    """Lift a feature table; return also the own evidence of every Gaussian for the vote.
+    """Lift a feature table; also return each Gaussian's own evidence for the vote, in views.
+
+    The reliability R is always that of the features before the consensus.
 
     Args:
-        table: features of the views, after consensus if enabled. R is that of the features before the consensus.
+        table: features of the regions, after the consensus if it is enabled.
     """
     kwargs = {"beta": options.reliability_beta, "unlabeled": options.unlabeled}
     lifted = lift(views.evidence, table, **kwargs)
@@ -194,7 +195,7 @@ def lift_features(
 
 
 def count_directions(lifted: Lifted) -> Int64[Tensor, " 2"]:
-    """Return the number of Gaussians with a direction, and the number of entries of the evidence."""
+    """Return the number of Gaussians with a direction, and the number of evidence entries."""
     norm = lifted.scalars.norm
     return torch.stack([(norm > 0).sum(), torch.tensor(lifted.evidence.nnz, device=norm.device)])
 
@@ -212,20 +213,20 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
     if lifted == 0 and entries == 0:
         raise InputError(
             f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
-            f"{_describe(source)}). Likely causes: every value in the label maps is negative or the background "
-            "(--regions-background), the level has no regions (--level), masks exclude everything, all features are "
-            "zero, or the cameras do not see the scene"
+            f"{_describe(source)}). Check these likely causes: all label values are negative or the background "
+            "(--regions-background), the level has no regions (--level), masks exclude all pixels, all features are "
+            "zero, or the cameras do not face the scene"
         )
     if lifted == 0:
         raise InputError(
             f"none of the {total:,} Gaussians received a direction, although they have regions (from "
-            f"{_describe(source)}): the features cancel out in every Gaussian, or unlabeled pixels outweigh them "
-            "(--unlabeled dilute)"
+            f"{_describe(source)}). Either the features cancel out in every Gaussian, so check the features, or "
+            "unlabeled pixels outweigh them, so give --unlabeled ignore"
         )
     if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(
             f"only {lifted:,} of {total:,} Gaussians ({lifted / total:.2%}) appear in labeled pixels; the others have "
-            f"no features. If you did not expect this, check the regions (from {_describe(source)}) and the cameras",
+            f"no features. If this is not intended, check the regions (from {_describe(source)}) and the cameras",
             stacklevel=2,
         )
 
@@ -244,11 +245,11 @@ def vote_directions(
     config: RefineConfig,
     stages: StageTimer,
 ) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
-    """Vote among neighbors.
+    """Let neighboring Gaussians vote on their directions.
 
     Returns:
-        For every Gaussian, the Gaussian whose direction it takes. Also the shares of Gaussians that change their
-        direction and that have no support.
+        For every Gaussian, the index of the Gaussian whose direction it takes. Also the shares of Gaussians that
+        change their direction, and of those without support.
     """
     reliability, n = lifted.scalars.reliability, len(means)
     with stages("neighbors", n):
@@ -263,7 +264,7 @@ def vote_directions(
 def count_votes(
     copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
 ) -> Int64[Tensor, " 2"]:
-    """Return how many Gaussians changed their direction, and how many have no support."""
+    """Return the number of Gaussians that changed their direction, and the number without support."""
     return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
 
 
@@ -327,7 +328,7 @@ def with_cost(field: SemanticField, stages: StageTimer, device: str) -> Semantic
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
 ) -> Callable[[], None]:
-    """Start to compile or load kernels in the background; return a function that waits for them."""
+    """Start to compile or load kernels in the background, and return a function that waits for them."""
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
@@ -338,9 +339,9 @@ def start_kernel_warm_up(
 
 
 def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig) -> Thread:
-    """Lift random features onto some of the Gaussians in a thread, and discard the result.
+    """Compile or load kernels in a thread that lifts dummy features onto some Gaussians and discards the result.
 
-    Errors are suppressed here, because the lift itself will raise them again.
+    The thread suppresses errors, because the lift itself raises them again.
     """
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image

@@ -1,4 +1,4 @@
-"""Progress of a lift: time and steps of each stage, and peak memory."""
+"""Progress and cost of a lift: steps and seconds of each stage, and peak memory."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ ProgressCallback = Callable[[str, int, int], None]
 
 
 class StageTimer:
-    """Timers of the stages of a lift, which also report progress."""
+    """Timer of the stages of a lift, which also reports progress."""
 
     def __init__(self, report: ProgressCallback, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds: dict[str, float] = {}
         self.report = report
-        """Reports the progress of a stage that counts its own steps."""
+        """Progress callback for stages that count their own steps."""
         self._clock = clock
         self._done: dict[str, int] = {}
 
@@ -29,6 +29,9 @@ class StageTimer:
     def __call__(self, stage: str, total: int = 1) -> Iterator[Callable[[], None]]:
         """Time a stage, or a part of it; yield a function to call after every step.
 
+        Args:
+            stage: name of the stage.
+            total: number of steps of the whole stage.
         Raises:
             MemoryError: the GPU is out of memory. The message names the stage.
         """
@@ -51,9 +54,9 @@ class StageTimer:
 
 
 def lift_cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
-    """Return the seconds of each stage and in total, and the peak memory in GiB.
+    """Return the seconds of each stage, their total, and the peak memory of this process and of the GPU in GiB.
 
-    Memory is that of the GPU and of this process, if the system reports it.
+    The memory of the process is left out if the system does not report it.
     """
     peak = peak_gib()
     memory = {} if peak is None else {"memory_gib": peak}
@@ -63,8 +66,7 @@ def lift_cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
 
 
 def peak_gib() -> float | None:
-    """Return the peak resident memory of this process in GiB, including libraries; None if the system does not report
-    it.
+    """Return the peak resident memory of this process in GiB, including libraries; None if it is unknown.
 
     On Linux, this is `VmHWM` from /proc, because `ru_maxrss` starts from the value of the parent process.
     """

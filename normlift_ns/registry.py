@@ -1,7 +1,7 @@
-"""Plugins of this package and of other packages, by name.
+"""Registry of the plugins of this package and of other packages.
 
-Every plugin is an entry point. This module imports nothing heavy; a package is imported only when its plugin is
-requested.
+Every plugin is an entry point, whose package is imported only when the plugin is requested. This module imports no
+heavy package.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ Plugin = TypeVar("Plugin")
 
 @dataclass(frozen=True)
 class Registry(Generic[Plugin]):
-    """Plugins of one type by name. Other packages cannot take the name of a built-in plugin."""
+    """Plugins of one type, by name. Built-in plugins take precedence over plugins of other packages."""
 
     group: str
     """Entry point group."""
     built_in: Mapping[str, str]
-    """Built-in plugins, as pyproject.toml registers them. Listed here for source trees that are not installed, or were
-    installed before a plugin was added."""
+    """Entry points of built-in plugins by name, as in pyproject.toml. They are repeated here for source trees that are
+    not installed, or whose installation is older than a plugin."""
     plugin: type[Plugin]
     noun: str
-    """Name of a plugin in messages."""
+    """Noun for a plugin in messages, such as "encoder"."""
     flag: str
-    """Option that selects a plugin."""
+    """Command-line option that selects a plugin."""
     default: str
-    """A plugin that always works, for messages."""
+    """Name of a plugin that always works, as advice in messages."""
 
     def names(self) -> list[str]:
         """Return the names of all plugins in alphabetical order, including those that fail to load."""
         return sorted({*self.built_in, *installed_names(self.group)})
 
     def load(self, name: str) -> Plugin:
-        """Return the plugin of a name.
+        """Import and return the plugin with this name.
 
         Raises:
-            InputError: If the name is unknown, two packages claim it, or the plugin of another package cannot be
+            InputError: The name is unknown, two packages register it, or the plugin of another package cannot be
                 loaded.
         """
         point = self._find(name)
@@ -64,7 +64,7 @@ class Registry(Generic[Plugin]):
         return plugin
 
     def _find(self, name: str) -> EntryPoint:
-        """Return the entry point of a name."""
+        """Return the entry point with this name; raise InputError if there is none, or more than one."""
         if name in self.built_in:
             return EntryPoint(name, self.built_in[name], self.group)
         points = {point.value: point for point in _entry_points(self.group, tuple(sys.path)) if point.name == name}
@@ -73,20 +73,20 @@ class Registry(Generic[Plugin]):
             raise InputError(f"unknown {self.noun} {truncate_text(name)!r}; {self.flag} is one of {known}")
         if len(points) > 1:
             packages = " and ".join(f"{_package(point)} ({value})" for value, point in points.items())
-            raise InputError(f"{self.noun} {name!r} is claimed by {packages}; uninstall one of the two")
+            raise InputError(f"{self.noun} {name!r} is registered by {packages}; uninstall one of the two")
         return next(iter(points.values()))
 
 
 def installed_names(group: str) -> list[str]:
-    """Return the names in an entry point group of the installed packages, in alphabetical order."""
+    """Return the names that installed packages register in an entry point group, in alphabetical order."""
     return sorted({point.name for point in _entry_points(group, tuple(sys.path))})
 
 
 @cache
 def _entry_points(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    """Return the entry points of the packages on a path. Packages with damaged metadata are skipped.
+    """Return the entry points of a group from all packages on an import path; skip packages with damaged metadata.
 
-    Cached, because a search through hundreds of packages takes 20 ms, and a command needs it often.
+    The result is cached, because a search through hundreds of packages takes 20 ms, and commands need it often.
     """
     points: list[EntryPoint] = []
     names: set[str] = set()
@@ -94,7 +94,7 @@ def _entry_points(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
         with suppress(Exception):  # reading third-party metadata may raise anything
             text = package.read_text("entry_points.txt")
             if text is not None and group in text and package.name not in names:
-                names.add(package.name)  # the first on the path is the one that Python imports
+                names.add(package.name)  # Python imports the first package on the path
                 points += [point for point in package.entry_points if point.group == group]
     return tuple(points)
 
