@@ -1,6 +1,6 @@
 """Estimate of the time, memory and disk space of a lift, from a short measurement on this machine.
 
-`dry_run` is what `ns-normlift --dry-run` does; `ns-normlift-check` takes the same steps, with a finding for each.
+`dry_run` implements `ns-normlift --dry-run`. `ns-normlift-check` runs the same steps and reports the result of each.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _OFFSET_BYTES = 16
 
 @dataclass(frozen=True)
 class Rate:
-    """Cost of a stage: a fixed part, and a part for each item."""
+    """Cost of a stage: a fixed part, plus a part proportional to the number of items."""
 
     fixed: float
     per_item: float
@@ -91,9 +91,9 @@ class Measurements:
     entry_bytes: int
     """Bytes per evidence entry."""
     preparation_s: Mapping[str, float]
-    """Seconds of steps that were done already and will be repeated, by name (start, open, kernels, check)."""
+    """Seconds of the steps before the views, by name (start, open, kernels, check). The lift repeats these steps."""
     load_s: float
-    """Seconds until the network is loaded."""
+    """Seconds to load the network."""
     features_s: float | None
     """Seconds per view with new features; None if all are cached."""
     cached_features_s: float | None
@@ -107,31 +107,31 @@ class Measurements:
     cached_evidence_share: float
     """Share of the views with cached evidence, in 0..1."""
     core_s: Mapping[str, Rate]
-    """Cost of consensus, lift, neighbors, vote and store, as far as they are enabled."""
+    """Cost in seconds of the enabled stages: consensus, lift, neighbors, vote and store."""
     field_bytes: Rate
-    """Size of the stored semantics."""
+    """Bytes of the stored semantics."""
     run_bytes: int
-    """Size of the checkpoint that is stored with the semantics."""
+    """Bytes of the checkpoint that is stored with the semantics."""
     write_bytes_s: float
     """Bytes written per second."""
     view_bytes: float
-    """Size of a view's features and regions in the cache."""
+    """Bytes of a view's features and regions in the cache."""
     host_bytes: int
     """Peak memory of this process so far."""
     device_bytes: int | None
-    """Peak GPU memory until the evidence was computed; None without a GPU."""
+    """Peak GPU memory up to the end of the evidence stage; None without a GPU."""
     measured_views: int = 0
-    """Number of views that were measured."""
+    """Number of measured views."""
 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """One stage of a lift."""
+    """Planned stage of a lift."""
 
     name: str
     seconds: float
     remark: str = ""
-    """Cached part of the stage, in words."""
+    """Description of the cached part of the stage; empty if nothing is cached."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Plan:
     disk_bytes: int
     """Bytes to be written."""
     looked_at: int
-    """Number of views that the estimate is based on."""
+    """Number of measured views that the estimate is based on."""
 
     @property
     def seconds(self) -> float:
@@ -170,7 +170,7 @@ class Plan:
 def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
     """Estimate the cost of a lift.
 
-    Views and Gaussians are divided among the devices. The preceding steps, loading and writing are not.
+    The devices share the views and the Gaussians. The steps before the views, loading and writing are not shared.
 
     Args:
         num_devices: number of processes that share the work, each with its own device; at least 1.
@@ -219,7 +219,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
 
 
 def _share_of(views: int, share: float) -> int:
-    """Return the number of views in a share. It is all views only if the share is 1, and 0 only if the share is 0.
+    """Round a share of the views to a number, which is 0 only for share 0 and `views` only for share 1.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
@@ -237,13 +237,13 @@ def _cached(cached: int, views: int) -> str:
 
 
 Clock = Callable[[], float]
-"""Returns seconds."""
+"""Clock that returns seconds."""
 _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
-"""Gaussians in the larger sample."""
+"""Number of Gaussians in the larger sample, by device."""
 _SAMPLE_RATIO = 4
-"""Ratio of the sizes of the two samples."""
+"""Size of the larger sample divided by that of the smaller one."""
 _MAX_SAMPLE_VIEWS = 64
-"""Maximum number of views in the samples. The cost of more views is extrapolated in proportion."""
+"""Maximum number of views in the samples. The cost of further views is extrapolated."""
 
 
 def measure_core(
@@ -254,14 +254,14 @@ def measure_core(
     views: int,
     clock: Clock,
 ) -> tuple[dict[str, Rate], Rate]:
-    """Measure the cost of each stage of the core of a lift, and the bytes that it stores.
+    """Measure the cost of each core stage of a lift in seconds, and of the storage in bytes.
 
-    The evidence of a few views is repeated until there are as many as in the lift. A Gaussian of the sample then has as
-    many entries as in the lift. The cost of a stage has a fixed part and a part for each of its items.
+    The function repeats the evidence of a few views until it has as many views as the lift. A Gaussian of the sample
+    then has as many entries as in the lift. `Rate` explains the parts of a cost.
 
     Args:
         evidence: evidence of a few views.
-        features: features of their regions.
+        features: features of the regions in these views.
         views: number of views in the whole lift.
     """
     repeated = min(views, _MAX_SAMPLE_VIEWS)
@@ -271,7 +271,7 @@ def measure_core(
     most = min(len(gaussians), _LARGE_SAMPLE.get(gaussians.means.device.type, _LARGE_SAMPLE["cpu"]))
 
     def costs(count: int) -> tuple[dict[str, float], dict[str, float], int]:
-        """Run all stages after the evidence on some Gaussians; return seconds and items of each, and stored bytes."""
+        """Run all stages after the evidence on `count` Gaussians; return their seconds, their items and the bytes."""
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
         rows = rows.to(gaussians.means.device)
         means, sample = gaussians.means[rows], replace(evidence.select_gaussians(rows), num_excluded=0)
@@ -292,7 +292,7 @@ def measure_core(
         stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
         return stages.seconds, _items(sample, times, len(means), options), stored_bytes
 
-    # The first two only load or compile kernels for these sizes.
+    # The first two measurements only load or compile kernels for these sizes.
     _, _, (small, few, few_bytes), (large, many, many_bytes) = map(costs, 2 * (most // _SAMPLE_RATIO, most))
     counts = _items(evidence, times, len(gaussians), options)
     counts |= {"consensus": counts["consensus"] * factor**2, "lift": counts["lift"] * factor}
@@ -301,7 +301,7 @@ def measure_core(
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
-    """Fit a line through two costs, or one through the origin and the larger if they do not rise."""
+    """Fit a line to two pairs of items and cost. It meets the larger pair; slope and fixed part are not negative."""
     (items, cost), (more, most) = small, large
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
@@ -311,7 +311,7 @@ def _rate(small: tuple[float, float], large: tuple[float, float], count: float) 
 def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:
     """Count the items of each stage.
 
-    They are the Gaussians sampled in every region for the consensus, evidence entries for the lift, and Gaussians for
+    The items are sampled Gaussians in all regions for the consensus, evidence entries for the lift, and Gaussians for
     the other stages.
     """
     per_region = torch.bincount(evidence.rows.column.long(), minlength=evidence.num_regions)
@@ -322,12 +322,12 @@ def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions)
 
 DiagnosticState = Literal["ok", "warning", "error"]
 _PROJECTED_GAUSSIANS = 100_000
-"""Number of Gaussians that are projected into the cameras."""
+"""Approximate number of Gaussians that `diagnose_views` projects into the cameras."""
 _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
-"""Shares of Gaussians in view below which the check warns, and fails."""
+"""Shares of Gaussians in view below which the check warns, and below which it fails."""
 _HIGH_SHARE = 0.8
 """Share of free memory or disk space above which an estimate gets a warning."""
-_LIFT_LESS = "lift less: --lift-downscale 2, or --max-views 50"
+_LIFT_LESS = "reduce the lift with --lift-downscale 2 or --max-views 50"
 _SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
 
@@ -343,7 +343,7 @@ class Diagnostic:
 
 
 def diagnose_views(scene: Scene) -> Diagnostic:
-    """Check how many Gaussians lie in the training views."""
+    """Check the share of the Gaussians that lie in at least one training view."""
     means = scene.gaussians.means
     means = means[:: max(1, len(means) // _PROJECTED_GAUSSIANS)]
     visible = torch.zeros(len(means), dtype=torch.bool)
@@ -352,46 +352,46 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     share = float(visible.float().mean())
     message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
-        return Diagnostic("in view", "error", message, "give the cameras of this splat, or --world-transform")
+        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform")
     if share < _FEW_IN_VIEW:
-        advice = "the others get no semantics; are these the cameras of the splat?"
+        advice = "check that these are the cameras of the splat; the other Gaussians get no semantics"
         return Diagnostic("in view", "warning", message, advice)
     return Diagnostic("in view", "ok", message)
 
 
 def diagnose_cameras(warning: str | None) -> Diagnostic:
-    """Return the result of comparing images with renders, from the warning if they differ."""
+    """Return the diagnostic for the warning of `compare_cameras`, which is None if images and renders match."""
     match = "three images match renders from their cameras"
     return Diagnostic("cameras", "ok" if warning is None else "warning", warning or match)
 
 
 def diagnose_device(device: str) -> Diagnostic:
-    """Check which device the lift will use."""
+    """Report the device of the lift; warn if the lift does not use an available GPU."""
     if torch.device(device).type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         name = torch.cuda.get_device_name(device)
         return Diagnostic("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
     message = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
     if torch.cuda.is_available():
-        return Diagnostic("device", "warning", f"{message}, although one is available", "--device cuda")
+        return Diagnostic("device", "warning", f"{message}, although one is available", "add --device cuda")
     return Diagnostic("device", "ok", message)
 
 
 def diagnose_versions() -> Diagnostic:
-    """Check which packages are installed."""
+    """Report the versions of the main packages, and check that all required packages are installed."""
     missing = [name for name in _required_packages() if _version(name) is None]
     message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
         message = f"{message}; ns-* commands need nerfstudio"
-        return Diagnostic("versions", "warning", message, "pip install nerfstudio==1.1.5")
+        return Diagnostic("versions", "warning", message, "run pip install nerfstudio==1.1.5")
     if len(missing) > 0:
         message = f"{message}; not installed: {', '.join(missing)}"
-        return Diagnostic("versions", "error", message, f"pip install {missing[0]}")
+        return Diagnostic("versions", "error", message, f"run pip install {missing[0]}")
     return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
 def _required_packages() -> list[str]:
-    """Return the names of the packages that normlift_ns requires; none in a source tree."""
+    """Return the names of the packages that normlift_ns requires; empty if it is not installed."""
     required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()
     return [re.split(r"[^\w.-]", requirement)[0] for requirement in required if "extra ==" not in requirement]
 
@@ -404,34 +404,35 @@ def _version(name: str) -> str | None:
 
 
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
-    """Describe the network weights that the options need and this machine does not have."""
+    """Return a description of all network weights that the options need and that are not on this machine."""
     if options.features != "none":
         return []
     options, missing = resolve_source(options, device), []
     if options.regions in ("sam", "sam3"):
         model = options.sam_model or (DEFAULT_SAM if options.regions == "sam" else DEFAULT_SAM3)
         if find_local_sam(model) is None:
-            missing.append(f"those of SAM, {model}")
+            missing.append(f"weights of SAM, {model}")
     family = MODEL_FAMILIES.get(options.encoder)
     if family is not None and find_local_model(resolve_model_name(options, family)) is None:
-        missing.append(f"those of {options.encoder}, {resolve_model_name(options, family)}")
+        missing.append(f"weights of {options.encoder}, {resolve_model_name(options, family)}")
     model, weights = options.encoder_model, options.encoder_pretrained
     if options.encoder == "open_clip" and has_local_clip_weights(model, weights) is False:
-        missing.append(f"those of OpenCLIP, {model} {weights}")
+        missing.append(f"weights of OpenCLIP, {model} {weights}")
     files = [file for file in (IMAGENET, EDGES) if file.name in (options.encoder, options.regions) and not file.is_here]
-    return missing + [f"those of {file.user} ({file.command})" for file in files]
+    return missing + [f"weights for {file.user} ({file.command})" for file in files]
 
 
 def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
-    message = f"not on this machine: {'; '.join(missing)}. Those of the hub are downloaded at their first use"
+    message = f"not on this machine: {'; '.join(missing)}. A lift downloads weights of the Hugging Face hub"
     return Diagnostic(
         "weights",
         "warning",
         message,
-        "fetch them now: see ns-normlift-weights; or give local files: --encoder-pretrained FILE, --sam-model FILE",
+        "fetch them now with ns-normlift-weights --get NAME, or give local files with --encoder-pretrained FILE or "
+        "--sam-model FILE",
     )
 
 
@@ -441,55 +442,55 @@ def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
     free = min(free_memory().values(), default=None)
     if free is not None:
         own = int((peak_gib() or 0.0) * 2**30)
-        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, {_LIFT_LESS}"))
+        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, or {_LIFT_LESS}"))
     if plan.device_bytes is not None:
         free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
-        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or --device cpu"))
+        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or add --device cpu"))
     return rows
 
 
 def diagnose_disk(plan: Plan, folder: Path) -> Diagnostic:
     """Check that the output fits on the disk."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
-    advice = f"free space in {existing}, or give --output-dir"
+    advice = f"free space in {existing}, or give another folder with --output-dir"
     return _check_capacity("disk", plan.disk_bytes, shutil.disk_usage(existing).free, advice)
 
 
 def _check_capacity(name: str, needed: int, free: int, advice: str) -> Diagnostic:
     """Compare needed bytes with free bytes."""
-    message = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
+    message = f"about {needed / 2**30:.2f} GiB are needed, and {free / 2**30:.1f} GiB are free"
     state: DiagnosticState = "error" if needed > free else "warning" if needed > _HIGH_SHARE * free else "ok"
     return Diagnostic(name, state, message, "" if state == "ok" else advice)
 
 
 # Short measurement of a capture: encode and rasterize a few views, and lift some Gaussians.
 #
-# The results are discarded, and nothing is downloaded. Cached views are read, not computed again.
+# The measurement discards its results and downloads nothing. It reads cached views instead of recomputing them.
 
 
 _Result = TypeVar("_Result")
 _MAX_VIEWS = 4
-"""Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
+"""Maximum number of views to rasterize and encode. Sources that segment several views in one batch encode more."""
 _MAX_LOAD_S = 3.0
-"""Maximum number of seconds to load kernels. If it takes longer, they were compiled, which happens only once."""
+"""Maximum estimate of the seconds to load kernels. Longer times include compilation, which happens only once."""
 _SLOW_FIRST_VIEW_S = 20.0
-"""If the first view takes this many seconds, only one more batch is measured.
+"""Seconds for the first view above which only one more batch is measured.
 
-How many of these seconds were loading is unknown.
+They include an unknown time to load networks.
 """
 _MAX_LOOKUPS = 16
-"""Maximum number of views that are looked up in the cache."""
+"""Maximum number of views to look up in the cache."""
 
 
 class _Observed(NamedTuple):
-    """Some views, and the seconds that it took to observe them."""
+    """Observed views, with the seconds of the observation."""
 
     block: evidence_collection.ViewBatch
     seconds: float
 
 
 def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
-    """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
+    """Load or compile the kernels of a lift; return the seconds that the next process needs to load them."""
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
     ready = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
@@ -506,15 +507,15 @@ def measure_capture(
     before: Mapping[str, float] | None = None,
     clock: Clock = perf_counter,
 ) -> Measurements:
-    """Process a few views of a scene as a lift would.
+    """Process a few views of a scene as in a lift, and measure the cost.
 
     Args:
         source: as in `lift_scene`.
-        cache: folder of 2D features and evidence, which is only read.
-        before: seconds of the steps that precede the views, by name (start, open, kernels, check).
-        clock: returns seconds; use `time.process_time` for the time of all cores.
+        cache: folder of 2D features and evidence. The function only reads it.
+        before: seconds of the steps before the views, by name (start, open, kernels, check).
+        clock: clock in seconds; `time.process_time` measures the time of all cores.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: for the same reasons as `lift_scene`.
+        ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
     """
     collection = pipeline.plan_collection(scene, source, options, cache, device=device, export=None)
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
@@ -544,7 +545,7 @@ def measure_capture(
     def rasterize(folder: Path) -> Evidence:
         return evidence_collection.batch_evidence(gaussians, block, folder, drawing, reuse=True, on_view=lambda: None)
 
-    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:  # rasterized, read, and written once more
+    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as name:  # evidence is computed, read and written
         folder, file = Path(name), Path(name) / "again.safetensors"
         if cuda:  # kernels for labels like these are compiled once for all lifts
             rasterize(folder / "first")
@@ -593,7 +594,7 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views; return them with the seconds for all views after loading, and the seconds for loading networks."""
+    """Observe views; return them with the seconds of all views without loading, and the seconds to load networks."""
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])
@@ -617,7 +618,7 @@ def _evidence_cached(
     """Return the share of views whose evidence is cached.
 
     Args:
-        groups: examples of views, and how many views they represent.
+        groups: batches of sample views, each with the number of views that it represents.
     """
     if not collection.options.reuse_evidence:
         return 0.0
@@ -630,7 +631,7 @@ def _evidence_cached(
 
 
 def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple[float, _Result]:
-    """Return the duration of some work, until the GPU is done if there is one, and its result."""
+    """Return the seconds that a function takes, including its work on the GPU, and its result."""
     start = clock()
     result = work()
     if torch.device(device).type == "cuda":
@@ -642,7 +643,7 @@ def _seconds(work: Callable[[], _Result], *, clock: Clock, device: str) -> tuple
 
 
 class OpenedCapture(NamedTuple):
-    """An opened capture and the seconds that each stage has taken so far."""
+    """Opened capture, with the seconds of each stage so far."""
 
     scene: Scene
     run_dir: Path
@@ -650,10 +651,10 @@ class OpenedCapture(NamedTuple):
 
 
 def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
-    """Open the capture to plan a lift of it.
+    """Open the capture of a request, and time the stages start and open.
 
     Args:
-        start_time: start of the command by `time.perf_counter`.
+        start_time: value of `time.perf_counter` at the start of the command.
     """
     import_time = perf_counter()
     scene = request.open_scene()
@@ -662,7 +663,7 @@ def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
 
 
 def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
-    """Return a warning if images and renders of three views differ; add the time to that of the stages."""
+    """Return a warning if images and renders of three views differ; record the seconds of kernels and check."""
     opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
     start = perf_counter()
     warning = compare_with_images(opened.scene, options, device)
@@ -673,20 +674,20 @@ def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) ->
 def plan_opened(
     opened: OpenedCapture, source: FeatureSource, options: LiftOptions, device: str, num_devices: int
 ) -> Plan:
-    """Estimate the lift from a short measurement of the opened capture."""
+    """Estimate the cost of a lift from a short measurement of an opened capture."""
     scene, run_dir, seconds = opened
     facts = measure_capture(scene, source, options, cache_folder(run_dir), device=device, before=seconds)
     return make_plan(facts, num_devices=num_devices)
 
 
 def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
-    """Return what a lift needs, without lifting anything.
+    """Estimate the time, memory and disk space of a lift without running it.
 
     Args:
-        num_devices: number of processes that would share the work.
-        start_time: start of the command by `time.perf_counter`.
+        num_devices: number of processes that share the work.
+        start_time: value of `time.perf_counter` at the start of the command.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: as the lift itself; also if weights are not on this machine.
+        ValueError, FileNotFoundError, MemoryError: as in the lift; also if weights are not on this machine.
     """
     device, lift = choose_device(request.device), request.lift or LiftOptions()
     init_cuda(device)
@@ -695,9 +696,9 @@ def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
     missing = missing_weights(options, device)
     if len(missing) > 0:
         raise FileNotFoundError(
-            f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
-            "Fetch them first (ns-normlift-weights lists all weights), or give local files with --encoder-pretrained "
-            "and --sam-model."
+            f"A dry run encodes a few images, but this machine lacks {'; '.join(missing)}. "
+            "Fetch them with ns-normlift-weights --get NAME, or give local files with --encoder-pretrained and "
+            "--sam-model."
         )
     opened = open_capture(request, start_time)
     warning = compare_cameras(opened, lift, device) if request.check_alignment else None

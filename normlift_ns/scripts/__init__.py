@@ -1,1 +1,1 @@
-"""Old paths of the commands."""
+"""Module paths of commands in earlier versions."""

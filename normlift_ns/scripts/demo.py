@@ -1,4 +1,4 @@
-"""Old path of `normlift_ns.cli.demo`."""
+"""Earlier module path of `normlift_ns.cli.demo`."""
 
 from normlift_ns.cli.common import run_command_process
 from normlift_ns.cli.demo import Demo
