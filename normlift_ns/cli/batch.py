@@ -1,7 +1,7 @@
-"""ns-normlift-batch: lift many captures, by one worker or several.
+"""ns-normlift-batch: lift many captures with one or several workers.
 
-Runs of a batch are named after a digest of the scene and the options. The name therefore shows whether a capture was
-lifted with the same options, and no two processes can both write it.
+The name of a run in a batch contains a digest of the scene and the options. It therefore shows whether a capture was
+lifted with the same options, and prevents two processes from writing the same run.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
 _PREFIX = "batch_"
 _SOURCES = {".pt": "load_gsplat", **dict.fromkeys((".ply", ".spz", ".splat", ".glb", ".gltf"), "load_ply")}
-"""Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
+"""Option of ns-normlift for a path, by the suffix of the path. Paths with other suffixes are configs."""
 _SOURCE_NAMES = ("load_config", "load_ply", "load_gsplat")
 _NOT_IN_KEY = ("device", "timestamp", "output_dir")
-"""Options that do not change what is lifted, only where it is computed or stored."""
+"""Options that do not change the result of a lift, but only its device or its location."""
 _KEY_LENGTH = 16
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One line of a capture list."""
+    """Capture in a capture list."""
 
     name: str
-    """The line itself."""
+    """Line of the list."""
     arguments: tuple[str, ...]
     """Arguments of ns-normlift, including the name of the new run."""
     key: str
@@ -63,26 +63,26 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
     """Read a capture list, in its order.
 
     Args:
-        path: Text file. A line has the path of a config.yml, a PLY file or a gsplat checkpoint. Options of ns-normlift,
-            quoted as in a shell, may follow the path or replace it. Empty lines and lines that start with # are
-            ignored.
-        options: Options of ns-normlift for all captures; those of a line override them.
+        path: Text file. Each line has the path of a config.yml, a PLY file or a gsplat checkpoint. Options of
+            ns-normlift, quoted as in a shell, may follow the path or replace it. Empty lines and lines that start with
+            # are ignored.
+        options: Options of ns-normlift for all captures. The options of a line override them.
     Raises:
         InputError: The file is not UTF-8 text or lists no captures, or a line is invalid or a duplicate.
     """
     try:
         common = _parse(options)
     except InputError as error:
-        raise InputError(f"After --: {error}") from None
+        raise InputError(f"Invalid options after --. {error}") from None
     if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
-            f"--{name.replace('_', '-')} comes after --, where it applies to every capture. Write it into {path}, one "
-            "line per capture."
+            f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write it into "
+            f"{path}, with one line per capture."
         )
     try:
         text = read_text(path, "utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path} is not UTF-8 text. Expected a list of captures, one path per line.") from None
+        raise InputError(f"{path} is not UTF-8 text. Give a list of captures with one path per line.") from None
     captures: dict[str, tuple[int, Capture]] = {}
     for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
         if line == "" or line.startswith("#"):
@@ -90,27 +90,27 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         capture = _make_capture(line, options, common, f"{path}, line {number}")
         if capture.key in captures:
             raise InputError(
-                f"{path}, line {number}, is the same capture with the same options as line {captures[capture.key][0]}: "
-                f"{escape_unprintable(line)}. Remove one of the two."
+                f"{path}, line {number}, has the same capture and options as line {captures[capture.key][0]}: "
+                f"{escape_unprintable(line)}. Remove one of the two lines."
             )
         captures[capture.key] = number, capture
     if len(captures) == 0:
-        raise InputError(f"{path} lists no captures. Expected one path per line, such as outputs/…/config.yml.")
+        raise InputError(f"{path} lists no captures. Write one path per line, such as outputs/…/config.yml.")
     return tuple(capture for _, capture in captures.values())
 
 
 def is_lifted(run: Path) -> bool:
-    """Return whether a lifted run exists and has a valid manifest.
+    """Return whether a lifted run with a valid manifest exists.
 
     Raises:
-        InputError: The path is something else, or a damaged run.
+        InputError: The path exists, but is not a lifted run or is a damaged one.
     """
     if not os.path.lexists(run):
         return False
     try:
         read_manifest(run / FIELD_FOLDER)
     except (InputError, OSError) as error:
-        raise InputError(f"{error}. To have the capture lifted again, delete {run} and rerun the command.") from error
+        raise InputError(f"{error}. To lift the capture again, delete {run} and rerun the command.") from error
     return True
 
 
@@ -118,7 +118,7 @@ def _capture_key(command: NormLift) -> str:
     """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
 
     The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
-    features, label maps and weights, it includes their paths only.
+    features, label maps and weights, it includes only the paths.
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
     files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
@@ -136,14 +136,14 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
         first, *rest = shlex.split(line)
     except ValueError as error:
         raise InputError(
-            f"{location}: {escape_unprintable(line)} is not quoted as in a shell ({error}). Close the quotes."
+            f"{location}: {escape_unprintable(line)} has quotes that a shell would not accept ({error}). Close them."
         ) from None
     source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
     own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]
     try:
         if source is None or len(rest) > 0:
             command = _parse([*options, *own])
-        else:  # a shortcut for lines without options, because tyro is slow
+        else:  # lines without options avoid tyro, which is slow
             command = replace(common, **{source: Path(first)})
     except InputError as error:
         raise InputError(f"{location}: {error}") from None
@@ -159,10 +159,10 @@ def _parse(words: Sequence[str]) -> NormLift:
     """Parse the arguments of ns-normlift.
 
     Raises:
-        InputError: ns-normlift does not know an argument, or a batch does not support it.
+        InputError: An argument is not valid for ns-normlift, or not supported in a batch.
     """
     if {"-h", "--help"} & set(words):
-        raise InputError("--help has no place in a batch; type ns-normlift --help for the options of a capture")
+        raise InputError("--help is not supported in a batch; for the options of a capture, run ns-normlift --help")
     try:
         command = parse_flags(NormLift, words, name="ns-normlift")
     except InputError as error:
@@ -170,8 +170,8 @@ def _parse(words: Sequence[str]) -> NormLift:
     if command.timestamp is not None or command.overwrite:
         flag = "--overwrite" if command.overwrite else "--timestamp"
         raise InputError(
-            f"{flag} is not supported in a batch, which names runs by their options and lifts only missing ones. Leave "
-            "it out; to lift a capture again, delete its run."
+            f"{flag} is not supported in a batch, which names runs by their options and lifts only missing runs. Leave "
+            "it out. To lift a capture again, delete its run."
         )
     return command
 
@@ -182,14 +182,14 @@ _TASK_ID, _TASK_COUNT, _TASK_MIN, _TASK_STEP = (f"SLURM_ARRAY_TASK_{name}" for n
 
 @dataclass(frozen=True)
 class Shard:
-    """One of `count` parts of a list."""
+    """Part of a list that is divided into `count` parts."""
 
     index: int
     """Number of the part, from 0."""
     count: int
 
     def contains(self, position: int) -> bool:
-        """Return whether a position in the list, from 0, belongs to this part; each belongs to exactly one part.
+        """Return whether a position in the list, from 0, belongs to this part. Parts do not overlap.
 
         >>> [position for position in range(7) if Shard(1, 3).contains(position)]
         [1, 4]
@@ -222,8 +222,8 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     match = re.fullmatch(r"(\d{1,7})/(\d{1,7})", word, re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]) <= _MAX_SHARDS:
         raise InputError(
-            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n; got {short_repr(word)}. For "
-            "the second of four workers, give --shard 2/4."
+            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n, got {short_repr(word)}. For "
+            "example, give --shard 2/4 to the second of four workers."
         )
     return Shard(int(match[1]) - 1, int(match[2]))
 
@@ -239,7 +239,7 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
             f"{_TASK_ID} is {task}, but expected {count} tasks from {first} on, without gaps. Submit an array without "
-            "gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared folder."
+            "gaps, such as sbatch -a 0-7, or give --shard none to let workers claim captures in a shared folder."
         )
     return Shard(index, count)
 
@@ -253,7 +253,7 @@ def _rank_shard(environment: Mapping[str, str]) -> Shard:
         raise InputError(f"{present[0]} is set, but {missing} is not. Set both, or give the part with --shard i/n.")
     rank, count = _integer(environment, "RANK", 0), _integer(environment, "WORLD_SIZE", 1)
     if rank >= count:
-        raise InputError(f"RANK is {rank}, but must be less than WORLD_SIZE, {count}. Set both, or give --shard i/n.")
+        raise InputError(f"RANK is {rank}, but must be less than WORLD_SIZE, {count}. Correct it, or give --shard i/n.")
     return Shard(rank, count)
 
 
@@ -261,8 +261,8 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
     text = environment.get(name, default)
     if not re.fullmatch(r"\d{1,7}", text, re.ASCII) or int(text) < least:
         raise InputError(
-            f"{name} must be a whole number, at least {least}, got {short_repr(text)}. Set it, or give the part with "
-            "--shard i/n."
+            f"{name} must be a whole number, at least {least}, got {short_repr(text)}. Correct it, or give the part "
+            "with --shard i/n."
         )
     return int(text)
 
@@ -272,7 +272,7 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
 
 OutcomeState = Literal["done", "failed", "skipped"]
 _STATE_NAMES: dict[OutcomeState, str] = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
-"""Names of outcomes in messages."""
+"""Names of outcome states in messages."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ class Outcome:
     """Result of one attempt at a capture."""
 
     capture: str
-    """Line of the capture in the list."""
+    """Line of the list."""
     key: str
     """Digest of scene and options."""
     attempt: int
@@ -290,7 +290,7 @@ class Outcome:
     seconds: float
     """Duration of the attempt."""
     message: str
-    """Reason for a failure; otherwise empty."""
+    """Reason for the failure; empty if the attempt did not fail."""
     code: int
     """Exit code of the process, or 128 plus the number of the signal that killed it."""
     run: str | None
@@ -302,7 +302,7 @@ class Outcome:
 
 
 def latest_outcomes(outcomes: Iterable[Outcome]) -> dict[str, Outcome]:
-    """Return the last outcome of each capture by key; a later skip does not replace a completed lift.
+    """Return the last outcome of each capture by key. A later skip does not replace a completed lift.
 
     >>> done = Outcome("fox", "a", 1, "done", 41.0, "", code=0, run=None, worker="one", time=1.0)
     >>> skipped = Outcome("fox", "a", 2, "skipped", 0.0, "", code=0, run=None, worker="two", time=2.0)
@@ -340,19 +340,21 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
 LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
-"""Seconds between terminating a process and killing it."""
+"""Seconds from the request to terminate a process to its kill."""
 
 
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
-    """Run a program with its output in a log file; return its exit code, or minus the signal that killed it.
+    """Run a program and write its output to a log file.
 
-    On Linux, the program ends whenever this process ends; elsewhere, only after Ctrl-C and SIGTERM.
+    On Linux, the program always ends with this process. On other systems, it ends after Ctrl-C and SIGTERM only.
 
     Args:
         command: Command line of the program.
-        log: New file for its output.
-        on_tick: Callback; if it returns False, the program is terminated and the result is None.
+        log: File for the output; an existing file is replaced.
+        on_tick: Callback; if it returns False, the program is terminated.
         interval: Seconds between two calls of `on_tick`.
+    Returns:
+        The exit code, minus the number of the signal that killed the program, or None if `on_tick` returned False.
     Raises:
         OSError: The program cannot be started, or the log cannot be written.
     """
@@ -360,7 +362,7 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
     environment = inherited | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # keeps the last line complete
     log.unlink(missing_ok=True)
     with (
-        log.open("xb") as output,  # never into a pipe, or through a link
+        log.open("xb") as output,  # a new file, never a pipe or the target of a link
         subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -381,16 +383,16 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
 
 
 def failure_reason(code: int, log: Path) -> str:
-    """Return why a process failed: the signal that killed it, or the last line that it printed."""
+    """Return the reason why a process failed: the signal that killed it, or the last line of its output."""
     if code < 0:
-        return f"its process was killed by {describe_signal(-code)}; see its output in {log}"
+        return f"its process was killed by {describe_signal(-code)}; read its output in {log}"
     lines = map(str.strip, read_file(log, max_bytes=2**31).decode("utf8", "replace").split("\n"))
     *_, last = (f"its process ended with exit code {code} and without output", *filter(None, lines))
     return last
 
 
 _CLAIMS, _LOGS = "claims", "logs"
-"""Subfolders of the results folder."""
+"""Names of the subfolders of the results folder."""
 
 
 def lift_captures(
@@ -404,9 +406,9 @@ def lift_captures(
     """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
 
     Args:
-        captures: The captures of this worker.
-        folder: Folder of claims and results, which all workers share; created if missing.
-        timeout: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+        captures: Captures of this worker.
+        folder: Folder of claims and results, which all workers share. It is created if missing.
+        timeout: Seconds without a heartbeat after which a worker counts as dead, the same for all workers.
         on_message: Callback for messages about each capture.
         command: Command of ns-normlift.
     Raises:
@@ -427,7 +429,7 @@ def lift_captures(
             file_lock.finish_claim(claim, file_lock.ABANDONED)
             raise
         if outcome is None:
-            on_message(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
+            on_message(f"{capture.name}: taken over by another worker, which received no heartbeats of this worker")
             continue
         file_lock.append_jsonl(folder / f"{worker}{file_lock.JSONL_SUFFIX}", outcome)
         file_lock.finish_claim(claim, outcome.state)
@@ -449,7 +451,7 @@ def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
 def _lift_capture(
     capture: Capture, claim: file_lock.Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
 ) -> Outcome | None:
-    """Lift a capture unless it is already lifted; return None if another worker has taken over."""
+    """Lift a capture unless it is already lifted; return None if another worker took it over."""
     start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
 
     def outcome(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
@@ -468,7 +470,7 @@ def _lift_capture(
             return None
         if code == 0:
             return outcome("done")
-        if capture.run_dir is not None and is_lifted(capture.run_dir):  # by a worker that was considered dead
+        if capture.run_dir is not None and is_lifted(capture.run_dir):  # a worker that counted as dead lifted it
             return outcome("skipped")
     except InputError as error:
         return outcome("failed", str(error), 1)
@@ -480,29 +482,28 @@ def _lift_capture(
 
 @dataclass
 class NormLiftBatch(CheckedOptions):
-    """Lift many captures, each in its own process; several workers may share the list. A rerun skips captures that
-    were lifted with the same options."""
+    """Lift many captures, each in its own process. Several workers may share the list. A rerun skips captures that were
+    already lifted with the same options."""
 
     captures: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURES")]
-    """Text file with one capture per line: the config.yml of a run, a PLY file or a gsplat checkpoint. Options of
-    ns-normlift for this capture may follow."""
+    """Text file with one capture per line: the path of a config.yml, a PLY file or a gsplat checkpoint. Options of
+    ns-normlift for this capture may follow the path."""
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS]")] = ()
-    """Options of ns-normlift for all captures, after --."""
+    """Options of ns-normlift that apply to all captures, given after --."""
     results: Path | None = None
-    """Folder of results, logs and claims, which all workers share. Default: <name of the list>_batch next to the
-    list."""
+    """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
     shard: str = "auto"
-    """Part of the list for this worker. i/n: the i-th of n parts. auto: from SLURM_ARRAY_TASK_ID or from RANK and
-    WORLD_SIZE if they are set, else none. none: every capture that no other worker has claimed."""
+    """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
+    claimed. auto: the part given by SLURM_ARRAY_TASK_ID, or by RANK and WORLD_SIZE, if they are set, else none."""
     patience: float = 120.0
-    """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400; use the same value
+    """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400. Use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""
 
     def main(self) -> None:
         """Lift the captures and print the results.
 
         Raises:
-            SystemExit: A capture failed; the exit code is the largest of all captures.
+            SystemExit: A capture failed. The exit code is the largest exit code of all captures.
         """
         check_readable_file(self.captures, "ns-normlift-batch")
         shard = make_shard(self.shard, os.environ)
@@ -525,5 +526,5 @@ class NormLiftBatch(CheckedOptions):
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-batch in a process that continues afterwards."""
+    """Run ns-normlift-batch, and return to the caller if it succeeds."""
     run_command(NormLiftBatch)

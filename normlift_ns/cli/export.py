@@ -1,4 +1,4 @@
-"""ns-normlift-export: write a lifted run as a file of Gaussians and a table of objects."""
+"""ns-normlift-export: write a lifted run as a splat file and a table of objects."""
 
 from __future__ import annotations
 
@@ -31,47 +31,47 @@ if TYPE_CHECKING:
 )
 @dataclass
 class NormLiftExport(options.CheckedOptions):
-    """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
+    """Export a lifted run, a selection of its Gaussians, or the rest of the scene, as files for other splat tools."""
 
     load_config: Path
-    """Path to config YAML file of the lifted run."""
+    """Path to the config.yml file of the lifted run."""
     output_dir: Path
-    """Output folder, created if missing."""
+    """Output folder. The command creates it if it is missing."""
     text: tuple[str, ...] = ()
-    """Prompts to search for. Default: the queries stored in the run, with their stored options."""
+    """Prompts to search for. Without prompts, the command uses the queries stored in the run, with their options."""
     select: Literal["scene", "selection", "rest", "clean"] = "scene"
-    """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
-    likely floaters, which are Gaussians floating in front of the cameras."""
+    """Gaussians to export. scene: all Gaussians. selection: Gaussians that any prompt selects. rest: Gaussians that no
+    prompt selects. clean: all except likely floaters, which are Gaussians floating in front of the cameras."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the file, in the format that it ends with: .ply, .compressed.ply, .glb or .spz. <name>_rows.npy has the
-    index of each Gaussian in the run, <name>_names.json the names of class_id and instance_id values, and
-    <name>_objects.json the objects."""
+    """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. Next to it,
+    <name>_rows.npy contains the index of each Gaussian in the run, <name>_names.json the names of class_id and
+    instance_id values, and <name>_objects.json the objects."""
     masks_dir: Path | None = None
-    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --select rest,
-    the values are swapped. Masks fit the undistorted images that the scene was trained with."""
+    """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
+    swaps the values. The masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
-    """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
-    Gaussians) and names.json."""
+    """Folder for the exported Gaussians as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored Gaussians)
+    and names.json."""
     exporters: tuple[str, ...] = ()
-    """Further outputs, by name: ply, compressed_ply, glb, spz, spz4 (version 4), or exporters of other packages. Each
-    writes <name of the file>_<exporter>, with a suffix of its own, to the output folder."""
+    """Further outputs: ply, compressed_ply, glb, spz (version 3), spz4 (version 4), or exporters of other packages.
+    Each exporter writes <name>_<exporter> with its own suffix to the output folder."""
     transfer: Path | None = None
-    """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
-    relevancies of the nearest visible Gaussian; 0 if none is near enough."""
+    """PLY point cloud or mesh to label. The command writes a copy, <name of the cloud>_labels.ply, with the class_id,
+    instance_id and relevancies of the nearest visible Gaussian, or 0 if no Gaussian is near enough."""
     transfer_distance: float = options.MAX_TRANSFER_DISTANCE
-    """Largest distance from a point to the center of its Gaussian for --transfer, > 0; larger values label more points.
-    In units of the median distance from a Gaussian to the nearest one at another position."""
+    """Maximum distance from a point to the center of its Gaussian for --transfer, > 0. Larger values label more points.
+    The unit is the median distance from a Gaussian to the nearest one at another position."""
     transfer_coordinates: Literal["capture", "scene"] = "capture"
-    """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
-    them. scene: the Gaussians' coordinates, as in exported files."""
+    """Coordinate system of the cloud for --transfer. capture: that of the cameras before nerfstudio rotated and scaled
+    them. scene: that of the Gaussians and of exported files."""
     object_max_gap: float = options.OBJECT_MAX_GAP
-    """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
+    """Maximum gap between Gaussians of one object, > 0, in units of the selection's median spacing. Larger values merge
     more objects."""
     object_min_gaussians: int = options.OBJECT_MIN_GAUSSIANS
-    """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
+    """Minimum number of Gaussians in an object, at least 1. Larger values list fewer objects."""
     floater_threshold: float = options.FLOATER_THRESHOLD
-    """Score above which a Gaussian counts as a floater for --select clean; larger values leave out fewer Gaussians."""
+    """Floater score above which --select clean leaves out a Gaussian. Larger values leave out fewer Gaussians."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -80,7 +80,7 @@ class NormLiftExport(options.CheckedOptions):
     """Device for the text encoder: auto, cpu or cuda."""
 
     def main(self) -> Path:
-        """Write the files and return the path of the file of Gaussians."""
+        """Write the files and return the path of the splat file."""
         options.check_device(self.device)
         options.check_prompt_list("text", self.text)
         preflight.check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
@@ -104,7 +104,7 @@ class NormLiftExport(options.CheckedOptions):
         return outputs["ply"]
 
     def _job(self, run: LiftedRun, cloud: PlyData | None) -> ExportJob:
-        """Return the exported Gaussians with the answer to the prompts."""
+        """Return the job with the Gaussians to export and the answer to the prompts."""
         from normlift_ns import exports  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
 
@@ -125,7 +125,7 @@ class NormLiftExport(options.CheckedOptions):
         return replace(job, answer=answer, instances=instances, objects=objects, transfer=transfer)
 
     def _keep(self, run: LiftedRun, answer: Answer | None) -> Bool[Tensor, " n"]:
-        """Return the Gaussians of the exported part."""
+        """Return a mask of the Gaussians that --select exports."""
         import torch  # noqa: PLC0415 (--help should not wait for it)
 
         if self.select == "clean":
@@ -137,10 +137,10 @@ class NormLiftExport(options.CheckedOptions):
         return answer.mask if self.select == "selection" else ~answer.mask
 
     def _outputs(self) -> dict[str, Path]:
-        """Return the path of every output by its exporter."""
+        """Return the path of every output, keyed by its exporter."""
         name = self.output_filename
         if name in ("", "..") or Path(name).name != name:
-            raise InputError(f"--output-filename {name!r} is not a file name; give one without folders, as splat.ply")
+            raise InputError(f"--output-filename {name!r} is not a file name; give one without folders: splat.ply")
         target = self.output_dir / name
         cloud = None if self.transfer is None else self.output_dir / f"{self.transfer.stem}_labels.ply"
         paths = {"ply": target, "masks": self.masks_dir, "arrays": self.arrays_dir, "cloud": cloud}
@@ -164,7 +164,7 @@ class NormLiftExport(options.CheckedOptions):
             preflight.refuse_unused(self, ("transfer_distance", "transfer_coordinates"), "--transfer FILE")
         preflight.check_readable_file(self.transfer, "--transfer")
         if self.masks_dir is not None and self.select == "clean":
-            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --select clean")
+            raise InputError("--masks-dir does not work with --select clean; give --select selection or --select rest")
         if cloud in files:
             raise InputError(f"{cloud} would be both the splat and the labeled cloud; give another --output-filename")
         preflight.check_writable_folder(self.masks_dir, "--masks-dir")
@@ -176,7 +176,7 @@ class NormLiftExport(options.CheckedOptions):
             preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
-        """Raise if an output or an option needs prompts, and there are none."""
+        """Raise InputError if an output or an option needs prompts, and there are none."""
         if len(self.text) == 0:
             preflight.refuse_unused(self.ask, vars(self.ask), "--text")
         stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"
@@ -191,7 +191,7 @@ class NormLiftExport(options.CheckedOptions):
         if self.select in ("selection", "rest"):
             flags.insert(0, f"--select {self.select}")
         if len(flags) > 0:
-            raise InputError(f"{flags[0]} needs prompts, and the run stores no queries; give --text")
+            raise InputError(f"{flags[0]} needs prompts, but the run stores no queries; give prompts with --text")
         preflight.refuse_unused(self, ("object_max_gap", "object_min_gaussians"), "--text")
 
 
@@ -212,7 +212,7 @@ def _objects_table(queries: list[dict[str, Any]]) -> Table:
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-export in a process that continues afterwards."""
+    """Run ns-normlift-export, and return to the caller if it succeeds."""
     common.run_command(NormLiftExport)
 
 
