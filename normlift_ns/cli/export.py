@@ -140,7 +140,9 @@ class NormLiftExport(options.CheckedOptions):
         """Return the path of every output, keyed by its exporter."""
         name = self.output_filename
         if name in ("", "..") or Path(name).name != name:
-            raise InputError(f"--output-filename {name!r} is not a file name; give one without folders: splat.ply")
+            raise InputError(
+                f"--output-filename {name!r} is not a file name; give a name without folders, such as splat.ply"
+            )
         target = self.output_dir / name
         cloud = None if self.transfer is None else self.output_dir / f"{self.transfer.stem}_labels.ply"
         paths = {"ply": target, "masks": self.masks_dir, "arrays": self.arrays_dir, "cloud": cloud}

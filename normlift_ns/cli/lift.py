@@ -36,12 +36,14 @@ if TYPE_CHECKING:
 
 @contextmanager
 def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
-    """Join the other processes of the lift; only the first one prints. Yield None if there is only one process.
+    """Join the other processes of the lift. Only the first process prints.
 
     Args:
         device: cpu, cuda or auto.
+    Yields:
+        The communicator, or None if there is only one process.
     """
-    started_by_us = LAUNCHED_VARIABLE in os.environ  # the process that started this one reports failures
+    started_by_us = LAUNCHED_VARIABLE in os.environ  # the parent process reports failures
     try:
         with distributed_context(device, common.print_error) as team:
             if team is not None and team.rank > 0:
@@ -61,29 +63,29 @@ class NormLift(CheckedOptions):
     file or a checkpoint of gsplat's trainer."""
 
     load_config: Path | None = None
-    """Path to config YAML file of the trained run."""
+    """Path to the config.yml file of the trained run."""
     load_ply: Path | None = None
-    """PLY, compressed PLY, SPZ, .splat, GLB or glTF file of a splat, instead of --load-config; needs --colmap or
+    """Splat file to use instead of --load-config: PLY, compressed PLY, SPZ, .splat, GLB or glTF. Needs --colmap or
     --transforms."""
     load_gsplat: Path | None = None
-    """Checkpoint of gsplat's simple_trainer, ckpt_<step>_rank0.pt, instead of --load-config; needs --colmap."""
+    """Checkpoint of gsplat's simple_trainer to use instead of --load-config, ckpt_<step>_rank0.pt. Needs --colmap."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
-    """COLMAP project folder or transforms.json with images taken after training, which are lifted too. It must also
+    """COLMAP project folder or transforms.json with images taken after training, to lift in addition. It must also
     contain training images, with the same cameras as in training."""
     check_alignment: bool = True
-    """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
+    """Compare three training images with renders of the scene before the lift. False: skip the comparison."""
     dry_run: bool = False
-    """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and cached views. The
-    speed is measured on a few images."""
+    """Estimate the seconds of every stage, the memory, the disk space and the number of cached views without lifting.
+    The command measures its speed on a few images."""
     data: Path | None = None
     """Current path of the dataset, if it was moved after training."""
     load_step: int | None = None
-    """Training step of the checkpoint to load. Default: the last one."""
+    """Training step of the checkpoint to load. None: the last checkpoint."""
     output_dir: Path | None = None
-    """Output folder to use instead of that of the trained run."""
+    """Output folder. None: the output folder of the trained run, or outputs for a splat without a run."""
     timestamp: str | None = None
-    """Name of the new run directory. Default: the current time."""
+    """Name of the new run directory. None: the current time."""
     overwrite: bool = False
     """Replace an existing run directory of that name, and exported files whose content differs."""
     device: str = "auto"
@@ -92,14 +94,14 @@ class NormLift(CheckedOptions):
     """Number of processes on this machine, each with its own GPU or an equal share of the CPU cores. For several
     machines, use torchrun."""
     queries: tuple[str, ...] = ()
-    """Prompts to store in the run; ns-render and ns-viewer show their relevancy."""
+    """Prompts to store in the run. ns-render and ns-viewer show their relevancy."""
     export_langsplat: Path | None = None
     """Folder for a copy of the lifted regions and features, in the format of LangSplat's preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
 
     def main(self) -> LiftedRun | None:
-        """Lift and return the new run; None for a dry run, or if another process writes the run."""
+        """Lift, and return the new run; None for a dry run, or if another process writes the run."""
         self.check_early()
         refuse_small_memory(loaded="torch" in sys.modules)
         if self.dry_run:
@@ -109,9 +111,9 @@ class NormLift(CheckedOptions):
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 common.info(
-                    f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster."
+                    f"{self.num_devices} processes share {cores} CPU cores; more than {cores} processes save no time."
                 )
-            words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # told once
+            words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # prints once
             program = [sys.executable, "-m", "normlift_ns.cli.lift"]
             # Only the first process writes the log file.
             other = [*program, *common.split_output_flags(words)[0]]
@@ -134,7 +136,7 @@ class NormLift(CheckedOptions):
         return LiftRequest(**own, **more)
 
     def _plan(self) -> None:
-        """Print what the lift needs, without lifting anything."""
+        """Print an estimate of the time, memory and disk space of the lift."""
         start_time = time.perf_counter()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.planning import dry_run  # noqa: PLC0415 (as above)
@@ -197,7 +199,7 @@ class NormLift(CheckedOptions):
             preflight.check_writable_folder(cache_folder(run_dir), "--output-dir")
 
     def _check_splat(self) -> None:
-        """Raise InputError unless one trained splat is given, with options that apply to it."""
+        """Raise InputError unless exactly one trained splat is given, and all options apply to it."""
         paths = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
         if len(paths) != 1:
             raise InputError(
@@ -206,15 +208,15 @@ class NormLift(CheckedOptions):
             )
         default = SplatOptions()
         if self.load_config is None:
-            options, names, hint = self, ("data", "load_step"), "--load-config; for a splat see --images"
+            options, names, hint = self, ("data", "load_step"), "--load-config (a splat has --images instead)"
         else:
             options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
         for name in names:
             if getattr(options, name) != getattr(default, name, None):
-                raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
+                raise InputError(f"--{name.replace('_', '-')} works only with {hint}. Leave it out.")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
-        """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
+        """Return the capture name and output folder for `run_directory`; None if only an open capture has them.
 
         Raises:
             InputError, OSError: The config is invalid or cannot be read.
@@ -229,7 +231,7 @@ class NormLift(CheckedOptions):
         return name or "splat", self.output_dir or Path("outputs")
 
     def open_scene(self) -> Scene:
-        """Open the trained scene, with the images of --add-images."""
+        """Open the trained scene, and add the images of --add-images."""
         from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
         from normlift_ns.data.open_scene import open_scene  # noqa: PLC0415 (as above)
         from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
@@ -249,7 +251,7 @@ class NormLift(CheckedOptions):
 
 @contextmanager
 def progress_bars() -> Iterator[ProgressCallback]:
-    """Show one bar with elapsed time per stage, or one line per stage if output goes to a pipe or a log file."""
+    """Show a progress bar for each stage, or a line if the output goes to a pipe or a log file."""
     names = {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
     columns = (
         TextColumn("{task.description:>17}", markup=False),
@@ -272,7 +274,7 @@ def progress_bars() -> Iterator[ProgressCallback]:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print the stages of a plan with their seconds and cached views, and a sentence about memory and disk."""
+    """Print a table of the stages with their seconds and cached views, and a line about memory and disk space."""
     table = Table("stage", title=f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}")
     table.add_column("seconds", justify="right")
     table.add_column("cached")
@@ -292,10 +294,10 @@ def _views(count: int) -> str:
 
 
 def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:
-    """Return the table that is printed after a lift: statistics, seconds, memory, storage and path.
+    """Return the table to print after a lift: statistics, seconds, memory, storage and path.
 
     Args:
-        run: The lifted run.
+        run: Lifted run.
         before: Seconds of the stages before the lift, by name.
         total: Seconds of the whole command.
     """
@@ -306,7 +308,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image"
     table.add_row("Gaussians", f"{statistics['gaussians']:,}; {unseen}")
     if statistics["excluded"] > 0:
-        table.add_row("not drawn", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
+        table.add_row("not rendered", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
     if statistics["left_out"] > 0:
         table.add_row("left out", f"{statistics['left_out']} images without features")
     features = manifest["features"]
@@ -319,7 +321,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
         unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
-        refined = f"{statistics['refined_share']:.1%} of Gaussians took over a neighbor's feature"
+        refined = f"{statistics['refined_share']:.1%} of the Gaussians copied a neighbor's feature"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}
@@ -338,7 +340,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
 
 
 def next_command(config: Path, queries: tuple[str, ...]) -> str:
-    """Return the command to type next, as one line.
+    """Return the query command to type after a lift.
 
     >>> next_command(Path("a b/config.yml"), ("red mug",))
     "ns-normlift-query --load-config 'a b/config.yml' --text 'red mug'"
@@ -373,7 +375,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     >>> describe_consensus(0.3, 0.4, "superpixel")
     'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
-    'if they are bad masks of objects, try --consensus-min-agreement 0'
+    'if they are rough masks of objects, try --consensus-min-agreement 0'
     """
     from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
 
@@ -385,11 +387,11 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged
-    return f"{unchanged}; if they are bad masks of objects, try --consensus-min-agreement 0"
+    return f"{unchanged}; if they are rough masks of objects, try --consensus-min-agreement 0"
 
 
 def entrypoint() -> None:
-    """Run ns-normlift in a process that continues afterwards."""
+    """Run ns-normlift, and return to the caller if it succeeds."""
     common.run_command(NormLift)
 
 

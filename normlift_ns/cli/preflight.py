@@ -24,12 +24,12 @@ from normlift_ns.options import (
 
 
 def check_readable_file(path: Path | None, flag: str) -> None:
-    """Raise FileNotFoundError if the path is missing, or InputError if it is not a regular file."""
+    """Raise FileNotFoundError if a path does not exist, or InputError if it is not a regular file."""
     _check_readable(path, flag, "a file", "a file")
 
 
 def check_readable_folder(path: Path | None, flag: str) -> None:
-    """Raise FileNotFoundError if the path is missing, or InputError if it is not a folder."""
+    """Raise FileNotFoundError if a path does not exist, or InputError if it is not a folder."""
     _check_readable(path, flag, "a folder", "the folder that contains the files")
 
 
@@ -40,7 +40,7 @@ def _check_readable(path: Path | None, flag: str, expected: str, advice: str) ->
     kind = {stat.S_IFREG: "a file", stat.S_IFDIR: "a folder"}.get(stat.S_IFMT(mode), "a pipe or a device")
     if kind != expected:
         raise InputError(f"{path}, given with {flag}, is {kind}; give {advice}")
-    if flag != "--colmap":  # a project folder, which may also hold outputs
+    if flag != "--colmap":  # a project folder may also contain outputs
         protect_inputs(path)
     _check_access(path, flag)
 
@@ -53,7 +53,7 @@ def _existing_mode(path: Path, flag: str) -> int:
 
 
 def _mode(path: Path, flag: str) -> int | None:
-    """Return the mode of a file or a folder; None if there is none."""
+    """Return the mode of a file or folder; None if it does not exist."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -63,7 +63,9 @@ def _mode(path: Path, flag: str) -> int | None:
             ) from None
         return None
     except OSError as error:  # a link to itself, a name that is too long, a folder without search permission
-        raise OSError(f"{short_repr(str(path))}, given with {flag}, cannot be opened: {error.strerror}") from None
+        raise OSError(
+            f"{short_repr(str(path))}, given with {flag}, cannot be opened: {error.strerror}; give another path"
+        ) from None
 
 
 def _check_access(path: Path, flag: str) -> None:
@@ -72,7 +74,7 @@ def _check_access(path: Path, flag: str) -> None:
 
 
 def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
-    """Raise if a file cannot be written, or exists and must not be replaced."""
+    """Raise an error if a file cannot be written, or if it exists and `overwrite` is False."""
     files = [path for path in paths if path is not None]
     refuse_existing(*files, overwrite=overwrite, flags=flags)
     for path in files:
@@ -80,7 +82,7 @@ def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
 
 
 def check_writable_file(path: Path | None, flag: str) -> None:
-    """Raise InputError or OSError if a file cannot be written; its parent folders need not exist."""
+    """Raise InputError or OSError if a file cannot be written. Its parent folders need not exist."""
     if path is None:
         return
     if path.name == "":
@@ -89,15 +91,15 @@ def check_writable_file(path: Path | None, flag: str) -> None:
 
 
 def check_writable_folder(path: Path | None, flag: str) -> None:
-    """Raise InputError or OSError if a folder cannot be written; it need not exist."""
+    """Raise InputError or OSError if a folder cannot be written. It need not exist."""
     for parent in () if path is None else (path, *path.absolute().parents):
         mode = _mode(parent, flag)
         if mode is None:
             continue
         if not stat.S_ISDIR(mode):
-            raise InputError(f"{parent}, named with {flag}, is not a folder; give another path")
+            raise InputError(f"{parent}, given with {flag}, is not a folder; give another path")
         if not os.access(parent, os.W_OK | os.X_OK):
-            raise PermissionError(f"{parent}, named with {flag}, is not writable; give another folder")
+            raise PermissionError(f"{parent}, given with {flag}, is not writable; give another folder")
         return
 
 
@@ -107,7 +109,7 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     Args:
         config: Path of the config.
         data: Current path of the dataset, if it was moved.
-        step: Training step of the checkpoint; None: any.
+        step: Training step of the checkpoint. If None, any checkpoint suffices.
         written_by: Command that wrote the config, for messages.
     Raises:
         FileNotFoundError: The config, the dataset or the checkpoint is missing.
@@ -115,21 +117,21 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     """
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
-        complete_interrupted_writes(run_dir.parent)  # finish a replacement of the run that was killed
+        complete_interrupted_writes(run_dir.parent)  # complete an interrupted replacement of the run
     from normlift_ns.data.nerfstudio.config import check_config_exists, read_config_paths  # noqa: PLC0415 (as --help)
 
     check_config_exists(config, written_by)
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
         raise FileNotFoundError(
-            f"No dataset at {data}, given with --data. Expected the folder or the transforms.json that "
-            "ns-train was run with."
+            f"The dataset {data}, given with --data, does not exist. Give the folder or the transforms.json that "
+            "ns-train used."
         )
     paths = read_config_paths(config)
     located = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat stores its image paths
     if not located and len(paths.data) > 0 and not any(path.exists() for path in paths.data):
         raise FileNotFoundError(
-            f"The dataset of {config} is not at {' nor at '.join(map(str, paths.data[:2]))}. If it was moved, give its "
+            f"The dataset of {config} is not at {' or at '.join(map(str, paths.data[:2]))}. If it was moved, give its "
             "new path with --data."
         )
     checkpoints = run_dir / "nerfstudio_models"
@@ -137,12 +139,12 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
         raise FileNotFoundError(
-            f"No checkpoint {pattern} in {checkpoints}, which contains {files}. Copy it there again."
+            f"There is no checkpoint {pattern} in {checkpoints}, which contains {files}. Copy the checkpoint there."
         )
 
 
 def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
-    """Check a lifted run, and with `ask` also its text encoder."""
+    """Check the files of a lifted run, and its text encoder if `ask` is given."""
     check_run_config(config, data, written_by="ns-normlift")
     folder = field_folder(Path(os.path.abspath(config)).parent)
     if ask is None:
@@ -163,13 +165,13 @@ def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = N
 
 
 def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:
-    """Check a splat without a nerfstudio run, its cameras and its images."""
+    """Check the paths of a splat without a nerfstudio run, of its cameras and of its images."""
     check_readable_file(ply, "--load-ply")
     check_readable_file(gsplat, "--load-gsplat")
     if (splat.colmap is None) == (splat.transforms is None):
         count = "none" if splat.colmap is None else "two"
         raise InputError(
-            f"A splat needs one file of cameras, got {count}: give a COLMAP project folder with --colmap, or a "
+            f"A splat needs one camera file, got {count}: give a COLMAP project folder with --colmap, or a "
             "transforms.json with --transforms."
         )
     for name in ("colmap", "images", "masks"):
@@ -180,14 +182,14 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
 
 
 def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
-    """Raise InputError if an option that has no effect without the flag `needed` is not at its default."""
+    """Raise InputError if one of these options, which have no effect without `needed`, differs from its default."""
     for name in names:
         if getattr(options, name) != getattr(type(options), name):
-            raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave it out")
+            raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave the option out")
 
 
 def check_unused_options(lift: LiftOptions) -> None:
-    """Raise InputError for options that have no effect because their step is off."""
+    """Raise InputError for options that have no effect because their step is disabled."""
     if not lift.consensus:
         names = ("consensus_power", "consensus_sample", "consensus_min_agreement")
         refuse_unused(lift, names, "--consensus True")
@@ -196,7 +198,7 @@ def check_unused_options(lift: LiftOptions) -> None:
 
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
-    """Check the folders, weights, levels and prompts of 2D features."""
+    """Check the folders, the weights, the level and the prompts of 2D features."""
     from normlift_ns.encoders.registry import encoder_kind, with_encoder  # noqa: PLC0415 (not needed for --help)
     from normlift_ns.encoders.weights import is_local_path  # noqa: PLC0415
     from normlift_ns.segmentation.registry import check_mask_options, requested_regions  # noqa: PLC0415

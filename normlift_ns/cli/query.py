@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 _OUTPUTS = ("output_json", "output_npz", "render_dir")
-"""Options of files that hold an answer."""
+"""Options of files that contain an answer."""
 
 
 @renamed(
@@ -60,12 +60,12 @@ _OUTPUTS = ("output_json", "output_npz", "render_dir")
 )
 @dataclass
 class NormLiftQuery(CheckedOptions):
-    """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
+    """Search a lifted run with text prompts, print a table of the results, and write files on request."""
 
     load_config: Path
-    """Path to config YAML file of the lifted run."""
+    """Path to the config.yml file of the lifted run."""
     text: tuple[str, ...] = ()
-    """One or several prompts to search for: --text mug 'red bowl'. A prompt may contain commas."""
+    """Prompts to search for, such as --text mug 'red bowl'. A prompt may contain commas."""
     ask: AskOptions = field(default_factory=AskOptions)
     interactive: bool = False
     """Read prompts from the terminal, one after another, while the run stays open."""
@@ -74,47 +74,50 @@ class NormLiftQuery(CheckedOptions):
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
     save_query: bool = False
-    """Store the queries in the run, replacing earlier ones. ns-render and ns-viewer then render their relevancy."""
+    """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
-    """JSON file to write the table to."""
+    """JSON file for the table."""
     output_npz: Path | None = None
-    """NPZ file to write relevancy [N, Q], reliability [N], valid [N] and names to, for N Gaussians and Q prompts."""
+    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts."""
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
-    """Training images whose cameras to render from, such as 0001 0042. Default: three evenly spaced images."""
+    """Names of training images, such as 0001 0042, from whose cameras to render. Without names, the command renders
+    from three evenly spaced images."""
     explain: bool = False
-    """List the images and regions that voted for the selection, and how well they agree."""
+    """List the images and regions that voted for the selection, and their agreement."""
     explain_dir: Path | None = None
     """Folder for the images of --explain, with outlines of the regions that voted."""
     segment: Literal["sam3"] | None = None
-    """Also segment some training views with SAM 3 and lift its masks. The table then has their relevancy, their
-    agreement between views and their reliability."""
+    """Network that also segments some training views for the prompts. sam3: lift the masks of SAM 3, and print their
+    relevancy, their agreement between views and their reliability."""
     segment_model: str | None = None
-    """Weights of SAM 3: a folder in transformers format, or a name to download. Default: facebook/sam3."""
+    """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
-    """Largest number of evenly spaced training views for --segment, at least 1; more views are slower and more
+    """Maximum number of evenly spaced training views for --segment, at least 1. More views are slower and more
     reliable."""
     objects: bool = False
-    """List the objects in the selection: connected groups of at least 20 Gaussians. id: instance_id in exports. text:
-    prompt with the largest relevancy. Gaussians: their number. centroid: mean position, weighted by evidence. box: edge
-    lengths of the oriented box, longest first. extent: size along x, y and z. Both span the 1st to 99th percentile. R:
-    mean reliability. views: training images that show at least a tenth as much of the object as the best one. best
-    views: three images that show it whole and large. Lengths are in capture units."""
+    """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
+    instance_id in exports, and text is the prompt with the largest relevancy. centroid is the mean position, weighted
+    by evidence. box has the edge lengths of the oriented box, longest first, and extent the size along x, y and z. Both
+    span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least a
+    tenth as much of the object as the best image. best views names three images that show the object whole and large.
+    Lengths are in capture units."""
     objects_dir: Path | None = None
-    """Folder for the list of --objects with box axes, in capture and scene coordinates: objects.json, objects.csv, and
-    boxes as meshes (objects.ply, objects_scene.ply). docs/objects.md explains every column."""
+    """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
+    objects.json, objects.csv, and meshes of the boxes, objects.ply and objects_scene.ply. docs/objects.md explains
+    every column."""
     meters_per_unit: float | None = None
-    """Length of one capture unit in meters for --objects, > 0; positions and sizes are then in meters."""
+    """Length of one capture unit in meters for --objects, > 0. If given, positions and sizes are in meters."""
     inventory: bool = False
-    """List the objects of the scene without prompts: at most 20, those with the most evidence first, with the columns
-    of --objects. An object has a name if a word of the vocabulary is found there, else it is called object 3."""
+    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. The
+    name of an object is the word of the vocabulary that matches it, or else a number such as object 3."""
     vocabulary: Path | None = None
-    """Text file of words to name objects by with --inventory, one per line. Default: the words of the encoder, which
-    are the 1,000 classes for imagenet and the names of colors for color; none for others."""
+    """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
+    classes for imagenet and the names of colors for color. Other encoders have no words."""
     image: Path | None = None
-    """PNG file of --inventory: the scene, from the training image that shows the most objects, with their outlines and
-    numbers."""
+    """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
+    objects."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -180,7 +183,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _run(self) -> StoredRun:
-        """The run with its scene, which most answers do not need."""
+        """Stored run with its scene, which most answers do not need."""
         from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
         return open_stored_run(self.load_config, self.data)
@@ -191,7 +194,7 @@ class NormLiftQuery(CheckedOptions):
         return run_query(self._run.field, self._run.scene.gaussians.means, question)
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
-        """Load everything that renders need, and return a function that renders and saves them."""
+        """Load everything that the renders need, and return a function that makes and saves them."""
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415
 
@@ -203,7 +206,7 @@ class NormLiftQuery(CheckedOptions):
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Add an explanation to every row, write the images, and return a function that prints the explanations.
 
-        A prompt that selects nothing has no explanation.
+        Prompts that select nothing have no explanation.
         """
         import torch  # noqa: PLC0415
 
@@ -307,7 +310,7 @@ class NormLiftQuery(CheckedOptions):
         check_lifted_run(self.load_config, self.data, self.ask)
         outputs = [os.path.realpath(path) for path in (self.output_json, self.output_npz) if path is not None]
         if len(set(outputs)) < len(outputs):
-            raise InputError(f"--output-json and --output-npz name the same file, {self.output_npz}")
+            raise InputError(f"--output-json and --output-npz are the same file, {self.output_npz}; give two names")
         files = (("--output-json", self.output_json), ("--output-npz", self.output_npz), ("--image", self.image))
         for flag, path in files:
             check_new_files(path, overwrite=self.overwrite, flags=flag)
@@ -320,25 +323,25 @@ class NormLiftQuery(CheckedOptions):
         for folder in filter(None, (self.render_dir, self.explain_dir, self.objects_dir)):
             place = Path(os.path.realpath(folder))
             if written & {place, *place.parents}:
-                raise InputError(f"{folder} is named as a folder and as a file; give another path for one of them")
+                raise InputError(f"{folder} is given both as a folder and as a file; give another path for one of them")
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
         flags = [f"--{name}" for name in ("text", "stdin", "interactive", "inventory") if getattr(self, name)]
         if len(flags) == 0:
             raise InputError(
-                'no prompts given; name at least one object to search for, such as --text "orange", or enter prompts '
-                "one after another with --interactive"
+                'there are no prompts; give one with --text, such as --text "orange", or enter prompts one after '
+                "another with --interactive"
             )
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
         for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name) and not (self.inventory and name == "output_json"):
-                raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
+                raise InputError(f"--{name.replace('_', '-')} works only with --text; leave it out with {flags[0]}")
         self._check_dependent_options()
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
-                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
+                "--interactive needs a terminal as standard input; to read prompts from a file, use --stdin True"
             )
         check_prompt_list("text", self.text)
 
@@ -355,7 +358,7 @@ class NormLiftQuery(CheckedOptions):
                 refuse_unused(self, names, flag)
 
     def _existing_renders(self) -> list[Path]:
-        """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""
+        """Return the existing renders that new renders of these prompts and views would replace."""
         views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
         views += ["contact_sheet"] if len(views) > 1 else []
         names = [f"{view}_{i}_{safe_file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
@@ -363,17 +366,16 @@ class NormLiftQuery(CheckedOptions):
 
 
 def read_vocabulary(path: Path) -> list[str]:
-    """Read the words of a text file, one per line; empty lines are skipped.
+    """Read the words of a text file, one per line, and skip empty lines.
 
     Raises:
-        OSError, ValueError: as `check_readable_file`.
-        ValueError: It is not a text file in UTF-8, or has no word.
+        OSError, ValueError: The file cannot be read, is not UTF-8 text, or has no words.
     """
     check_readable_file(path, "--vocabulary")
     try:
         lines = read_text(path, "utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"--vocabulary {path} is not a text file in UTF-8 ({error}); save it as UTF-8") from error
+        raise InputError(f"--vocabulary {path} is not UTF-8 text ({error}); save it as UTF-8") from error
     words = list(dict.fromkeys(filter(None, map(str.strip, lines))))
     if len(words) == 0:
         raise InputError(f"--vocabulary {path} has no words; write one per line")
@@ -381,10 +383,10 @@ def read_vocabulary(path: Path) -> list[str]:
 
 
 def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> None:
-    """Answer prompts that a user types, one per line, until Ctrl-D; invalid prompts print an error message.
+    """Answer the prompts that a user types, one per line, until Ctrl-D. Print an error for invalid prompts.
 
     Args:
-        run: The lifted run.
+        run: Lifted run.
         rules: Keyword arguments of `QuickRun.ask`.
         keep_history: Store prompts in the history file.
     """
@@ -427,16 +429,18 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
     """Answer one prompt per line, and print each answer immediately as one line of JSON; skip empty lines.
 
     Args:
-        run: The lifted run.
+        run: Lifted run.
         rules: Keyword arguments of `QuickRun.ask`.
-        lines: The prompts; None: lines of standard input.
+        lines: Prompts in UTF-8. If None, read standard input.
     Raises:
-        ValueError: Some lines failed; the JSON line of each has an `error`.
+        ValueError: Some prompts failed. The JSON line of each has the key `error`.
     """
     stdin: Any = sys.stdin  # None if it is closed
     source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
     if sys.stdout is None:
-        raise InputError("standard output is closed; --stdin prints its answers there")
+        raise InputError(
+            "standard output is closed, but --stdin prints answers there; open it, or redirect it to a file"
+        )
     failed = total = 0
     for line in source:
         text = line.decode("utf8", "replace").lstrip("\ufeff").strip()  # byte order mark of files from Windows
@@ -453,7 +457,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.write(json.dumps(output) + "\n")
         sys.stdout.flush()
     if failed > 0:
-        raise InputError(f"{failed} of {total} lines could not be answered; see their `error` for the reasons")
+        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines have the reasons under `error`")
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
@@ -465,7 +469,7 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 
 
 def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
-    """Print the table of an answer, and a note for each prompt that is not found, or of which only words count."""
+    """Print the table of an answer, and a note for each prompt that has no clear match or is encoded only in part."""
     rule = f"{question.rule} > {question.threshold:.4g}"
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
     for row in rows:
@@ -484,7 +488,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
         rows: Rows of `Answer.to_json`.
         rule: Selection rule for the title, such as lerf > 0.5.
         threshold: Threshold that each histogram marks with a bar |.
-        narrow: Leave out the histograms and the verdicts.
+        narrow: Omit the histograms and the verdicts.
     """
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
@@ -519,7 +523,7 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
 
 
 _MAX_ROWS = 40
-"""Largest number of objects in the table."""
+"""Maximum number of objects in the table."""
 
 
 def print_catalog(catalog: Catalogue) -> None:
@@ -547,7 +551,7 @@ def print_catalog(catalog: Catalogue) -> None:
     common.CONSOLE.print(table)
     if len(catalog.objects) > _MAX_ROWS:
         common.info(
-            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all."
+            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; add --objects-dir FOLDER to write all."
         )
     if catalog.num_in_small_components > 0:
         common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
@@ -557,32 +561,32 @@ def print_catalog(catalog: Catalogue) -> None:
 
 
 IMAGES_PER_GROUP = 3
-"""Number of images per prompt in each group: those with the largest weight, and those that disagree most."""
+"""Number of images per prompt in each of two groups: the largest weights, and the strongest disagreement."""
 _LARGEST_WEIGHT = "weighs most"
 
 
 def explanation_to_json(names: Sequence[str], why: Why) -> dict[str, Any]:
-    """Return an explanation as plain types, with the names of the images."""
+    """Return an explanation as JSON types, with the names of the images."""
     row = why.to_json()
     return {**row, "views": [{"photograph": names[view["view"]], **view} for view in row["views"]]}
 
 
 def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
-    """Return the images to show: those with the largest weight, and those that disagree most."""
+    """Return the votes of the images with the largest weight, and of those that disagree most, by group."""
     return {_LARGEST_WEIGHT: why.views[:IMAGES_PER_GROUP], "disagrees most": why.most_different[:IMAGES_PER_GROUP]}
 
 
 def save_vote_images(
     recorded: RecordedVotes, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
 ) -> None:
-    """Write the images of the largest weights and disagreements, all or none.
+    """Write the images with the largest weights and disagreements, or no file at all.
 
     The files are <number>_<text>_1_<image>.png … and <number>_<text>_disagrees_1_<image>.png ….
 
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
         OSError: A file cannot be written.
-        FileNotFoundError, ValueError: for the same reasons as `Votes.pictures`.
+        FileNotFoundError, ValueError: As in `RecordedVotes.pictures`.
     """
     from PIL import Image  # noqa: PLC0415 (the tables do not need it)
 
@@ -601,18 +605,18 @@ def save_vote_images(
 
 
 def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
-    """Print a table of images, and a sentence per prompt about their agreement."""
+    """Print a table of images, and a sentence about their agreement for each prompt."""
     result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        common.info(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
+        common.info(f"{text}: {'nothing is selected, so there is no explanation.' if why is None else why.sentence}")
 
 
 def explanation_table(
     names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False
 ) -> Table:
-    """Return a table of the images of every prompt; a narrow table leaves out weights and region counts."""
+    """Return a table of the images of every prompt. A narrow table omits weights and region counts."""
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
     result = Table(title="Why", padding=(0, 0 if narrow else 1))
@@ -637,7 +641,7 @@ def explanation_table(
 
 
 def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
-    """Print the table of SAM 3's answer."""
+    """Print one row per prompt about the lifted masks of SAM 3."""
     from normlift_ns.query.sam3_query import MIN_MASK_FRACTION  # noqa: PLC0415 (loads torch)
 
     limit = max(row["min_reliability"] for row in rows)
@@ -660,7 +664,7 @@ def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> No
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-query in a process that continues afterwards."""
+    """Run ns-normlift-query, and return to the caller if it succeeds."""
     common.run_command(NormLiftQuery)
 
 

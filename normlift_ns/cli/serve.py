@@ -19,17 +19,18 @@ from normlift_ns.errors import InputError
 
 @dataclass
 class NormLiftServe(ServeOptions):
-    """Serve lifted runs: an HTTP API (`normlift_ns.connect` speaks it), the page of ns-normlift-view, and tools for
-    agents. Runs stay open, so that answers take milliseconds.
+    """Serve lifted runs to programs, browsers and agents. The server has an HTTP API (its client is
+    `normlift_ns.connect`), the page of ns-normlift-view, and tools for agents. Runs stay open, so queries take only
+    milliseconds.
     """
 
     runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN…")]
-    """Paths of the config.yml files of lifted runs."""
+    """Paths to the config.yml files of lifted runs."""
     mcp: bool = False
-    """Also offer the tools of the Model Context Protocol: at /mcp, or on standard input and output if standard input is
-    a pipe, as when an agent starts this command. Needs the package mcp: pip install 'normlift-ns[mcp]'."""
+    """Also serve tools of the Model Context Protocol at /mcp. If standard input is a pipe, as when an agent starts this
+    command, serve them on standard input and output instead. Needs pip install 'normlift-ns[mcp]'."""
     export_dir: Path | None = None
-    """Folder below which tools of --mcp may write files. Default: they write none."""
+    """Folder in which the tools of --mcp may write files. None: the tools write no files."""
 
     def main(self) -> None:
         """Serve until the process is interrupted, or until the agent closes standard input."""
@@ -40,7 +41,7 @@ class NormLiftServe(ServeOptions):
             check_lifted_run(config, None)
         check_writable_folder(self.export_dir, "--export-dir")
         if self.export_dir is not None and not self.mcp:
-            raise InputError("--export-dir belongs to --mcp; add --mcp True, or leave it out.")
+            raise InputError("--export-dir has no effect without --mcp; add --mcp True, or leave --export-dir out.")
         server = self.make_server(*self.runs)
         try:
             if self.mcp and stat.S_ISFIFO(os.fstat(sys.stdin.fileno()).st_mode):
@@ -64,7 +65,7 @@ class NormLiftServe(ServeOptions):
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-serve in a process that continues afterwards."""
+    """Run ns-normlift-serve, and return to the caller if it succeeds."""
     run_command(NormLiftServe)
 
 

@@ -1,4 +1,4 @@
-"""Entry points that import their command late, so that Ctrl-C during the import prints no traceback."""
+"""Entry points of the commands. They import a command only when called, so Ctrl-C then prints no traceback."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def _start(module: str, command: str) -> None:
     try:
         found = getattr(import_module(f"normlift_ns.cli.{module}"), command)
         import_module("normlift_ns.cli.common").run_command_process(found)
-    except KeyboardInterrupt:  # the command itself handles later ones
+    except KeyboardInterrupt:  # during the import; later, the command handles it
         sys.stderr.write("Interrupted.\n")
         sys.stderr.flush()
         os._exit(130)

@@ -1,4 +1,4 @@
-"""ns-normlift-view: view a lifted run in the browser, which renders the Gaussians itself."""
+"""ns-normlift-view: view a lifted run in the browser, which renders the Gaussians."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ class ServeOptions(CheckedOptions):
     """Options of commands that serve lifted runs."""
 
     host: str = "127.0.0.1"
-    """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
+    """Address to listen on. 127.0.0.1: accept connections from this machine only. 0.0.0.0: also accept connections from
+    other machines."""
     allowed_hosts: tuple[str, ...] = ()
-    """Further names of this machine in the browser's address bar, such as that of a proxy. Pages at other names get
-    status 403."""
+    """Further host names under which browsers may open the page, such as that of a proxy. The server answers requests
+    under other names with status 403."""
     port: int = 7008
-    """Port to listen on, in 1..65535; if it is in use, the next free one."""
+    """Port to listen on, in 1..65535. If it is in use, the server takes the next free port."""
     read_only: bool = False
-    """Forbid visitors from storing prompts in the run."""
+    """Prevent visitors from storing prompts in the run."""
     max_gaussians: int = 1_000_000
-    """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
-    need more browser memory."""
+    """Maximum number of Gaussians to render. Larger scenes show only their most opaque and largest Gaussians. Larger
+    values need more browser memory."""
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
 
@@ -46,7 +47,7 @@ class ServeOptions(CheckedOptions):
         accepted_names(self.host, self.allowed_hosts)
 
     def make_server(self, *configs: Path) -> WarmServer:
-        """Return the server of some runs, which does not listen yet."""
+        """Return a server for the given runs, without starting it."""
         from normlift_ns.server.app import ServerOptions, WarmServer  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.server.runs import RunStore  # noqa: PLC0415
 
@@ -60,7 +61,12 @@ class ServeOptions(CheckedOptions):
         return open_run(config, device=self.device)
 
     def announce(self, server: WarmServer, port: int, what: str) -> None:
-        """Print the address of a server."""
+        """Print the address of a server.
+
+        Args:
+            port: Port on which the server listens.
+            what: Subject of the sentence, such as "The viewer".
+        """
         if port != self.port:
             info(f"Port {self.port} is already in use.")
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
@@ -78,16 +84,16 @@ class ServeOptions(CheckedOptions):
 )
 @dataclass
 class NormLiftView(ServeOptions):
-    """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
-    GPU.
+    """View a lifted run in the browser, to search, select, hide and export Gaussians. The browser renders the scene, so
+    this machine needs no GPU.
     """
 
     load_config: Path
-    """Path to config YAML file of the lifted run."""
+    """Path to the config.yml file of the lifted run."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per prompt, used instead of encoding prompts."""
+    """NPZ file with one vector per prompt, used instead of the text encoder of the run."""
     prompt_template: str | None = None
-    """Template of the text that the network encodes, with {} for the prompt. Default: the template of the lift."""
+    """Template of the text that the network encodes, with {} for the prompt. None: the template of the lift."""
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
 
@@ -115,7 +121,7 @@ class NormLiftView(ServeOptions):
 
 
 def open_all(server: WarmServer) -> None:
-    """Open the runs of a server, and compute in a thread what the first page would wait for."""
+    """Open the runs of a server, and start a thread for each that prepares the data of its first page."""
     runs = [server.runs.get(name) for name in server.runs.ids]
     for run in runs:
         threading.Thread(target=run.warm_up, daemon=True).start()
@@ -139,12 +145,12 @@ def _check_host(host: str) -> None:
     except (OSError, UnicodeError) as error:
         raise InputError(
             f"--host {host} is not an address that this machine can listen on ({error}). Leave it out to accept "
-            "connections from this machine only, or give 0.0.0.0 to accept them from other machines too."
+            "connections from this machine only, or give 0.0.0.0 to accept connections from other machines as well."
         ) from None
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-view in a process that continues afterwards."""
+    """Run ns-normlift-view, and return to the caller if it succeeds."""
     run_command(NormLiftView)
 
 

