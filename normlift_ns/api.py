@@ -268,13 +268,7 @@ def announce(prepared: PreparedLift) -> None:
 
 
 def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
-    """Compare training images with renders of the scene.
-
-    Returns:
-        A warning if they differ, else None.
-    Raises:
-        ValueError: they do not show the same scene.
-    """
+    """Compare training images with renders; return a warning if they differ, raise if they show different scenes."""
     settings = RasterSettings.of_gsplat(resolve_gsplat_version(scene, options))
     match = measure_alignment(scene, settings, device=device)
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))

@@ -61,12 +61,7 @@ class ServeOptions(CheckedOptions):
         return open_run(config, device=self.device)
 
     def announce(self, server: WarmServer, port: int, what: str) -> None:
-        """Print the address of a server.
-
-        Args:
-            port: Port on which the server listens.
-            what: Subject of the sentence, such as "The viewer".
-        """
+        """Print the address of a server, in a sentence that begins with `what`."""
         if port != self.port:
             info(f"Port {self.port} is already in use.")
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
