@@ -76,7 +76,7 @@ def truncate_text(text: str, max_length: int = 40) -> str:
 
 
 def summarize_error(error: BaseException) -> str:
-    """Return the type and the first line of another package's error, to quote in a message; about 300 characters."""
+    """Return the type and the first line of another package's error, cut to 300 characters, to quote in a message."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
     lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
     text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__

@@ -181,7 +181,7 @@ class ViewBatch(NamedTuple):
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Cell of every pixel; -1 for unlabeled, -2 for masked. On each level, the pixels of a cell have the same region.
+    """Cell of every pixel; -1 for unlabeled, -2 for masked. On each level, the pixels of a cell share a region.
     """
     regions: list[Int32[Tensor, "levels c"]]
     """Region of every cell on every level; -1 for no region."""

@@ -124,7 +124,7 @@ class TrainedSplat(NamedTuple):
 
 
 class SplatLabels(NamedTuple):
-    """Semantics of all Gaussians. A file contains those that its format has columns for."""
+    """Semantics of all Gaussians. A file contains those that its format supports."""
 
     field: SemanticField
     answer: Answer | None = None
@@ -322,7 +322,7 @@ class LabelTransfer(NamedTuple):
 def nearest_gaussians(
     points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], max_distance: float
 ) -> tuple[Int64[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-    """Find the nearest center of a Gaussian to each point, with a k-d tree.
+    """Find the Gaussian center that is nearest to each point, with a k-d tree.
 
     Args:
         means: centers of at least one Gaussian.
@@ -393,14 +393,14 @@ def label_cloud(
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
-        raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
+        raise InputError(
+            "the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255); give another run"
+        )
     means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     spacing = spacing[spacing.isfinite()]
     if len(spacing) == 0:
-        raise InputError(
-            "the cloud cannot be labeled: all visible Gaussians are at one position, so they have no spacing"
-        )
+        raise InputError("the cloud cannot be labeled: all visible Gaussians are at one position; give another run")
     limit = transfer.max_distance * float(spacing.median())
     row, within = nearest_gaussians(vertex_positions(transfer.cloud), means, limit)
     labels = {name: np.where(within, x[row], 0).astype(x.dtype) for name, x in columns.items()}
@@ -433,7 +433,7 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
 
 @dataclass(frozen=True, eq=False)
 class ExportJob:
-    """Gaussians of a lifted run to export, and everything that an exporter may write about them."""
+    """Export job: Gaussians of a lifted run, and all data that an exporter may write about them."""
 
     scene: Scene
     field: SemanticField

@@ -380,9 +380,9 @@ class LiftedRun:
         """List at most 20 objects of the scene without prompts; see `analysis.inventory`.
 
         An object is named after the best word of the vocabulary if the verdict on that word is "found" and the word
-        selects more than half of the object. Other objects are called "object 1", "object 2" and so on. Except for
-        colors, the match of the word must also exceed chance, compared with the 200 unrelated words of the encoder or
-        with a vocabulary of at least 100 words.
+        selects more than half of the object. Other objects are called "object 1", "object 2" and so on. Unless the
+        encoder is color, the word must also match better than chance, compared with the 200 unrelated words of the
+        encoder or with a vocabulary of at least 100 words.
 
         Args:
             vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
@@ -569,7 +569,7 @@ def open_run(
     text_embeddings: str | Path | None = None,
     prompt_template: str | None = None,
 ) -> LiftedRun:
-    """Open a lifted run. The working directory does not matter.
+    """Open a lifted run from any working directory.
 
     Args:
         load_config: config.yml of the run.

@@ -121,7 +121,7 @@ _Target = TypeVar("_Target")
 
 
 def renamed(**names: str) -> Callable[[_Target], _Target]:
-    """Make a function accept old keyword arguments, or a dataclass old field names, with a DeprecationWarning.
+    """Accept old keyword arguments of a function, or old field names of a dataclass, with a DeprecationWarning.
 
     `__setstate__` accepts old names without a warning, because the config.yml files of earlier versions have them.
 
@@ -234,7 +234,7 @@ def check_options(options: Any) -> None:
 
 
 class CheckedOptions:
-    """Base class of options dataclasses; checks the fields of new instances with `check_options`."""
+    """Base class of options dataclasses that checks the fields of new instances with `check_options`."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -629,7 +629,7 @@ class RefineConfig(CheckedOptions):
 
     vote: VoteKind = "posterior"
     """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views, compared with
-    --vote-prior for all neighbors together. paper: the weight of one of its neighbors (equations 9 and 10 of the
+    --vote-prior views for all neighbors together. paper: one vote, as for each neighbor (equations 9 and 10 of the
     paper)."""
     k: int = 36
     """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer."""
@@ -650,7 +650,7 @@ class RefineConfig(CheckedOptions):
     overrule Gaussians with more views."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state. Configs of version 0.1 name no kind of vote and mean the paper's."""
+        """Restore the state. Configs of version 0.1 do not name the kind of vote, which was always the paper's."""
         vars(self).update({"vote": "paper", **state})
 
     @property
@@ -674,7 +674,7 @@ class LiftOptions(CheckedOptions):
     """
 
     image_source: Literal["photos", "render"] = "photos"
-    """Images that the encoder encodes. photos: the training images. render: renders of the trained scene from the same
+    """Images that the encoder receives. photos: the training images. render: renders of the trained scene from the same
     cameras."""
     max_views: int | None = None
     """Maximum number of training views, which are evenly spaced. More views are slower and more reliable. None: all."""

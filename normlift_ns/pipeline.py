@@ -220,8 +220,8 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
     if lifted == 0:
         raise InputError(
             f"none of the {total:,} Gaussians received a direction, although they have regions (from "
-            f"{_describe(source)}). Either the features cancel out in every Gaussian, so check the features, or "
-            "unlabeled pixels outweigh them, so give --unlabeled ignore"
+            f"{_describe(source)}). Check whether the features cancel out in every Gaussian. If unlabeled pixels "
+            "outweigh them, give --unlabeled ignore"
         )
     if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(

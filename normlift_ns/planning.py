@@ -271,7 +271,7 @@ def measure_core(
     most = min(len(gaussians), _LARGE_SAMPLE.get(gaussians.means.device.type, _LARGE_SAMPLE["cpu"]))
 
     def costs(count: int) -> tuple[dict[str, float], dict[str, float], int]:
-        """Run all stages after the evidence on `count` Gaussians; return their seconds, their items and the bytes."""
+        """Run all stages after the evidence on `count` Gaussians; return seconds and items by stage, and the bytes."""
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
         rows = rows.to(gaussians.means.device)
         means, sample = gaussians.means[rows], replace(evidence.select_gaussians(rows), num_excluded=0)
@@ -426,7 +426,7 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
-    message = f"not on this machine: {'; '.join(missing)}. A lift downloads weights of the Hugging Face hub"
+    message = f"not on this machine: {'; '.join(missing)}. A lift downloads weights from the Hugging Face hub"
     return Diagnostic(
         "weights",
         "warning",
@@ -663,7 +663,7 @@ def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
 
 
 def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
-    """Return a warning if images and renders of three views differ; record the seconds of kernels and check."""
+    """Return a warning if images and renders of three views differ; record the seconds of both steps."""
     opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
     start = perf_counter()
     warning = compare_with_images(opened.scene, options, device)

@@ -136,7 +136,7 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
         first, *rest = shlex.split(line)
     except ValueError as error:
         raise InputError(
-            f"{location}: {escape_unprintable(line)} has quotes that a shell would not accept ({error}). Close them."
+            f"{location}: {escape_unprintable(line)} is not quoted correctly ({error}). Close the quotes."
         ) from None
     source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
     own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]
@@ -340,7 +340,7 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
 LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
 """Command of ns-normlift in this installation."""
 _GRACE = 30.0
-"""Seconds from the request to terminate a process to its kill."""
+"""Seconds that a process has to terminate before it is killed."""
 
 
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
@@ -354,7 +354,7 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
         on_tick: Callback; if it returns False, the program is terminated.
         interval: Seconds between two calls of `on_tick`.
     Returns:
-        The exit code, minus the number of the signal that killed the program, or None if `on_tick` returned False.
+        The exit code, the negative number of the signal that killed the program, or None if `on_tick` returned False.
     Raises:
         OSError: The program cannot be started, or the log cannot be written.
     """

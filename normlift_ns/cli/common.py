@@ -177,7 +177,9 @@ def _open_log(path: Path) -> IO[str]:
         protect_inputs(path)
         return path.open("a", encoding="utf8", errors="backslashreplace")
     except OSError as error:
-        raise InputError(f"{path}, given with --log-file, cannot be written: {error.strerror}") from error
+        raise InputError(
+            f"{path}, given with --log-file, cannot be written ({error.strerror}); give another"
+        ) from error
 
 
 class _OutputStream:
@@ -238,7 +240,7 @@ _Command = TypeVar("_Command", bound=CommandProtocol)
 
 
 class TerminatedError(BaseException):
-    """Exception raised by SIGTERM, which a system sends before preemption, for example."""
+    """Exception for SIGTERM, which a scheduler sends before preemption, for example."""
 
 
 _SIGNALS: dict[type, signal.Signals] = {KeyboardInterrupt: signal.SIGINT, TerminatedError: signal.SIGTERM}

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
-"""Number of superpixels per view, which is large enough to separate the green star of a tomato."""
+"""Number of superpixels per view, which is enough to separate a tomato from its green star."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
 """Prompt for the networks, its class in the room, and a sufficient number of views."""
 _ASK = AskOptions(threshold="auto")
@@ -58,7 +58,7 @@ class Demo(CheckedOptions):
     """Number of training views, at least 3. More views take longer."""
 
     def main(self) -> dict[str, float]:
-        """Run the demo; return the mIoU before and after refinement, and the IoU of the object if it was searched."""
+        """Run the demo; return the mIoU before and after refinement, and the IoU of the object unless skipped."""
         check_writable_folder(self.folder, "--folder")
         room = self.folder / "room"
         if (room / "images").exists() and not (room / "instance").exists():

@@ -111,7 +111,7 @@ class NormLift(CheckedOptions):
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 common.info(
-                    f"{self.num_devices} processes share {cores} CPU cores; more than {cores} processes save no time."
+                    f"{self.num_devices} processes share {cores} CPU cores. More than {cores} processes are not faster."
                 )
             words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # prints once
             program = [sys.executable, "-m", "normlift_ns.cli.lift"]
@@ -125,7 +125,7 @@ class NormLift(CheckedOptions):
             return self._lift(team)
 
     def request(self, **more: Any) -> LiftRequest:
-        """Return the request of the lift with these options.
+        """Return the lift request for these options.
 
         Args:
             more: Other fields of the request.
@@ -216,7 +216,7 @@ class NormLift(CheckedOptions):
                 raise InputError(f"--{name.replace('_', '-')} works only with {hint}. Leave it out.")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
-        """Return the capture name and output folder for `run_directory`; None if only an open capture has them.
+        """Return the capture name and output folder for `run_directory`; None if they are not known yet.
 
         Raises:
             InputError, OSError: The config is invalid or cannot be read.

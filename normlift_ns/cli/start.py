@@ -1,4 +1,4 @@
-"""Entry points of the commands. They import a command only when called, so Ctrl-C then prints no traceback."""
+"""Entry points that import a command only when called, and print no traceback if Ctrl-C interrupts the import."""
 
 from __future__ import annotations
 
