@@ -551,7 +551,7 @@ def print_catalog(catalog: Catalogue) -> None:
     common.CONSOLE.print(table)
     if len(catalog.objects) > _MAX_ROWS:
         common.info(
-            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; add --objects-dir FOLDER to write all."
+            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; write all with --objects-dir FOLDER."
         )
     if catalog.num_in_small_components > 0:
         common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
