@@ -206,7 +206,7 @@ def write_splat(
 
 def _named_format(path: Path) -> SplatFormat:
     if path.suffix.lower() in _UNWRITTEN:
-        raise InputError(f"{path} is not written; give a name that ends with .ply, {', '.join(_FORMATS)}")
+        raise InputError(f"{path} is not written: give a name that ends with .ply, {', '.join(_FORMATS)}")
     for end, kind in _FORMATS.items():
         if path.name.lower().endswith(end):
             return kind

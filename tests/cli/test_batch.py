@@ -296,8 +296,8 @@ def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsy
         ("a --vote-k 0\n", "list.txt", "list.txt, line 1", "k must be at least 1, got 0"),
         ("a\nb\n./a\n", "list.txt", "list.txt, line 3", "line 1"),
         ("a --timestamp x", "list.txt", "list.txt, line 1", "--timestamp"),
-        ("a", "list.txt -- --nothing", "After --", "--nothing"),
-        ("a", "list.txt -- --quiet yes --log-file x", "After --", "--quiet"),  # is for another command
+        ("a", "list.txt -- --nothing", "after --", "--nothing"),
+        ("a", "list.txt -- --quiet yes --log-file x", "after --", "--quiet"),  # is for another command
         ("a", "list.txt -- --load-ply x.ply", "--load-ply", "after --"),
         ("a", "list.txt -- --vote-k 0", "--vote-k must be at least 1, got 0"),
         ("a\0b", "list.txt", "list.txt, line 1", "--load-config"),

@@ -67,7 +67,7 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_p
     monkeypatch.setattr(planning, "in_frustum", lambda means, camera: means[:, 0] > 1e9)
     code, found = checked("--check-alignment", "False")
     assert code == 1 and states(found)["in view"] == "error" and found["plan"] is None
-    assert "Correct the errors above" in said(capsys)
+    assert "rerun the command" in said(capsys)
     file = tmp_path / "mine.json"
     file.write_text("mine")
     assert run_entry(monkeypatch, check.entrypoint, "--load-config", trained, *SMALL, "--output-json", file) == 1
@@ -82,7 +82,7 @@ def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, tr
     assert "ViT-B-16" in next(row for row in found["findings"] if row["what"] == "weights")["found"]
     given = ("--load-config", trained, "--encoder", "open_clip", "--regions", "patches")
     assert run_entry(monkeypatch, lift.entrypoint, *given, "--output-dir", tmp_path, "--dry-run", "True") == 1
-    assert "weights are not on this machine" in said(capsys)
+    assert "weights of OpenCLIP, ViT-B-16" in said(capsys)
 
 
 def test_texts_of_sam3_are_those_of_the_lift(checked, monkeypatch, trained, tmp_path, capsys) -> None:

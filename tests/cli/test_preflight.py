@@ -62,9 +62,9 @@ LIFT = [
     ("--device cuda:x:", "--device must be auto, cpu or cuda, got 'cuda:x:'"),
     ("--timestamp ../x", "'../x'", "name of a folder"),
     ("--timestamp old", "old exists", "--timestamp", "--output-dir", "--overwrite True"),
-    ("--output-dir file", "file, named with --output-dir"),
+    ("--output-dir file", "file, given with --output-dir"),
     ("--output-dir dangling/x", "dangling", "link"),
-    ("--export-langsplat file", "file, named with --export-langsplat"),
+    ("--export-langsplat file", "file, given with --export-langsplat"),
     ("--data nowhere", "nowhere, given with --data"),
     ("--load-step 3", "step-000000003.ckpt"),
     ("--regions-dir [/red]", "[/red], given with --regions-dir"),
@@ -91,8 +91,8 @@ LIFT = [
 SPLATS = [
     ("--load-ply nowhere.ply", "nowhere.ply, given with --load-ply"),
     ("--load-gsplat fifo", "fifo, given with --load-gsplat", "pipe"),
-    ("--load-ply file", "cameras", "none"),
-    ("--load-ply file --colmap room --transforms x", "cameras", "two"),
+    ("--load-ply file", "camera file", "none"),
+    ("--load-ply file --colmap room --transforms x", "camera file", "two"),
     ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
@@ -102,8 +102,8 @@ SPLATS = [
     ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),
     ("--load-ply file --transforms room --data x", "--data", "--load-config"),
     ("--load-ply file --transforms room --views some", "--views", "'some'"),
-    ("--load-config config.yml --colmap x", "--colmap is for --load-ply and --load-gsplat"),
-    ("--load-config config.yml --background white", "--background is for --load-ply"),
+    ("--load-config config.yml --colmap x", "--colmap", "--load-ply and --load-gsplat"),
+    ("--load-config config.yml --background white", "--background", "--load-ply"),
 ]
 QUERY = [
     ("--text", "--text", "--interactive"),
@@ -116,9 +116,9 @@ QUERY = [
     ("--text a --output-json file/x", "--output-json is"),
     ("--text a --output-json n --render-dir n/b", "n/b", "folder and as a file"),
     ("--text a --output-json n --output-npz n", "--output-json and --output-npz", ", n"),
-    ("--text a --render-dir file", "file, named with --render-dir"),
-    ("--text a --explain --explain-dir file", "file, named with --explain-dir"),
-    ("--text a --objects --objects-dir file", "file, named with --objects-dir"),
+    ("--text a --render-dir file", "file, given with --render-dir"),
+    ("--text a --explain --explain-dir file", "file, given with --explain-dir"),
+    ("--text a --objects --objects-dir file", "file, given with --objects-dir"),
     ("--text a --text-embeddings none.npz", "none.npz, given with --text-embeddings"),
     ("--text a --render-views 9999 --output-json a.json", "--render-views", "--render-dir"),
     ("--text a --objects-dir x", "--objects-dir", "--objects"),
@@ -140,7 +140,7 @@ EXPORT = [
     ("--exporters note", "unknown exporter 'note'"),
     *((f"--output-dir mine --output-filename {x[0]}.ply", f"{x} exists", "--output-dir") for x in MY_EXPORTS),
     ("--object-max-gap nan", "--object-max-gap", "got nan"),
-    ("--output-dir file", "file, named with --output-dir"),
+    ("--output-dir file", "file, given with --output-dir"),
     ("--output-filename /", "--output-filename"),
     ("--text a --transfer none.ply", "none.ply, given with --transfer"),
     ("--text a --select clean --masks-dir m", "--masks-dir"),
@@ -219,7 +219,7 @@ def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_e
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)
-    folders = {tmp_path: ".cache, named with --output-dir", tmp_path / "locked" / "new": "is not writable"}
+    folders = {tmp_path: ".cache, given with --output-dir", tmp_path / "locked" / "new": "is not writable"}
     for folder, fact in list(folders.items())[: 1 if os.geteuid() == 0 else 2]:  # root may write everywhere
         assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", folder) == 1
         assert fact in said(capsys)
