@@ -174,11 +174,11 @@ WRONG = {
 WRONG_ROWS = {
     "column out of range": (with_rows(column=lambda x: with_value(x, 10**6)), r"columns .*\.\.1000000, .* 0\.\.17"),
     "negative column": (with_rows(column=lambda x: with_value(x, -7)), "columns .* -7"),
-    "falling offsets": (with_rows(offsets=lambda x: with_value(x, 10**9)), "offsets must rise"),
-    "offsets past the end": (with_rows(offsets=lambda x: x + 1), "offsets must rise"),
-    "no offsets": (with_rows(offsets=lambda x: x[:0]), "offsets must rise"),
+    "falling offsets": (with_rows(offsets=lambda x: with_value(x, 10**9)), "offsets that rise"),
+    "offsets past the end": (with_rows(offsets=lambda x: x + 1), "offsets that rise"),
+    "no offsets": (with_rows(offsets=lambda x: x[:0]), "offsets that rise"),
     "short offsets": (with_rows(offsets=lambda x: torch.cat([x[:5], x[-1:]])), r"evidence.*\(5 Gaussians .*40"),
-    "short columns": (with_rows(column=lambda x: x[:-1]), "offsets must rise"),
+    "short columns": (with_rows(column=lambda x: x[:-1]), "offsets that rise"),
     "narrow columns": (with_rows(column=lambda x: x.to(torch.int16)), r"columns are int16"),
     "NaN weight": (with_rows(weight=lambda x: with_value(x, NAN)), r"weights .* nan"),
     "negative weight of a region": (with_rows(weight=lambda x: with_value(x, -1.0)), r"weights .* -1"),
@@ -253,7 +253,7 @@ def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> No
         metadata={k: v for k, v in load_arrays(path).metadata.items() if k != "digest"},
     )
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
-    with pytest.raises(ValueError, match="does not record one"):
+    with pytest.raises(ValueError, match="its metadata has none"):
         Evidence.load(path, key="a")
 
 

@@ -176,8 +176,8 @@ def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
         (lambda file: file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 36\n"), "cannot be read"),
         (lambda file: file.write_bytes(b""), "cannot be read as an image"),
         (lambda file: Image.new("RGB", (20, 10)).save(file), "is 20 x 10 pixels"),
-        (os.mkfifo, "is not a regular file"),
-        (lambda file: file.mkdir(), "is not a regular file"),
+        (os.mkfifo, "regular file"),
+        (lambda file: file.mkdir(), "regular file"),
     ):
         file.unlink()
         make(file)
@@ -323,5 +323,5 @@ def test_smaller_copies_of_images_of_one_name_are_refused(copied: Path) -> None:
         whole["frames"][i]["file_path"] = f"{side}/000.jpg"
     path.write_text(json.dumps(whole))
     copied.write_text(config.replace("downscale_factor: null", "downscale_factor: 2"))
-    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg would share the file .*images_2/000\.jpg"):
+    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg .*share the file .*images_2/000\.jpg"):
         opened(copied)

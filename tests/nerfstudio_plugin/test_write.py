@@ -141,7 +141,7 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field:
     torch.save({"step": 2, "pipeline": fewer}, path)
     with pytest.raises(ValueError, match=rf"normlift has 60 Gaussians, but {path} has 59"):
         field_of(opened(run_dir / "config.yml"))
-    with pytest.raises(FileNotFoundError, match=r"without semantics \(no normlift/"):
+    with pytest.raises(FileNotFoundError, match="without semantics.* normlift/"):
         field_of(opened(stock.config))
 
 
