@@ -103,8 +103,8 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
     arrays, metadata, digest = load_arrays(path, key=key, legacy_keys=legacy_keys, remedy=remedy)
     if metadata.get("format") != EVIDENCE_FORMAT:
         raise InputError(
-            f"{path} has format {metadata.get('format')!r}, expected an evidence file of format "
-            f"{EVIDENCE_FORMAT!r}; {remedy}"
+            f"{path} has format {metadata.get('format')!r}, expected an evidence file of format {EVIDENCE_FORMAT!r}; "
+            "create it again with this version"
         )
     try:
         rows = RowArrays(*(arrays[name] for name in ("offsets", "region", "weight")))
@@ -118,7 +118,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         unlabeled.check("weights of unlabeled pixels", views)
         if len(unlabeled.offsets) != len(rows.offsets):
             raise InputError(
-                f"region weights are for {len(rows.offsets) - 1} Gaussians, but the weights of unlabeled pixels are for "
+                f"region weights are for {len(rows.offsets) - 1} Gaussians, but weights of unlabeled pixels are for "
                 f"{len(unlabeled.offsets) - 1}"
             )
         last = views - 1 if region_view.size > 0 else 0

@@ -193,7 +193,7 @@ def iter_claims(
     >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, timeout=60.0))
     (ClaimState(number=1, outcome='done'), [])
     """
-    heartbeats: dict[Claim, tuple[bytes, float]] = {}  # latest heartbeat of each claim, and the time of its first reading
+    heartbeats: dict[Claim, tuple[bytes, float]] = {}  # latest heartbeat of each claim, and its first reading time
     while True:
         now, current, waiting, mine = clock(), read_claim_states(folder), False, None
         for key in keys:

@@ -62,8 +62,8 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
             )
         if len(os.fsencode(folder)) > _MAX_NAME_BYTES:
             raise InputError(
-                f"the {kind} {folder[:20]!r}… has {len(os.fsencode(folder))} bytes, expected at most {_MAX_NAME_BYTES}; "
-                "give a shorter name"
+                f"the {kind} {folder[:20]!r}… has {len(os.fsencode(folder))} bytes, expected at most "
+                f"{_MAX_NAME_BYTES}; give a shorter name"
             )
     return Path(os.path.abspath(output_dir)) / name / "normlift" / stamp
 
@@ -171,14 +171,14 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
     refuse_inputs([run_dir], instead=flags)
     complete_interrupted_writes(run_dir.parent)
     if source is not None and Path(os.path.realpath(source)).is_relative_to(os.path.realpath(run_dir)):
-        raise InputError(f"{run_dir} contains {source}, which this lift reads; give another {flags}")
+        raise InputError(f"{run_dir} contains the run to lift, so the lift must not replace it; give another {flags}")
     if not overwrite and os.path.lexists(run_dir):
         raise FileExistsError(f"{run_dir} exists; give another {flags}, or --overwrite True.")
     is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
     if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
             f"{run_dir} has no config.yml or no {FIELD_FOLDER}/, but --overwrite replaces only lifted runs; "
-            f"give another {flags}, or delete the folder"
+            "give another --timestamp or --output-dir, or delete the folder"
         )
 
 
@@ -252,7 +252,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         ) from error
     if facts.get("schema_version") != SCHEMA_VERSION or isinstance(facts["schema_version"], bool):
         version = repr(facts.get("schema_version"))[:50]
-        raise InputError(f"{path} has schema version {version}, expected {SCHEMA_VERSION}; {LIFT_AGAIN}")
+        raise InputError(f"{folder} has schema version {version}, expected {SCHEMA_VERSION}; lift again")
     expected, digests = facts.pop("digest", None), facts.pop("digests", None)
     if expected is not None or digests is not None:
         actual = text_digest(text.replace(f'"digest": {json.dumps(expected)}', '"digest": ""', 1))
