@@ -286,7 +286,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
-        ({**every, "test_every": 8, "eval_images": ("0001",)}, "give only one of them"),
+        ({**every, "test_every": 8, "eval_images": ("0001",)}, "test-every and --eval-images"),
         ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
         ({**every, "eval_images": ("list.txt",)}, r"--eval-images .*list\.txt"),
         ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),

@@ -82,7 +82,7 @@ def test_columns_that_change_what_is_drawn(tmp_path: Path) -> None:
     assert found.rasterize_mode == "antialiased" and "filter_3D" in found.remarks[0]
     same = read_ply(write_ply(tmp_path / "a.ply", {**columns, "filter_3D": other})).splat
     torch.testing.assert_close(same.opacities, splat.opacities)
-    with pytest.raises(InputError, match=r"filter_3D holds negative"):
+    with pytest.raises(InputError, match="filter_3D"):
         read_ply(write_ply(tmp_path / "a.ply", {**columns, "filter_3D": other - 1}))
     for name in ("beta", "trbf_center", "motion_0", "scale_t", "shape", "shape_0"):
         with pytest.raises(InputError, match=rf"a\.ply has {name}, .*--load-ply"):
