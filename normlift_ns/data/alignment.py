@@ -1,4 +1,4 @@
-"""Check before a lift that images, cameras and Gaussians belong together, with a few renders."""
+"""Comparison of a few renders with their images before a lift, to detect cameras that do not match the splat."""
 
 from __future__ import annotations
 
@@ -98,10 +98,9 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         "the images, their exposure or transforms.json have changed since the training, or the training was stopped "
         "early"
         if trained_cameras
-        else "cameras of another capture; cameras in another world than the splat (give --world-transform, or for "
-        "gsplat's trainer --gsplat-normalize); other images; distorted images with cameras for undistorted images; "
-        "another exposure than in the training; much smaller copies of the training images; another --rasterize-mode "
-        "or --background"
+        else "cameras of another capture, or cameras in another world than the splat. Give --world-transform, or for "
+        "gsplat's trainer --gsplat-normalize. Other causes are other, distorted or much smaller images, another "
+        "exposure, another --rasterize-mode or another --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
@@ -110,21 +109,21 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         )
     if match.psnr < match.mean_color_psnr and not trained_cameras:
         raise InputError(
-            f"The splat does not match its images: renders of three training views have a PSNR of only "
-            f"{match.psnr:.1f} dB, less than the mean color of each image ({match.mean_color_psnr:.1f} dB). {causes}. "
+            f"The splat does not match its images. Renders of three training views have a PSNR of {match.psnr:.1f} dB, "
+            f"less than the mean color of each image ({match.mean_color_psnr:.1f} dB). {causes}. "
             "To lift anyway, give --check-alignment False."
         )
     if match.focal_factor != 1.0:
         return (
             f"Focal lengths that are {abs(match.focal_factor - 1):.0%} "
             f"{'longer' if match.focal_factor > 1 else 'shorter'} increase the PSNR by more than 1 dB. The cameras "
-            "may not be those of the training. Check if the camera file has changed, or if the images were resized."
+            "may not be those of the training. Check whether the camera file has changed or the images were resized."
         )
     name, lowest = match.worst
     if match.psnr >= MIN_PSNR > lowest:
         return (
             f"The render of {name}, one of three training images that were checked, has a PSNR of only {lowest:.1f} "
-            f"dB; {MIN_PSNR:.0f} dB or more is usual. Check if this image or its camera has changed since the "
+            f"dB; {MIN_PSNR:.0f} dB or more is usual. Check whether this image or its camera has changed since the "
             "training. If so, other images may have changed too."
         )
     if match.psnr < MIN_PSNR:

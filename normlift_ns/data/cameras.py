@@ -28,7 +28,7 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
         advice: Advice on missing images, for error messages; None for advice that suits the options.
     Raises:
         FileNotFoundError: A file, folder, image or mask is missing.
-        ValueError: The options contain no camera file or two, or the file cannot be read.
+        ValueError: The options do not contain exactly one camera file, or it cannot be read.
     """
     count = (options.colmap is not None) + (options.transforms is not None)
     if count != 1:
@@ -59,8 +59,8 @@ _NORMALIZED = "The splat matches its images in gsplat's normalized world, which 
 def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[tuple[str, WorldTransform]]:
     """Return possible transforms from the world of the cameras to the world of the splat.
 
-    Each comes with a message for the user if it is chosen. If there are several, the caller must compare renders with
-    the images. A PLY file may come from gsplat's trainer, so its normalized world is an alternative for PLY files too.
+    If there are several, the caller compares renders with the images, and shows the message of the transform that it
+    chooses. PLY files may come from gsplat's trainer, so its normalized world is an alternative for PLY files too.
     """
     if options.world_transform is not None:
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
@@ -110,7 +110,7 @@ def adjust_poses(
         deltas: Adjustments of the training views, as in `SplatFile.pose_adjust`.
         path: File of the splat, for error messages.
     Raises:
-        ValueError: There is not one adjustment per training view, or an adjustment is not a rotation.
+        ValueError: The numbers of adjustments and training views differ, or an adjustment is not a rotation.
     """
     trained = [frame for frame in frames if frame.name not in held_out]
     if len(trained) != len(deltas):

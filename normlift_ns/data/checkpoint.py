@@ -1,4 +1,4 @@
-"""Readers for nerfstudio and gsplat checkpoints, which execute no code from the files."""
+"""Readers for nerfstudio and gsplat checkpoints that do not execute code from the files."""
 
 from __future__ import annotations
 

@@ -257,9 +257,9 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     ]
     if len(differ) > 0:
         raise InputError(
-            f"{model} can be read in two ways: {differ[0]} has different cameras in the .bin files, which COLMAP and "
-            f"gsplat read, and in the .txt files, which nerfstudio reads ({len(differ)} of {len(first)} images). Keep "
-            f"only the files that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
+            f"{model} can be read in two ways: the cameras of {differ[0]} in the .bin and .txt files differ "
+            f"({len(differ)} of {len(first)} images). COLMAP and gsplat read the .bin files; nerfstudio reads the .txt "
+            f"files. Keep only those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
         )
 
 

@@ -83,8 +83,8 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
 def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
     """Encode Gaussians as a compressed PLY file, sorted so that each chunk covers a small box.
 
-    Opacities and colors have 8 bits, and rotations 10 bits per component. Positions and logarithms of scales have 10 or
-    11 bits of their range in a chunk. Spherical harmonics have steps of 1/32 between -4 and 4.
+    Opacities and colors have 8 bits; rotations have 10 bits per component. Positions and logarithms of scales have 10
+    or 11 bits for their range in a chunk. Spherical harmonics have steps of 1/32 between -4 and 4.
 
     Args:
         parameters: Finite parameters by splatfacto's names. Spherical harmonics of degree 4 are left out.
@@ -133,8 +133,8 @@ def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3
     most = float(errors[(len(errors) * 99 - 1) // 100])
     return (
         f"{name} contains rounded numbers. Maximum errors: {most:.2g} for 99 % of the positions and "
-        f"{float(errors[-1]):.2g} for all of them, {float(scales.max()) / steps:.2g} for logarithms of scales, "
-        "0.005 radians for rotations, and 0.002 for opacities."
+        f"{float(errors[-1]):.2g} for all, {float(scales.max()) / steps:.2g} for logarithms of scales, "
+        "0.005 radians for rotations, 0.002 for opacities."
     )
 
 

@@ -174,7 +174,7 @@ class WorldTransform(NamedTuple):
     """Rotation and translation."""
     scale: float
     float32: bool = False
-    """True to compute in float32 like nerfstudio, for cameras that are bit-exact equal to those of the training."""
+    """True to compute in float32 like nerfstudio, so that the cameras equal those of the training bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: There are no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a focal
-            length or size is not positive.
+        ValueError: There are no cameras, a name occurs twice, or a pose is not rigid. A number is not finite, or a
+            focal length or size is not positive.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")
@@ -294,7 +294,7 @@ def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
 def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """Find the masks of images, and return their absolute paths.
 
-    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image with the stem name.
+    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image name with any supported suffix.
 
     Raises:
         FileNotFoundError: A mask is missing.

@@ -105,8 +105,8 @@ def read_gltf(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
-        ValueError: The file is not a glTF file with exactly one splat, is truncated or damaged, needs an extension or
-            setting that is not supported, or has Gaussians that cannot be drawn.
+        ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
+            setting, or has Gaussians that cannot be drawn.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")

@@ -109,7 +109,7 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     low, high = float(splat.opacities.min()), float(splat.opacities.max())
     if len(splat) >= _MIN_LOGITS and low >= 0 and high <= 1:
         raise InputError(
-            f"{file} seems to contain opacities, between {low:.3g} and {high:.3g}, expected their logits. Store "
+            f"{file} seems to contain opacities (between {low:.3g} and {high:.3g}), expected their logits. Store "
             "log(opacity / (1 - opacity)), as all splat trainers do."
         )
     sample = splat.means[:: max(1, len(splat) // _SAMPLE_SIZE)]
@@ -188,7 +188,7 @@ _FILTER = "filter_3D"
 
 
 def check_extra_names(names: Iterable[str], file: Path) -> tuple[str, ...]:
-    """Return a message that lists the parameters that the reader ignores, or nothing without such parameters.
+    """Return a message that lists ignored parameters; an empty tuple if there are none.
 
     Raises:
         ValueError: A parameter belongs to a primitive other than 3D Gaussians.
@@ -279,8 +279,8 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 class _PlainHeader(io.FileIO):
     """PLY file whose header is changed to a form that plyfile reads, without a change of its length.
 
-    Other bytes than ASCII become question marks. Lines of obj_info, which some programs write after the properties,
-    become comments.
+    Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
+    comments.
     """
 
     def __init__(self, path: Path) -> None:
@@ -309,7 +309,7 @@ def _parse_ply(path: Path) -> PlyData:
             ) from error
         raise InputError(
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
-            "splat-transform converts other formats, for example: splat-transform scene.sog scene.ply"
+            "to convert other formats, run for example: splat-transform scene.sog scene.ply"
         ) from error
 
 

@@ -28,12 +28,12 @@ SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, number of streams."""
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
-"""Header of version 4, read for the offset of the table; compressed and uncompressed size of a stream."""
+"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
 _ANTIALIASED = 1
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
 _SH_STEPS = (8, 16)
-"""Steps of the spherical harmonics of degree 1 and of higher degrees, in 1/128: the defaults of Niantic's library."""
+"""Quantization steps of spherical harmonics of degree 1 and of higher degrees, in 1/128, as in Niantic's library."""
 _COMPONENT_STEPS = 511 * 2**0.5
 """Quantization steps per unit of a quaternion component. All components except the largest are at most sqrt(1/2)."""
 _MAX_RATIO = 1032
@@ -155,15 +155,14 @@ def _read_header(data: bytes, path: Path) -> _Header:
         raise InputError(f"{path} contains no Gaussians. Export the scene again.")
     if degree not in SH_DEGREES.values() or fractional_bits > _MAX_FRACTIONAL_BITS + 1:
         raise InputError(
-            f"{path} is damaged: its header has spherical harmonics of degree {degree} and {fractional_bits} "
-            f"fractional bits, expected a degree of at most {max(SH_DEGREES.values())} and at most 24 bits. Copy it "
-            "again."
+            f"{path} is damaged: its header has degree {degree} of spherical harmonics and {fractional_bits} "
+            f"fractional bits, expected at most {max(SH_DEGREES.values())} and 24. Copy it again."
         )
     return _Header(version, count, degree, fractional_bits, flags)
 
 
 def _check_size(header: _Header, size: int, path: Path) -> None:
-    """Raise if a compressed file of `size` bytes is too small for the Gaussians, or if memory is too small."""
+    """Raise if a compressed file of `size` bytes is too small for the Gaussians, or if they do not fit into memory."""
     if sum(header.sizes) > size * _MAX_RATIO:
         raise _damaged(path, f"its header declares {header.gaussians:,} Gaussians, too many for {size:,} bytes")
     refuse_small_memory(header.gaussians)

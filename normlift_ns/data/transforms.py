@@ -335,7 +335,7 @@ _SAME = 1e-3
 
 
 def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrinsics, path: Path) -> None:
-    """Raise InputError if the file has two different values for a parameter, of which programs read different ones."""
+    """Raise InputError if the file has two different values for a parameter, because programs read different ones."""
     found: dict[str, tuple[str, float]] = {}
     differ: list[tuple[str, tuple[str, float], tuple[str, float]]] = []
     pixels = _SAME * max(lens.width, lens.height)
@@ -360,7 +360,7 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         raise InputError(
             f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} by {first[0]}, which "
             f"nerfstudio reads, and {second[1]:g} by {second[0]}, which programs such as instant-ngp and Brush read. "
-            f"Remove the values that the splat was not trained with, and give the new file with --transforms: "
+            f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
         )
 
@@ -611,14 +611,14 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
 
     The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step turns the cameras
     upright around the origin, at a median distance of 1. The second step rotates the principal axes of the points to x,
-    y and z, with more points in the lower half.
+    y and z, and flips the half with more points to the bottom.
 
     Args:
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer, followed by the three that differ from it by half a turn about an axis. gsplat
-        before 1.5 omits the last rotation, and the signs of the axes depend on the linear algebra library.
+        The similarity of the trainer, followed by the three that differ from it by half a turn about an axis. The signs
+        of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip the points.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """
@@ -649,7 +649,7 @@ def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -
 
 
 def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform of the mean up axis of the cameras to -y, and of their common focus point to the origin.
+    """Return the transform that maps the mean up axis of the cameras to -y, and their focus point to the origin.
 
     Args:
         poses: Camera-to-world matrices in OpenCV convention.
@@ -672,7 +672,7 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform of the median of points to the origin, and of their widest axis to x, narrowest to z."""
+    """Return the transform that maps the median of points to the origin, their widest axis to x, narrowest to z."""
     center = np.median(points, axis=0)
     covariance = np.cov(points - center, rowvar=False)
     if not np.isfinite(covariance).all():

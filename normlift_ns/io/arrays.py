@@ -109,7 +109,7 @@ def save_arrays(
 
 
 def sort_metadata(path: Path) -> None:
-    """Sort the metadata in the header of a safetensors file, so that equal contents give bit-exact equal files.
+    """Sort the metadata in the header of a safetensors file, so that equal contents give bit-for-bit equal files.
 
     The safetensors library itself writes metadata in arbitrary order.
     """

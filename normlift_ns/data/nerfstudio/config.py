@@ -35,7 +35,7 @@ from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _MAX_BYTES = 2**18
 """Maximum size of a config.yml in bytes. Those of nerfstudio have about 6,000."""
-_EXPECTED = "Give the config.yml that ns-train splatfacto wrote with --load-config."
+_EXPECTED = "With --load-config, give the config.yml that ns-train splatfacto wrote."
 
 
 def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
@@ -440,8 +440,8 @@ def check_config_values(config: Any, path: Path, say: Callable[[str], None] = la
         path: Path of its file, for error messages.
         say: Function that is called with a sentence for each replaced choice.
     Raises:
-        ValueError: A value does not match its type, a number is out of range, a folder name is invalid, or a component
-            does not belong to splatfacto.
+        ValueError: A value does not match its type, a number is out of range, or a folder name or a component is not
+            supported.
     """
     if type(config) is not TrainerConfig:
         raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")
@@ -617,8 +617,8 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
         say: Function that is called with a sentence about ignored settings.
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not a nerfstudio config, or it has an unsupported method or data parser, other classes
-            than nerfstudio's configuration classes, or invalid values.
+        ValueError: The file is not a nerfstudio config, or it has an unsupported method, data parser or class, or
+            invalid values.
     """
     root = compose_config(path)
     method = config_string(root, "method_name")

@@ -1,6 +1,6 @@
 """Validation of the datasets of trained runs, and cameras, poses and splits as in nerfstudio's data parsers.
 
-All steps are the same as in nerfstudio, in float32, so the cameras are bit-exact equal.
+All steps are the same as in nerfstudio, in float32, so the cameras are bit-exact.
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ def normalize_poses(
 def compose_applied_transform(
     transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
 ) -> Float[Tensor, "3 4"]:
-    """Return the product of a transform and the transform that was applied to the stored poses, if there is one."""
+    """Return a transform that starts from the original world of the capture.
+
+    `applied` was applied to the poses before they were stored; None if there was no such transform.
+    """
     if applied is None:
         return transform
     rows = torch.cat([torch.tensor(applied, dtype=transform.dtype), torch.tensor([[0.0, 0.0, 0.0, 1.0]])], 0)
@@ -277,8 +280,8 @@ def split_files(
     validation list, which ns-train evaluates on.
 
     Raises:
-        ValueError: There are lists, but no list of training images; a listed file is missing; or eval_mode is filename
-            and a file name does not contain its split.
+        ValueError: There are lists, but no list of training images, or a listed file is missing. Or eval_mode is
+            filename, and a file name does not contain its split.
     """
     if any(names is not None for names in lists.values()):
         held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]
