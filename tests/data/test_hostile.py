@@ -163,7 +163,7 @@ def test_headers_of_arrays_are_not_believed(tmp_path: Path) -> None:
     path = tmp_path / "world.npy"
     head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000, 4), }"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + head.ljust(117) + b"\n" + bytes(128))
-    with pytest.raises(InputError, match=r"world\.npy does not hold a transform"):
+    with pytest.raises(InputError, match=r"world\.npy does not contain a transform"):
         read_world_transform(path)
     path.write_bytes(bytes(2**17))
     with pytest.raises(InputError, match="4 x 4"):

@@ -49,7 +49,7 @@ def test_what_stands_in_the_file_and_in_a_frame_must_agree(tmp_path: Path) -> No
         ({"camera_model": "OPENCV"}, {"camera_model": "PINHOLE"}, (".camera_model", ".frames[].camera_model")),
     ):
         path = capture(tmp_path, {"fl_x": 50.0, **shared}, **frame)
-        with pytest.raises(InputError, match=r"two ways: .*images/b\.png") as caught:
+        with pytest.raises(InputError, match=r"two ways.*images/b\.png") as caught:
             read_transforms(path)
         for place in places:
             assert f"jq 'del({place})' transforms.json > new.json" in str(caught.value), place
@@ -151,7 +151,7 @@ def test_paths_of_another_machine(tmp_path: Path, start: str) -> None:
 
 def test_other_content_is_refused(tmp_path: Path) -> None:
     for content, frame, message in (
-        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE; .* OPENCV"),
+        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE, .* OPENCV"),
         ({"w": 40, "h": 30}, {}, "fl_x nor camera_angle_x"),
         ({**INTRINSICS, "k4": 0.1}, {}, "k4 = 0.1"),
         ({**INTRINSICS, "w": 40.5}, {}, "whole number"),

@@ -365,7 +365,7 @@ def test_a_journal_of_somebody_else_is_not_followed(visited: tuple[Path, Path], 
         assert (sent / "mine").read_text() == "evil"
     atomic.write_journal(sent, STEPS)
     moved = sent.rename(folder / f".normlift-{'b' * 16}")
-    with pytest.warns(UserWarning, match="another machine"):
+    with pytest.warns(UserWarning, match="another user or machine"):
         atomic.complete_interrupted_writes(folder)
     moved.rename(sent)
     with monkeypatch.context() as patch:
