@@ -292,8 +292,8 @@ def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, litt
     for kind, name, *facts in (
         ("ply", "points.ply", "not a splat", "5", "f_dc_0"),
         ("gsplat", "other.pt", "normalized"),
-        ("ply", "scene.ply", "does not show"),
-        ("ply", "far.ply", "do not look at this splat"),
+        ("ply", "scene.ply", "does not match its images"),
+        ("ply", "far.ply", "do not show this splat"),
     ):
         assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
         text = said(capsys).replace("│", " ")
