@@ -122,11 +122,9 @@ def _look_at(
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
     """Write a run like that of `ns-train splatfacto` to output_dir/<capture>/splatfacto/<time>.
 
-    This takes seconds on a CPU.
-
-    nerfstudio's own trainer saves its full checkpoint, including optimizers and schedulers. It does so after one step
-    with zero gradients, which does not change the Gaussians of the room. The checkpoint lacks only the weights of the
-    LPIPS metric.
+    This takes seconds on a CPU. nerfstudio's own trainer saves its full checkpoint, including optimizers and
+    schedulers. It does so after one step with zero gradients, which does not change the Gaussians of the room. The
+    checkpoint lacks only the weights of the LPIPS metric.
 
     Args:
         capture_folder: Folder from `write_capture`. The config contains this path unchanged, relative or absolute.

@@ -54,7 +54,7 @@ def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool
 
 @dataclass(frozen=True)
 class _Cached:
-    """Base class of caches. All other attributes are those of `inner`."""
+    """Base class of caches, which have all attributes of `inner`."""
 
     inner: Any
     """Object that computes the results."""

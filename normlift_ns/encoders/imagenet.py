@@ -45,8 +45,8 @@ def find_classes(prompt: str) -> list[int]:
     near += [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
     raise InputError(
-        f"prompt {truncate_text(prompt)!r} is not the name of an ImageNet class or of a group of classes; use a known "
-        f"word, with a similar spelling such as {suggestions}. For other words, lift with --encoder open_clip"
+        f"prompt {truncate_text(prompt)!r} is not the name of an ImageNet class or of a group of classes. Words with a "
+        f"similar spelling are {suggestions}; use one of them, or lift with --encoder open_clip for other words"
     )
 
 

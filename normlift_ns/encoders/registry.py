@@ -79,7 +79,7 @@ class EncoderKind:
     suggested: float = 0.6
     """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
-    """Smallest best cosine of a weak match, and smallest best cosine of a match. None: see `query.presence`."""
+    """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.presence`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False
@@ -246,7 +246,10 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
 
     if options.prompt_template != "{}":
-        raise InputError(f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it")
+        raise InputError(
+            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or use "
+            "--encoder open_clip"
+        )
     return ColorEncoder()
 
 

@@ -134,9 +134,9 @@ class TextEmbeddingFile(LazyTextEncoder):
     def __post_init__(self) -> None:
         if not os.path.isfile(self.file):
             if os.path.lexists(self.file):
-                raise InputError(f"{self.file} is not a file of text vectors; give an NPZ file with --text-embeddings")
+                raise InputError(f"{self.file} is not a file of text embeddings; set --text-embeddings to an NPZ file")
             raise FileNotFoundError(
-                f"file of text vectors {self.file} does not exist; use --text-embeddings with an NPZ file that has one "
+                f"file of text embeddings {self.file} does not exist; set --text-embeddings to an NPZ file with one "
                 "vector per prompt"
             )
 
@@ -183,7 +183,7 @@ class TextEmbeddingFile(LazyTextEncoder):
             zipfile.BadZipFile, zlib.error, struct.error,
         ) as error:  # fmt: skip
             raise InputError(
-                f"file of text vectors {self.file} is damaged or not an NPZ file ({error}); write it again with "
+                f"file of text embeddings {self.file} is damaged or not an NPZ file ({error}); write it again with "
                 "numpy.savez(file, **{text: vector, ...})"
             ) from None
         lengths = {array.shape for array in arrays.values()}
@@ -234,7 +234,11 @@ def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origi
     for prompt in prompts:
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
-            hint = f"among {len(vectors)}; closest prompts: {', '.join(near)}" if len(vectors) > 0 else "which is empty"
+            hint = (
+                f"which has {len(vectors)} for other prompts; use one of these, such as {', '.join(near)}"
+                if len(vectors) > 0
+                else "which is empty; write the vectors of your prompts to it"
+            )
             raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 

@@ -23,7 +23,7 @@ class Suppression:
     """Thresholds of LangSplat's mask suppression. The defaults are its settings.
 
     A mask is inside another mask if it covers less than `outer` of that mask, which covers at least `inner` of it.
-    Masks inside other masks are dropped at any score.
+    Masks inside other masks are dropped, whatever their score is.
     """
 
     iou: float = 0.8
