@@ -38,7 +38,7 @@ def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> l
 
 
 def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras for evaluation, on a different circle than the cameras of `demo_cameras`."""
+    """Return cameras for evaluation, on a different circle from the cameras of `demo_cameras`."""
     return [_look_at((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
 
 

@@ -24,7 +24,7 @@ _SHELL = 0.02
 _MIN_SCALE = 1e-3
 """Smallest standard deviation of a Gaussian, in meters."""
 _CREASE = 0.03
-"""Weight of normals in patches, in meters. Normals at 60 degrees separate points like this distance, so that patches
+"""Weight of normals in patches, in meters. A difference of 60 degrees counts like this distance, so that patches
 end at edges."""
 
 

@@ -348,7 +348,7 @@ class PatchFeatures:
     """
 
     encoder: DenseEncoder
-    """Encodes the patches and the prompts."""
+    """Encoder of the patches and of prompts."""
     count: int = 1024
     """Approximate number of patches per image, at least 1."""
 
@@ -441,8 +441,8 @@ class PrecomputedFeatures:
         unknown = sorted(set(self.views) - set(names))
         if len(unknown) > 0:
             raise InputError(
-                f"features were given for {unknown[0]!r}, which is not a training image; use the {len(names)} names in "
-                f"scene.train.names, from {names[0]!r} to {names[-1]!r}"
+                f"features has an entry for {unknown[0]!r}, which is not a training image; use the {len(names)} names "
+                f"in scene.train.names, from {names[0]!r} to {names[-1]!r}"
             )
         return [name for name in names if name in self.views]
 
@@ -538,7 +538,10 @@ def _convert_text(text: str, values: Any) -> Tensor:
     if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
         raise InputError(f"the vector of prompt {text!r} must be finite, not zero and of shape [D], got {vector.shape}")
     if text.strip() == "" or text.endswith(".npy") or re.search("[\0\ud800-\udfff]", text):
-        raise InputError(f"{text!r} is not a valid prompt: it is empty, ends in .npy or contains invalid characters")
+        raise InputError(
+            f"{text!r} in texts is not a valid prompt, because it is empty, ends in .npy or contains invalid "
+            "characters; use another prompt"
+        )
     return vector
 
 

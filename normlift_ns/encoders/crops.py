@@ -67,7 +67,7 @@ class NetworkEncoder(ABC):
     """
 
     fill: CropFill
-    """Color of the pixels outside of a region."""
+    """Color of the pixels outside a region."""
     device: str
     """Device of the network; results are always on the CPU."""
     template: str

@@ -214,7 +214,7 @@ class TextTower:
     device: str
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt, on the CPU.
+        """Return one unit vector per prompt, on the CPU.
 
         Raises:
             ValueError: If `prompts` or a prompt is empty.

@@ -159,4 +159,6 @@ def _call(noun: str, name: str, function: Callable[[], _Result]) -> _Result:
     except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:  # other packages can raise any exception
-        raise InputError(f"{noun} {name!r} of another package failed ({summarize_error(error)})") from error
+        raise InputError(
+            f"{noun} {name!r} of another package failed ({summarize_error(error)}); fix that package"
+        ) from error
