@@ -27,8 +27,10 @@ _FIELD_OF_VIEW = 75.0
 
 
 def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras on a circle inside the room, at three heights in turn, directed across the table. Sizes are in
-    pixels."""
+    """Return cameras on a circle inside the room, at three alternating heights, that point across the table.
+
+    Sizes are in pixels.
+    """
     return [
         _look_at((1.4, 360 * i / count, (1.0, 1.35, 1.7)[i % 3]), (0, 0, (0.55, 0.45, 0.35)[i % 3]), width, height)
         for i in range(count)
@@ -36,20 +38,19 @@ def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> l
 
 
 def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras for evaluation, on another circle than those of `demo_cameras`."""
+    """Return cameras for evaluation, on a different circle from the cameras of `demo_cameras`."""
     return [_look_at((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
 
 
 def view_image(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w 3"]:
-    """Render the room from a camera in sRGB, on black."""
+    """Render the room from a camera, in sRGB with values in 0..255, on a black background."""
     return _image(render(room.scene, camera, room.colors)[0])
 
 
 def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
-    """Return the true class of every pixel: 1 + index into `room.names`, or 0 if less than half of the pixel is
-    covered.
+    """Return the true class of each pixel, as 1 + index into `room.names`, or 0 if it is at most half covered.
 
-    The class with the largest sum of compositing weights wins, and floaters do not count.
+    The class of a pixel is the class with the largest sum of compositing weights. Floaters do not count.
     """
     return _labels(render(room.scene, camera, _one_hot(room))[0])
 
@@ -57,11 +58,11 @@ def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
 def write_capture(
     room: DemoRoom, folder: Path, views: int = 24, held_out: int = 4, width: int = WIDTH, height: int = HEIGHT
 ) -> None:
-    """Write a nerfstudio dataset with true masks, replacing files of the same names.
+    """Write a nerfstudio dataset with true masks, and replace existing files.
 
-    It consists of transforms.json, images/0000.png …, instance/0000.png … as `view_labels` returns them, and
-    labels.json with {"labels": {"1": name, …}, "background": 0}. Images have no distortion. The held-out views come
-    last and are in the "val" and "test" splits.
+    The dataset consists of transforms.json, images/0000.png …, instance/0000.png … with the labels of `view_labels`,
+    and labels.json with {"labels": {"1": name, …}, "background": 0}. Images have no distortion. The held-out views come
+    last, and form the "val" and "test" splits.
     """
     cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
     paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
@@ -87,7 +88,7 @@ def write_capture(
 
 
 def _one_hot(room: DemoRoom) -> Float[Tensor, "n classes"]:
-    """Return the class of every Gaussian as a one-hot row; floaters have a zero row."""
+    """Return the class of each Gaussian as a one-hot row, or a zero row for a floater."""
     return torch.nn.functional.one_hot(room.labels + 1, len(room.names) + 1)[:, 1:].to(room.colors.dtype)
 
 
@@ -105,7 +106,10 @@ def _look_at(
     """Return a camera that points at a target.
 
     Args:
-        position: distance from the middle of the room, azimuth in degrees, height.
+        position: Distance from the center of the room in meters, azimuth in degrees, and height in meters.
+        target: Position (x, y, z) in meters.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
     """
     distance, azimuth, up = position[0], math.radians(position[1]), position[2]
     eye = torch.tensor([distance * math.cos(azimuth), distance * math.sin(azimuth), up], dtype=torch.float64)
@@ -116,19 +120,18 @@ def _look_at(
 
 
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
-    """Write output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
+    """Write a run like that of `ns-train splatfacto` to output_dir/<capture>/splatfacto/<time>.
 
-    The stock trainer sets up everything and saves its full checkpoint, including optimizers and schedulers. It does so
-    after one step with zero gradients, which does not change the Gaussians of the room. Only the weights of the LPIPS
-    metric are missing from the checkpoint.
+    This takes seconds on a CPU. nerfstudio's own trainer saves its full checkpoint, including optimizers and
+    schedulers. It does so after one step with zero gradients, which does not change the Gaussians of the room. The
+    checkpoint lacks only the weights of the LPIPS metric.
 
     Args:
-        capture_folder: folder written by `write_capture`. The config contains this path unchanged, relative or
-            absolute.
+        capture_folder: Folder from `write_capture`. The config contains this path unchanged, relative or absolute.
     Returns:
-        The run's config.yml.
+        The path of the run's config.yml.
     Raises:
-        AssertionError: `capture_folder` does not exist (nerfstudio's message).
+        AssertionError: If `capture_folder` does not exist; nerfstudio raises this error.
     """
     from nerfstudio.models.splatfacto import RGB2SH  # noqa: PLC0415
 
@@ -141,12 +144,12 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     config.pipeline.model.num_random = len(room.scene)
     config.set_timestamp()
     config.save_config()
-    config.vis = "none"  # no training, so no log, whose thread would write until the process ends
+    config.vis = "none"  # no log is needed, and its thread would write until the process ends
     trainer = config.setup()
     with (
         # The metric would download its weights.
         patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
-        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # global in the process; another training has its own
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # keep the writers of other trainings in this process
     ):
         trainer.setup()
     dataset = trainer.pipeline.datamanager.train_dataparser_outputs
@@ -171,8 +174,8 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
 
 
 def splatfacto_config() -> Any:
-    """Return nerfstudio's method splatfacto without importing the list of all its methods, which takes seconds
-    longer."""
+    """Return the config of nerfstudio's method splatfacto, without importing its list of all methods, which takes
+    seconds."""
     from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # noqa: PLC0415
 
@@ -185,7 +188,7 @@ def splatfacto_config() -> Any:
 
 
 def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:
-    """Transform the scene to the world of nerfstudio's dataparser, p' = scale (R p + t) with transform = [R | t]."""
+    """Transform a scene to the coordinates of nerfstudio's dataparser, p' = scale (R p + t) for transform = [R | t]."""
     rotation = Rotation.from_matrix(transform[:, :3].numpy())
     means = scale * (scene.means @ transform[:, :3].T + transform[:, 3])
     quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy puts w last

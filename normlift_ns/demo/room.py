@@ -1,4 +1,4 @@
-"""Synthetic rooms: Gaussians of known class on the surfaces of parts, as a reproducible benchmark for any lift."""
+"""Synthetic rooms of Gaussians with known classes, as a reproducible benchmark for lifting methods."""
 
 from __future__ import annotations
 
@@ -37,88 +37,92 @@ from normlift_ns.demo.shapes import (
 from normlift_ns.errors import InputError
 
 HALF_WIDTH = 1.6
-"""Half the side of the floor, the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0, in meters; z is up."""
+"""Half the side of the floor in meters. The floor is the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0."""
 HEIGHT = 1.8
-"""Height of the walls in meters. There is no ceiling."""
+"""Height of the walls in meters. The room has no ceiling."""
 
 _OPACITY = 0.97
 _POINTS_PER_GAUSSIAN = 12
-"""Average number of points per Gaussian in the dense sample that surfaces are divided from."""
+"""Average number of points per Gaussian in the dense sample of surfaces that is divided into patches."""
 _STRAY_SHARE = 0.1
-"""Share of all Gaussians."""
+"""Fraction of Gaussians that stray from the surfaces."""
 _FLOATER_SHARE = 0.02
-"""Share of all Gaussians."""
+"""Fraction of Gaussians that float in the air."""
 _MARGIN = 0.05
-"""Maximum extent of a part beyond the bounding box of its sample, in meters."""
+"""Largest distance of a part from the bounding box of its sample, in meters."""
 _FAINT_OPACITIES = (0.001, 0.1)
-"""Range of the opacities of strays and floaters. A Gaussian below 1 / 255 is never drawn."""
+"""Range of the opacities of strays and floaters. Rasterizers never draw a Gaussian with an opacity below 1 / 255."""
 
 
 @dataclass(frozen=True)
 class DemoRoom:
-    """N Gaussians of known color and class."""
+    """A room of N Gaussians with known colors and classes."""
 
     scene: GaussianScene
-    """Gaussians in meters, z up, float32."""
+    """Gaussians in float32 and meters; z points up."""
     colors: Float[Tensor, "n 3"]
-    """sRGB in 0..1."""
+    """Color of each Gaussian, sRGB in 0..1."""
     labels: Int64[Tensor, " n"]
-    """Class of every Gaussian, an index into `names`; -1 for a floater, which belongs to no class."""
+    """Class of each Gaussian, an index into `names`, or -1 for a floater, which has no class."""
     names: tuple[str, ...]
     """Name of each class, from the XKCD color survey."""
 
 
 class Part(NamedTuple):
-    """Surface of a class. A room may have several parts of the same class."""
+    """A surface of one class. A room can have several parts of the same class."""
 
     name: str
     """Name of the class."""
     detail: float
-    """Density of Gaussians per square meter, relative to the walls."""
+    """Number of Gaussians per square meter, relative to the walls."""
     shape: Distance
     paint: Callable[[Array], Array] | None = None
-    """Factors [n, 3] or [n, 1] on the color of the class at points [n, 3] of the surface; None for a plain color."""
+    """Function that returns factors [n, 3] or [n, 1] on the color of the class at points [n, 3]; None for a plain
+    color."""
     gloss: float = 0.0
     """Brightness of highlights."""
 
 
 class Surface(NamedTuple):
-    """Positions, normals and parts of the opaque Gaussians in a room."""
+    """Positions, normals and parts of the opaque Gaussians of a room."""
 
     means: Array
     normals: Array
     parts: NDArray[np.int64]
-    """[n], indices of the room's parts"""
+    """Index of the part of each Gaussian, [n]."""
 
 
 SurfaceColors = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
-"""sRGB [n, 3] of the Gaussians on a surface, including light and shadow; values may leave 0..1."""
+"""Function that returns the sRGB colors [n, 3] of surface Gaussians with light and shadow. Values can exceed 0..1."""
 
 
 class _Gaussians(NamedTuple):
     means: Array
     normals: Array
-    """[n, 3], unit; the third axis of `scales`."""
+    """Unit vectors [n, 3] along the third axis of `scales`."""
     scales: Array
     opacities: Array
     colors: Array
     labels: NDArray[Any]
-    """[n], integers: indices of parts"""
+    """Index of the part of each Gaussian, [n], or -1 for none."""
 
 
 def build_room(
     parts: Sequence[Part], painter: SurfaceColors, area: float, num_gaussians: int, seed: int = 0
 ) -> DemoRoom:
-    """Build a room. The same arguments give the same room.
+    """Build a room. The same arguments always produce the same room.
 
-    Most Gaussians lie flat on the surfaces. As in trained scenes, some faint ones stray above and below the surfaces,
-    in places that the views contradict each other about or do not show. Others float in the air.
+    Most Gaussians lie flat on the surfaces. As in trained scenes, some faint Gaussians stray above and below the
+    surfaces, at positions that views label inconsistently or do not show. Others float in the air.
 
     Args:
-        area: approximate visible area of all parts, each multiplied by its `detail`, in square meters.
-        num_gaussians: N, at least 2000.
+        parts: Surfaces of the room.
+        painter: Function that colors the Gaussians on surfaces.
+        area: Approximate visible area of all parts, each multiplied by its `detail`, in square meters.
+        num_gaussians: Number of Gaussians, at least 2000.
+        seed: Seed of the random numbers.
     Raises:
-        ValueError: `num_gaussians` is too small.
+        ValueError: If `num_gaussians` is too small.
     """
     if num_gaussians < 2000:
         raise InputError(f"num_gaussians must be at least 2000 to cover the shapes, got {num_gaussians}")
@@ -131,7 +135,7 @@ def build_room(
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)  # z axis to normal
     quats /= row_lengths(quats)[:, None]
     scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
-    names = tuple(dict.fromkeys(part.name for part in parts))  # in the order of their first parts
+    names = tuple(dict.fromkeys(part.name for part in parts))  # in the order of the first part of each class
     classes = np.array([*(names.index(part.name) for part in parts), -1])[labels.astype(int)]
     return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)
 
@@ -156,7 +160,7 @@ def _surface(
 
 
 def _uncovered(shapes: Sequence[Distance], samples: Sequence[Array]) -> list[Array]:
-    """Return the points of each part that lie inside no other part."""
+    """Return the points of each part that do not lie inside another part."""
     boxes = [
         (points.min(axis=0, initial=np.inf) - _MARGIN, points.max(axis=0, initial=-np.inf) + _MARGIN)
         for points in samples
@@ -177,7 +181,7 @@ def _uncovered(shapes: Sequence[Distance], samples: Sequence[Array]) -> list[Arr
 
 
 def _strays(parts: Sequence[Part], surface: _Gaussians, count: int, rng: np.random.Generator) -> _Gaussians:
-    """Return faint copies of surface Gaussians, up to three radii above or below; each belongs to the nearest part."""
+    """Return faint copies of surface Gaussians, shifted by up to three radii, with the class of the nearest part."""
     chosen = rng.choice(len(surface.labels), count)
     heights = surface.scales[chosen, :1] * rng.uniform(-3, 3, (count, 1))
     means = surface.means[chosen] + surface.normals[chosen] * heights
@@ -201,34 +205,34 @@ def _faint(count: int, rng: np.random.Generator) -> Array:
     return np.exp(rng.uniform(low, high, count))
 
 
-# Light baked into the colors of surfaces: lamps with soft shadows, gloss and contact shadows. Lengths are in meters.
+# Light in the colors of surfaces, from a lamp with soft shadows, gloss and contact shadows. Lengths are in meters.
 
 
 _SOFTNESS = 6.0
-"""Larger values sharpen the edges of shadows."""
+"""Sharpness of the edges of shadows."""
 _GLOSS_POWER = 32
-"""Larger values make highlights smaller."""
+"""Exponent of highlights. Larger values make highlights smaller."""
 
 
 _LAMP, _LAMP_COLOR = np.array([-0.8, 0.9, 2.6]), np.array([0.5, 0.48, 0.45])
-"""Position of the lamp, and the warm light it casts on surfaces that face it."""
+"""Position of the lamp, and color of its light on surfaces that face it."""
 _SKY_COLOR, _FLOOR_COLOR = np.array([0.62, 0.63, 0.65]), np.array([0.5, 0.49, 0.48])
-"""Ambient light on surfaces that face upward and downward."""
+"""Colors of the ambient light on surfaces that face upward and downward."""
 _GRID_STEP = 0.04
 """Side of the grid cells in which distances are interpolated for shadows."""
 _CHUNKS = 16
-"""Number of chunks that points are divided into. A few thousand points per chunk fit into processor caches."""
+"""Number of chunks into which points are divided. A few thousand points per chunk fit into processor caches."""
 _CONTACT_STRENGTH = 1.0
-"""Factor by which corners are darker than `contact_shadow`."""
+"""Factor on `contact_shadow`."""
 
 
 def shade(scene: Distance, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Return the light on surface points, [n, 3] factors on their colors, and highlights, [n] in 0..1.
+    """Return the light on surface points, as factors [n, 3] on their colors, and highlights [n] in 0..1.
 
     Args:
-        scene: distance to everything that casts a shadow.
-        points: [n, 3] on its surface.
-        normals: [n, 3], unit, outward.
+        scene: Distance to all surfaces that cast shadows.
+        points: Points [n, 3] on these surfaces.
+        normals: Outward unit normals [n, 3] at the points.
     """
     to_lamp = _LAMP - points
     distance = row_lengths(to_lamp)
@@ -243,7 +247,7 @@ def shade(scene: Distance, points: Array, normals: Array) -> tuple[Array, Array]
 
 
 def _interpolated(scene: Distance, points: Array) -> Distance:
-    """Return a fast approximation of the distance, interpolated on a grid around the scene."""
+    """Return a fast approximation of a distance function, interpolated on a grid around points."""
     low, high = points.min(axis=0) - _GRID_STEP, points.max(axis=0) + _GRID_STEP
     ticks = [np.arange(a, b + _GRID_STEP, _GRID_STEP) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
@@ -252,7 +256,7 @@ def _interpolated(scene: Distance, points: Array) -> Distance:
 
 
 def visibility(scene: Distance, start: Array, direction: Array, distance: Array) -> Array:
-    """Return the share of a soft lamp that each point sees, [n], by sphere tracing that keeps the closest miss."""
+    """Return the visible fraction of a soft lamp at each point, [n], from the closest miss of sphere tracing."""
     visible, traveled = np.ones(len(start)), np.full(len(start), 0.03)
     for _ in range(32):
         clearance = scene(start + traveled[:, None] * direction)
@@ -262,8 +266,8 @@ def visibility(scene: Distance, start: Array, direction: Array, distance: Array)
 
 
 def contact_shadow(scene: Distance, points: Array, normals: Array) -> Array:
-    """Return the darkening close to other surfaces, 0 to 0.45, [n]."""
-    probes = ((0.03, 0.1), (0.08, 0.15), (0.2, 0.2))  # height above the surface, weight
+    """Return the darkening of points by nearby surfaces, [n], in 0..0.45."""
+    probes = ((0.03, 0.1), (0.08, 0.15), (0.2, 0.2))  # height above the surface, and weight
     return np.sum([w * (1 - _distances(scene, points + h * normals) / h).clip(0, 1) for h, w in probes], axis=0)
 
 
@@ -271,41 +275,45 @@ def _distances(scene: Distance, points: Array) -> Array:
     return np.concatenate(map_threaded(scene, np.array_split(points, _CHUNKS)))
 
 
-# Textures as formulas: factors on the color of a surface at its points. Lengths are in meters.
+# Procedural textures, which are factors on the color of a surface at its points. Lengths are in meters.
 
 
 Paint = Callable[[Array], Array]
-"""Returns factors [n, 3] or [n, 1] at points [n, 3]."""
+"""Function that returns factors [n, 3] or [n, 1] on colors at points [n, 3]."""
 
 _WAVES = 9
-"""Number of waves in the noise; fewer give a regular pattern."""
+"""Number of waves in the noise. With fewer waves, the pattern looks regular."""
 
 
 def noise(points: Array, size: float, seed: int = 0) -> Array:
-    """Return smooth noise with spots of about `size`, [n], mean 0, mostly in -1..1: plane waves of random
-    directions."""
+    """Return smooth noise [n] with spots of about `size`, as a sum of plane waves with random directions.
+
+    Its mean is 0, and most values are in -1..1.
+    """
     rng = np.random.default_rng(seed)
     waves = rng.normal(size=(_WAVES, 3)) * (2 / size)
     return np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, _WAVES)).sum(axis=1) / np.sqrt(_WAVES)
 
 
 def mottled(size: float, depth: float, seed: int = 0) -> Paint:
-    """Return spots of about `size`, lighter and darker by about `depth`."""
+    """Return a texture of spots of about `size` that are lighter or darker by about `depth`."""
     return lambda p: 1 + depth * noise(p, size, seed)[:, None]
 
 
 def wood(width: float, across: int, ring: float = 0.035, joint: float = 0.006, contrast: float = 1.0) -> Paint:
-    """Return boards of `width` with grain, side by side along the horizontal axis `across` (0: x, 1: y).
+    """Return a texture of wooden boards, side by side along a horizontal axis.
 
     Args:
-        ring: distance between the lines of the grain.
-        joint: half the width of the dark line between two boards.
-        contrast: contrast of the grain; dark woods need more.
+        width: Width of a board.
+        across: Axis along which the boards lie side by side, 0 for x or 1 for y.
+        ring: Distance between the lines of the grain.
+        joint: Half the width of the dark line between two boards.
+        contrast: Contrast of the grain. Dark woods need a higher contrast.
     """
 
     def paint(p: Array) -> Array:
         board = np.floor(p[:, across] / width)
-        local = p + 7.3 * board[:, None]  # each board has another part of the grain
+        local = p + 7.3 * board[:, None]  # each board has a different part of the grain
         stretched = local * np.where(np.arange(3) == 1 - across, 0.18, 1)  # the grain runs along the board
         rings = stretched[:, across] / ring + 1.1 * noise(stretched, 0.12, 1)
         grain = 0.09 * np.sin(2 * np.pi * rings) + 0.05 * noise(stretched, 0.03, 2)
@@ -317,7 +325,7 @@ def wood(width: float, across: int, ring: float = 0.035, joint: float = 0.006, c
 
 
 def woven(band: float, half_length: float, half_width: float) -> Paint:
-    """Return the pattern of a rug around the origin, with rows of diamonds of length `band` and a darker border."""
+    """Return the texture of a rug around the origin, with rows of diamonds of length `band` and a darker border."""
 
     def paint(p: Array) -> Array:
         x, y = p[:, 0] / band, p[:, 1] / band
@@ -331,14 +339,14 @@ def woven(band: float, half_length: float, half_width: float) -> Paint:
 
 
 def cloth(thread: float = 0.03) -> Paint:
-    """Return a slightly uneven weave of crossing threads."""
+    """Return the texture of a slightly uneven fabric of crossing threads, `thread` apart."""
     return lambda p: (
         1 + 0.05 * np.sin(2 * np.pi * (p[:, :1] + p[:, 2:]) / thread) * np.sin(2 * np.pi * p[:, 1:2] / thread)
     ) * (1 + 0.05 * noise(p, 0.12, 4)[:, None])  # fmt: skip
 
 
 def ribs(count: int, depth: float) -> Paint:
-    """Return dark furrows between the ribs of `things.gourd`."""
+    """Return a texture of dark furrows between the ribs of `shapes.gourd`."""
 
     def paint(p: Array) -> Array:
         furrow = 1 - np.abs(np.cos(count / 2 * np.arctan2(p[:, 1], p[:, 0])))
@@ -348,41 +356,42 @@ def ribs(count: int, depth: float) -> Paint:
 
 
 def banded(tones: Callable[[Array], Array], tint: tuple[float, float, float]) -> Paint:
-    """Return `tint` at points whose `tones` is 1, and the plain color at those whose `tones` is 0."""
+    """Return a texture that blends from the plain color to the factors `tint` as `tones` grows from 0 to 1."""
     return lambda p: 1 + tones(p).clip(0, 1)[:, None] * (np.array(tint) - 1)
 
 
-# The demo room: objects with the names of their colors, on a table, in a room with light and texture.
+# The demo room, with objects on a table, light and textures. Classes have the names of their colors.
 #
-# The color encoder knows only names of colors. Many names in the XKCD color survey are names of objects. The prompt
-# "tomato red" thus finds the tomatoes here, by their color.
+# The color encoder accepts only color names, and many names in the XKCD color survey contain names of objects. The
+# prompt "tomato red" therefore selects the tomatoes by their color.
 
 
 _TABLE = 0.62
 """Height of the table top in meters."""
 _EXPOSURE = 0.8
-"""Share of each part's surface that is not brighter than the color of its name."""
+"""Fraction of the surface of each part that is not brighter than the color of its name."""
 _ROUGHNESS = 0.012
-"""Standard deviation of a random factor on every color."""
+"""Standard deviation of the random factor on each color."""
 _DETAILED_AREA = 130.0
 """Visible area of all parts, each multiplied by its `detail`, in square meters."""
 _RIPE = (1.0, 1.0, 1.0)
-"""Factors that make the pale banana yellow of the survey as yellow as a real banana."""
+"""Factors on the color of a ripe banana."""
 _STEM = (0.42, 0.33, 0.3)
-"""Factors that make the ends of a banana brown."""
+"""Factors that color the ends of a banana brown."""
 _VEIN = (1.7, 1.5, 2.0)
-"""Factors that make the middle of a leaf lighter."""
+"""Factors that lighten the middle of a leaf."""
 _GOLDEN_ANGLE = 137.5
 """Angle in degrees between successive leaves of a plant."""
 
 
 def demo_room(num_gaussians: int = 45_000, seed: int = 0) -> DemoRoom:
-    """Build the room. The same arguments give the same room.
+    """Build the demo room. The same arguments always produce the same room.
 
     Args:
-        num_gaussians: N, at least 2000.
+        num_gaussians: Number of Gaussians, at least 2000.
+        seed: Seed of the random numbers.
     Raises:
-        ValueError: `num_gaussians` is too small.
+        ValueError: If `num_gaussians` is too small.
     """
     return build_room([*_walls(), *_furniture(), *_plant(), *_fruit()], _painted, _DETAILED_AREA, num_gaussians, seed)
 
@@ -398,15 +407,16 @@ def _painted(parts: Sequence[Part], surface: Surface, rng: np.random.Generator) 
         factors = 1.0 if part.paint is None else part.paint(surface.means[rows])
         lit = light[rows] / np.quantile(light[rows].mean(axis=1), _EXPOSURE)
         matte = np.array(to_rgb(f"xkcd:{part.name}")) * factors * lit
-        matte /= matte.max(axis=1, keepdims=True).clip(1)  # a clipped channel would change the hue
+        matte /= matte.max(axis=1, keepdims=True).clip(1)  # clipping single channels would change the hue
         colors[rows] = matte + part.gloss * shine[rows, None]
     return colors * rng.normal(1, _ROUGHNESS, (len(colors), 1))
 
 
 def _at(part: Part, x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> Part:
-    """Move a part together with its texture: roll about x, tilt about y (+x end down), turn about z, then translate.
+    """Rotate and then translate a part together with its texture.
 
-    Angles are in degrees.
+    The rotations are `roll` about x, `tilt` about y (which lowers the +x end) and `turn` about z, in this order and in
+    degrees.
     """
     matrix = Rotation.from_euler("xyz", (roll, tilt, turn), degrees=True).as_matrix()
     shape, painted = part.shape, part.paint
@@ -450,7 +460,7 @@ def _furniture() -> list[Part]:
 
 
 def _plant() -> list[Part]:
-    """Return a plant on the floor, in the corner."""
+    """Return a plant on the floor in the corner of the room."""
     x, y, rim = 1.18, -1.18, 0.42
     pot = union(place(cone(0.17, 0.23, 0.38, 0.012), x, y, 0.19), place(cone(0.255, 0.255, 0.08, 0.015), x, y, 0.38))
     vein = banded(lambda p: 1.2 - np.abs(p[:, 1]) / 0.008, _VEIN)
@@ -487,13 +497,13 @@ def _fruit() -> list[Part]:
 
 
 def _ring(count: int, radius: float, height: float) -> Array:
-    """Return [count, 3] positions around the vertical axis."""
+    """Return `count` positions [count, 3] on a horizontal circle around the vertical axis."""
     angles = 2 * np.pi * np.arange(count) / count + radius
     return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)], axis=1)
 
 
 def _bananas(x: float, y: float, z: float) -> list[Part]:
-    """Return a bunch with its stems at (x, y), arched over the table."""
+    """Return a bunch of bananas with stems at (x, y, z) that arches over the table."""
     tints = banded(shapes.banana_end, _STEM)
     banana = Part("banana yellow", 26, shapes.banana(0.044), lambda p: _RIPE * tints(p), 0.15)
     return [_at(banana, x, y, z + 0.012 * i, -75 + 17 * i, -62 + 16 * i) for i in range(4)]

@@ -1,4 +1,4 @@
-"""Solids as signed distance functions (negative inside), and flat Gaussians that cover their surfaces, in meters."""
+"""Solids as signed distance functions, negative inside and in meters, and flat Gaussians that cover their surfaces."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 Distance = Callable[[Array], Array]
-"""Signed distance of points [n, 3] to a surface, [n]."""
+"""Function that returns the signed distances [n] of points [n, 3] to a surface."""
 
 ON_SURFACE = 1e-3
-"""Maximum distance in meters at which a point counts as lying on the surface."""
+"""Largest distance in meters at which a point counts as lying on the surface."""
 _OVERLAP = 2.6
-"""Standard deviation of a Gaussian relative to that of its patch; large enough to close the surface."""
+"""Standard deviation of a Gaussian relative to that of its patch. It is large enough to close gaps in the surface."""
 _SHELL = 0.02
-"""Half the thickness of the layer whose points are projected onto the surface, in meters."""
+"""Largest distance in meters of points that are projected onto the surface."""
 _MIN_SCALE = 1e-3
-"""Minimum standard deviation of a Gaussian, in meters."""
+"""Smallest standard deviation of a Gaussian, in meters."""
 _CREASE = 0.03
-"""Distance in meters that separates points as strongly as normals at 60 degrees do, so that patches end at edges."""
+"""Weight of normals in patches, in meters. A difference of 60 degrees counts like this distance, so that patches
+end at edges."""
 
 
 class Surfels(NamedTuple):
     """Flat round Gaussians on a surface."""
 
     means: Array
-    """[n, 3]"""
+    """Centers, [n, 3]."""
     normals: Array
-    """[n, 3], unit, outward."""
+    """Outward unit normals, [n, 3]."""
     radii: Array
-    """[n], standard deviation within the surface."""
+    """Standard deviations within the surface, [n]."""
     thickness: Array
-    """[n], standard deviation along the normal."""
+    """Standard deviations along the normal, [n]."""
 
 
 def sphere(radius: float) -> Distance:
@@ -52,7 +53,7 @@ def box(width: float, depth: float, height: float, rounding: float = 0.0) -> Dis
 
 
 def cone(bottom: float, top: float, height: float, rounding: float = 0.0) -> Distance:
-    """Return an upright truncated cone around the origin, which is a cylinder if both radii are equal."""
+    """Return an upright truncated cone around the origin. It is a cylinder if both radii are equal."""
     half, slope = height / 2 - rounding, (top - bottom) / height
     middle, lean = (bottom + top) / 2 - rounding, np.hypot(1, slope)
 
@@ -64,17 +65,17 @@ def cone(bottom: float, top: float, height: float, rounding: float = 0.0) -> Dis
 
 
 def torus(radius: float, tube: float) -> Distance:
-    """Return an upright torus around the origin, with its axis along y."""
+    """Return an upright torus around the origin with its axis along y."""
     return lambda p: np.hypot(np.hypot(p[:, 0], p[:, 2]) - radius, p[:, 1]) - tube
 
 
 def cavity(shape: Distance) -> Distance:
-    """Return all space outside the shape."""
+    """Return the space outside a shape."""
     return lambda p: -shape(p)
 
 
 def place(shape: Distance, x: float, y: float, z: float, turn: float = 0.0) -> Distance:
-    """Return the shape turned by `turn` degrees about the vertical axis, then moved by (x, y, z)."""
+    """Rotate a shape by `turn` degrees about the vertical axis, and then translate it by (x, y, z)."""
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
 
     def distance(p: Array) -> Array:
@@ -85,12 +86,12 @@ def place(shape: Distance, x: float, y: float, z: float, turn: float = 0.0) -> D
 
 
 def union(*shapes: Distance) -> Distance:
-    """Return the union of the shapes."""
+    """Return the union of shapes."""
     return lambda p: reduce(np.minimum, (shape(p) for shape in shapes))
 
 
 def row_lengths(vectors: Array) -> Array:
-    """Return the lengths [n] of rows [n, k]; on short rows much faster than numpy.linalg.norm."""
+    """Return the lengths [n] of rows [n, k], much faster than numpy.linalg.norm for short rows."""
     return np.sqrt(np.einsum("nk,nk->n", vectors, vectors))
 
 
@@ -100,22 +101,22 @@ def _outside(beyond: Array) -> Array:
 
 
 def normals(shape: Distance, points: Array) -> Array:
-    """Return unit gradients of the distance, [n, 3], which are the outward normals on the surface."""
+    """Return the unit gradients [n, 3] of the distance at points, which are outward normals on the surface."""
     steps = 1e-4 * np.eye(3)
     gradient = np.stack([shape(points + step) - shape(points - step) for step in steps], axis=1)
     return gradient / row_lengths(gradient)[:, None].clip(1e-12)
 
 
 def map_threaded(function: Callable[..., Any], *items: Iterable[Any]) -> list[Any]:
-    """Map a function over items on all cores; NumPy and SciPy release the GIL during long array operations."""
+    """Map a function over items in threads. NumPy and SciPy release the GIL during long array operations."""
     with ThreadPoolExecutor() as pool:
         return list(pool.map(function, *items))
 
 
 def sample_near_surface(shape: Distance, low: Array, high: Array, density: float, rng: np.random.Generator) -> Array:
-    """Sample random points near the surface in the box `low`..`high`, [m, 3].
+    """Sample random points [m, 3] near a surface in the box `low`..`high`.
 
-    `project_to_surface` keeps about `density` of them per square meter.
+    `project_to_surface` keeps about `density` points per square meter.
     """
     cell = 0.1  # side of a search cell
     ticks = [np.arange(a - cell / 2, b + cell, cell) for a, b in zip(low, high)]
@@ -126,7 +127,7 @@ def sample_near_surface(shape: Distance, low: Array, high: Array, density: float
 
 
 def project_to_surface(shape: Distance, points: Array, low: Array, high: Array) -> Array:
-    """Project the points near the surface onto it; return those that are then in the box `low`..`high`, [n, 3]."""
+    """Project points onto a nearby surface, and return those [n, 3] that are then in the box `low`..`high`."""
     points = points[np.abs(shape(points)) < _SHELL]
     for _ in range(2):
         points = points - shape(points)[:, None] * normals(shape, points)
@@ -135,11 +136,11 @@ def project_to_surface(shape: Distance, points: Array, low: Array, high: Array) 
 
 
 def fit_surfels(shape: Distance, points: Array, first: NDArray[np.int64]) -> Surfels:
-    """Divide a surface into compact patches (k-means) and cover each with one Gaussian.
+    """Divide a surface into compact patches (k-means), and cover each patch with one Gaussian.
 
     Args:
-        points: [m, 3], a dense sample of the surface, with at least ten points per patch.
-        first: [n], indices of the points at which the patches start.
+        points: Dense sample [m, 3] of the surface, with at least ten points per patch.
+        first: Indices [n] of the points that are the initial centers of patches.
     """
     count = len(first)
     if count == 0:
@@ -149,7 +150,7 @@ def fit_surfels(shape: Distance, points: Array, first: NDArray[np.int64]) -> Sur
     for _ in range(6):
         centers = _patch_means(sample, _nearest(centers, sample), centers)
     means = centers[:, :3]
-    normal = centers[:, 3:] / row_lengths(centers[:, 3:])[:, None].clip(1e-12)  # zero if one patch has both sides
+    normal = centers[:, 3:] / row_lengths(centers[:, 3:])[:, None].clip(1e-12)  # zero if a patch covers both sides
     patch = _nearest(centers, sample)
     offsets = points - means[patch]
     along = (offsets * normal[patch]).sum(axis=1)
@@ -160,32 +161,31 @@ def fit_surfels(shape: Distance, points: Array, first: NDArray[np.int64]) -> Sur
 
 
 def _nearest(centers: Array, sample: Array) -> NDArray[np.int64]:
-    """Return the index of the nearest center for every row of the sample."""
+    """Return the index of the nearest center of each row of the sample."""
     return np.asarray(KDTree(centers).query(sample)[1])
 
 
 def _patch_means(values: Array, patch: NDArray[np.int64], empty: Array) -> Array:
-    """Return the means of the rows of `values` by patch, and rows of `empty` for patches without any."""
+    """Return the mean of the rows of `values` in each patch, or the row of `empty` for an empty patch."""
     size = np.bincount(patch, minlength=len(empty))[:, None]
     sums = np.stack([np.bincount(patch, column, len(empty)) for column in values.T], axis=1)
     return np.where(size > 0, sums / size.clip(1), empty)
 
 
-# Shapes of familiar objects around the origin, standing or lying on z = 0, in meters.
+# Shapes of everyday objects at the origin that stand or lie on the plane z = 0, in meters.
 
 
 Point = tuple[float, float, float]
 
 _NEAR = 0.25
-"""Distance from the bounding sphere beyond which the sphere replaces the object, because lighting evaluates it
-often."""
+"""Distance from the bounding sphere beyond which the sphere replaces the object, which makes lighting faster."""
 
 _DIMPLE = 0.38
-"""Width of a fruit's dimple, in radii."""
+"""Width of the dimple of a fruit, relative to its radius."""
 
 
 def within_sphere(shape: Distance, center: Point, radius: float) -> Distance:
-    """Return a shape that lies within a sphere; far from it, use the distance to the sphere."""
+    """Return a shape whose distance is replaced by that of a bounding sphere for points far from the sphere."""
 
     def distance(p: Array) -> Array:
         result = row_lengths(p - center) - radius
@@ -197,7 +197,7 @@ def within_sphere(shape: Distance, center: Point, radius: float) -> Distance:
 
 
 def ellipsoid(a: float, b: float, c: float) -> Distance:
-    """Return an ellipsoid around the origin. Its distance is accurate near the surface, where it is needed."""
+    """Return an ellipsoid around the origin. Its distance is accurate only near the surface."""
     radii = np.array([a, b, c])
 
     def distance(p: Array) -> Array:
@@ -209,12 +209,15 @@ def ellipsoid(a: float, b: float, c: float) -> Distance:
 
 
 def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float, belly: float = 0.0) -> Distance:
-    """Return a tomato, an apple or a pumpkin: a flattened sphere with ribs and a dimple at its poles.
+    """Return a flattened sphere with ribs and dimples at its poles, such as a tomato, an apple or a pumpkin.
 
     Args:
-        furrow: depth of the furrows between ribs, in radii.
-        dimple: depth of the dimple, in half heights.
-        belly: how much wider it is above its middle than below.
+        radius: Largest horizontal radius.
+        height: Height without dimples.
+        ribs: Number of ribs.
+        furrow: Depth of the furrows between ribs, relative to `radius`.
+        dimple: Depth of the dimples, relative to half the height.
+        belly: Relative difference in width between the upper and the lower half.
     """
     body = ellipsoid(radius, radius, height / 2)
 
@@ -222,7 +225,7 @@ def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float,
         q = p - (0, 0, height / 2)
         from_axis = np.hypot(q[:, 0], q[:, 1]) / radius
         between_ribs = 1 - np.abs(np.cos(ribs / 2 * np.arctan2(q[:, 1], q[:, 0])))
-        rib = 1 - furrow * between_ribs * from_axis.clip(0, 1)  # none at the poles
+        rib = 1 - furrow * between_ribs * from_axis.clip(0, 1)  # no furrows at the poles
         dent = 1 - dimple * np.exp(-((from_axis / _DIMPLE) ** 2))
         lean = 1 + belly * (q[:, 2] / height).clip(-0.5, 0.5)
         factor = (rib * dent)[:, None] * np.stack([lean, lean, np.ones(len(q))], axis=1)
@@ -232,7 +235,7 @@ def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float,
 
 
 def tapered(start: Point, end: Point, first: float, last: float) -> Distance:
-    """Return spheres along a line segment, with radii from `first` to `last`."""
+    """Return the union of spheres along a line segment, with radii from `first` to `last`."""
     a, b = np.array(start), np.array(end)
 
     def distance(p: Array) -> Array:
@@ -243,16 +246,16 @@ def tapered(start: Point, end: Point, first: float, last: float) -> Distance:
 
 
 def capsule(start: Point, end: Point, radius: float) -> Distance:
-    """Return all points within `radius` of a line segment."""
+    """Return the set of points within `radius` of a line segment."""
     return tapered(start, end, radius, radius)
 
 
 BANANA_BEND, BANANA_ARC = 0.24, np.radians(55)
-"""Radius of the center line of a banana, and half the angle that it spans."""
+"""Radius of the center line of a banana in meters, and half of its angle in radians."""
 
 
 def banana(radius: float) -> Distance:
-    """Return a banana from its stem at the origin along -y, bent about z, with its middle toward +x."""
+    """Return a banana that extends from its stem at the origin along -y, and is bent about z toward +x."""
     start = np.array([BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC), 0])
     stem = tapered((-0.035, 0.03, 0), (0, 0, 0), 0.3 * radius, 0.36 * radius)
 
@@ -267,14 +270,14 @@ def banana(radius: float) -> Distance:
 
 
 def banana_end(points: Array) -> Array:
-    """Return how close points of a banana are to its dark ends, [n], positive near them."""
+    """Return the proximity [n] of points to the dark ends of a banana, which is positive near the ends."""
     x, y = BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC)
     to_end = BANANA_BEND * (BANANA_ARC - np.abs(np.arctan2(points[:, 1] + y, points[:, 0] + x)))
     return 1.6 - to_end / 0.012
 
 
 def calyx(radius: float, leaves: int = 5) -> Distance:
-    """Return the green star on a tomato, with its stem."""
+    """Return the star-shaped calyx of a tomato with its stem."""
     angles = 2 * np.pi * np.arange(leaves) / leaves
     tips = [(radius * np.cos(a), radius * np.sin(a), 0.004) for a in angles]
     star = [tapered((0, 0, 0.01), tip, 0.2 * radius, 0.06 * radius) for tip in tips]
@@ -283,7 +286,7 @@ def calyx(radius: float, leaves: int = 5) -> Distance:
 
 
 def aubergine() -> Distance:
-    """Return an eggplant along y, with its thin end toward +y."""
+    """Return an eggplant along the y axis, with its thin end toward +y."""
     thick = tapered((0, -0.13, 0.1), (0, 0.02, 0.085), 0.1, 0.085)
     thin = tapered((0, 0, 0.087), (0.02, 0.15, 0.062), 0.087, 0.05)
     return within_sphere(union(thick, thin), (0, 0, 0.09), 0.26)
@@ -307,7 +310,7 @@ def bottle(radius: float, height: float) -> Distance:
 
 
 def bowl(radius: float, thickness: float) -> Distance:
-    """Return a hemisphere with a flat foot, open at the top."""
+    """Return a hemispherical bowl with a flat foot, open at the top."""
 
     def distance(p: Array) -> Array:
         q = p - (0, 0, radius)
@@ -318,13 +321,13 @@ def bowl(radius: float, thickness: float) -> Distance:
 
 
 def heap(centers: Array, radius: float) -> Distance:
-    """Return spheres of the same radius."""
+    """Return the union of spheres of equal radius."""
     tree = KDTree(centers)
     return lambda p: np.asarray(tree.query(p)[0]) - radius
 
 
 def leaf(long: float, wide: float, thick: float) -> Distance:
-    """Return a blade that grows from the origin along x and bends downward."""
+    """Return a leaf blade that extends from the origin along x and bends downward."""
     blade = ellipsoid(long / 2, wide / 2, thick / 2)
 
     def distance(p: Array) -> Array:

@@ -1,1 +1,1 @@
-"""Distributed lifting: several processes lift one scene together."""
+"""Distributed lifting of one scene by several processes."""

@@ -1,4 +1,4 @@
-"""Communication between processes, and the redistribution of evidence among them."""
+"""Communication between processes, and redistribution of evidence among them."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from normlift_ns.progress import ProgressCallback
 VIEW_STAGES = ("features", "evidence")
 """Stages of a lift that count views."""
 _STALE_SECONDS = 7 * 86400
-"""Age at which a shared directory of killed processes is deleted."""
+"""Age in seconds at which a shared directory of killed processes is deleted."""
 
 
 @dataclass(kw_only=True)
 class TorchCommunicator(Communicator):
-    """Communication of this process with the others.
+    """A communicator that uses torch.distributed.
 
-    Arrays can have any type and device; results are on the same device.
+    Arrays can have any type and device. Results are on the device of the arguments.
     """
 
     rank: int
@@ -48,9 +48,9 @@ class TorchCommunicator(Communicator):
     store: Any
     """Shared store for progress counters."""
     _folder: Path = field(default_factory=Path)
-    """Directory shared by all processes, in which they claim work items."""
+    """Directory that all processes share, and in which they claim chunks."""
     _num_divisions: int = 0
-    """Number of calls of `chunks` so far."""
+    """Number of previous calls of `claim_chunks`."""
 
     def all_gather(self, rows: Tensor) -> Tensor:
         """See the base class."""
@@ -97,7 +97,7 @@ class TorchCommunicator(Communicator):
         return result
 
     def claim_chunks(self, count: int) -> Iterator[int]:
-        """Yield the items of this process, then those of other processes that are unclaimed in the directory."""
+        """Yield the chunks of this process, and then the chunks of other processes that are not claimed yet."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:
@@ -105,7 +105,7 @@ class TorchCommunicator(Communicator):
                 yield index
 
     def aggregate_progress(self, report: ProgressCallback) -> ProgressCallback:
-        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
+        """Wrap a callback so that process 0 reports the sum of all processes in stages that count views."""
         previous: dict[str, int] = {}
 
         def report_total(stage: str, done: int, total: int) -> None:
@@ -119,12 +119,12 @@ class TorchCommunicator(Communicator):
 
     @contextmanager
     def shared_folder(self, folder: Path) -> Iterator[None]:
-        """Provide a context in which `chunks` can be called.
+        """Provide a context in which `claim_chunks` can be called.
 
         Args:
-            folder: directory that all processes share.
+            folder: Directory that all processes share.
         Raises:
-            InputError: if the processes do not share it, or two of them can create the same file in it.
+            InputError: If the processes do not share the directory, or two processes can create the same file in it.
         """
         if self.rank == 0:
             for leftover in folder.glob("team-*"):  # from processes that were killed
@@ -134,9 +134,9 @@ class TorchCommunicator(Communicator):
         creators = sum(self.all_gather_object(try_claim(self._folder, "start", after=0) is not None))
         if creators != 1:
             raise InputError(
-                f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. Either they "
-                "do not share that folder, or its file system does not support exclusive creation. Give all of them "
-                "the same --output-dir, on a disk that they share"
+                f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. The "
+                "processes do not share that folder, or its file system does not support exclusive creation. Start all "
+                "processes with the same --output-dir, on a disk that they share"
             )
         try:
             yield
@@ -155,13 +155,13 @@ class TorchCommunicator(Communicator):
 
 
 def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
-    """Return the concatenated rows of all processes, in every process."""
+    """Return the concatenated rows of all processes, in each process."""
     lengths = team.all_gather(rows.offsets.diff())
     return SparseRows(_offsets(lengths), team.all_gather(rows.column), team.all_gather(rows.weight))
 
 
 def gather_sparse(portion: Partition, rows: SparseRows) -> SparseRows | None:
-    """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
+    """Combine sparse matrices with one row per Gaussian in process 0; return None in all other processes."""
     parts = [portion.communicator.gather(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
     if any(part is None for part in parts):
         return None
@@ -176,21 +176,21 @@ def _offsets(lengths: Int64[Tensor, " n"]) -> Int64[Tensor, " n_plus_1"]:
 
 
 def _like(data: Tensor, rows: Tensor) -> Tensor:
-    """Convert bytes to rows with the shape, type and device of others."""
+    """Convert bytes to rows with the shape, type and device of `rows`."""
     return data.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)
 
 
-# Exchange between processes: evidence from view owners to Gaussian owners, and neighbors for the vote.
+# Exchange of evidence between the owners of views and of Gaussians, and of neighbors for the vote.
 
 
 _WEIGHT_DTYPES = {4: torch.float32, 8: torch.float64}
-"""Types of evidence weights by their size in bytes."""
+"""Types of evidence weights, by size in bytes."""
 _RENUMBER_BLOCK = 2**20
-"""Number of rows of neighbors that are renumbered at a time."""
+"""Number of rows of neighbors to renumber at a time."""
 
 
 class CooEntries(NamedTuple):
-    """Entries of a sparse matrix as coordinates, sorted by row; each takes 12 bytes, and empty rows take none."""
+    """Entries of a sparse matrix in coordinate format, sorted by row, with 12 bytes per float32 entry."""
 
     row: Int32[Tensor, " nnz"]
     column: Int32[Tensor, " nnz"]
@@ -199,18 +199,18 @@ class CooEntries(NamedTuple):
 
 @dataclass(frozen=True)
 class EvidenceShard:
-    """Evidence of a few views, split by the process that owns the Gaussians; rows are those of the owner's portion."""
+    """Evidence of a few views, split by the process that owns the Gaussians, with rows of the owner's partition."""
 
     rows: list[CooEntries]
-    """Labeled entries for every process."""
+    """Labeled entries for each process."""
     unlabeled: list[CooEntries]
-    """Unlabeled entries for every process."""
+    """Unlabeled entries for each process."""
     metadata: tuple[list[int], int, int, int]
-    """Number of regions of every view, `weight_power`, `num_excluded`, and bytes per weight."""
+    """Number of regions of each view, `weight_power`, `num_excluded`, and bytes per weight."""
 
     @staticmethod
     def split(evidence: Evidence, portion: Partition) -> EvidenceShard:
-        """Split the evidence of all Gaussians by owner."""
+        """Split the evidence of all Gaussians by the process that owns them."""
         regions = torch.bincount(evidence.region_view, minlength=evidence.num_views).tolist()
         facts = (regions, evidence.weight_power, evidence.num_excluded, evidence.rows.weight.element_size())
         return EvidenceShard(
@@ -229,11 +229,11 @@ def _split_by_owner(rows: SparseRows, portion: Partition) -> list[CooEntries]:
 
 
 def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partition, chunks: int) -> Evidence:
-    """Redistribute evidence: return that of all views for the Gaussians of this process.
+    """Exchange evidence between processes, and return the evidence of all views for the Gaussians of this process.
 
     Args:
-        pieces: evidence collected by this process, by chunk index; together, the processes have all chunks.
-        chunks: number of chunks of all processes.
+        pieces: Evidence that this process collected, by chunk index. All processes together have all chunks.
+        chunks: Number of chunks of all processes.
     """
     local_chunks = sorted(pieces)
     matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
@@ -246,7 +246,7 @@ def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partitio
     )
     facts = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
     regions_of = [facts[chunk][0] for chunk in range(chunks)]
-    widths = [(sum(counts), len(counts)) for counts in regions_of]  # columns of both matrices
+    widths = [(sum(counts), len(counts)) for counts in regions_of]  # numbers of columns of both matrices
     _, weight_power, num_excluded, weight_bytes = facts[0]
     result = []
     for i, matrix in enumerate(matrices):
@@ -266,13 +266,13 @@ def _exchange_rows(
     portion: Partition,
     dtype: torch.dtype,
 ) -> SparseRows:
-    """Exchange the entries of a matrix, and return the rows of this process's Gaussians.
+    """Exchange the entries of a matrix between processes, and return the rows of this process's Gaussians.
 
     Args:
-        entries: entries of this process, by chunk and receiving process.
-        sent_counts: chunks of every process, and the number of entries of each that it sends to this one.
-        first_column: first column of every chunk in the whole matrix.
-        dtype: type of the weights.
+        entries: Entries of this process, by chunk and receiving process.
+        sent_counts: Chunks of each process, and the number of entries per chunk that it sends to this process.
+        first_column: First column of each chunk in the whole matrix.
+        dtype: Type of the weights.
     """
     team, device = portion.communicator, portion.order.device
     empty = CooEntries(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, dtype)))
@@ -289,22 +289,22 @@ def _exchange_rows(
 
 
 class Halo(NamedTuple):
-    """Gaussians of a portion, followed by their neighbors in other processes."""
+    """Gaussians of a partition, followed by their neighbors in other processes."""
 
     lifted: Lifted
-    """Directions of all these Gaussians; of the scalars, only the norm is valid."""
+    """Directions of all these Gaussians. The norm is the only valid scalar."""
     neighbors: Neighbors
-    """Neighbors of the portion's Gaussians, as rows of this object."""
+    """Neighbors of the partition's Gaussians, as rows of this object."""
     gaussians: Int64[Tensor, " all"]
     """Index of each of these Gaussians in the scene."""
 
 
 def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Halo:
-    """Gather the directions and neighbors that a vote of the portion's Gaussians reads.
+    """Gather the directions and neighbors that the vote needs for the Gaussians of this process.
 
     Args:
-        lifted: lift of the portion.
-        neighbors: neighbors of the portion's Gaussians, as indices in the scene.
+        lifted: Lift of the partition.
+        neighbors: Neighbors of the partition's Gaussians, as indices in the scene.
     """
     team, local, device = portion.communicator, portion.indices, portion.order.device
     _, row = portion.place

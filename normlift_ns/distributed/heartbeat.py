@@ -1,7 +1,7 @@
-"""Heartbeats of the processes of one lift, which reveal a lost process.
+"""Heartbeats of the processes of a distributed lift, which detect lost processes.
 
-A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
-counter stops is lost, and the others report that and exit. A process that fails reports its own error first.
+A thread of each process increments a counter in the shared store, even if an image takes hours. If a counter stops, its
+process is lost, and the other processes report this and exit. A process that fails reports its own error first.
 """
 
 from __future__ import annotations
@@ -22,62 +22,62 @@ HEARTBEAT_INTERVAL = 2.0
 HEARTBEAT_TIMEOUT = 30.0
 """Seconds without a heartbeat after which a process counts as lost."""
 _GRACE = 10.0
-"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost one."""
+"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost process."""
 
 
 class PeerFailure(NamedTuple):
-    """Loss or failure of another process, after which this one has to exit."""
+    """The loss or failure of another process, after which this process has to exit."""
 
     rank: int
     """Rank of the lost or failed process."""
     reported: bool
-    """True if the process failed and reported the error itself; False if its heartbeat stopped."""
+    """True if the process failed and reported its error, False if its heartbeat stopped."""
     host: str
     """Host name and process id."""
 
 
 @dataclass
 class Heartbeat:
-    """Heartbeat of this process, and monitor of the others."""
+    """The heartbeat of this process, and a monitor of the heartbeats of other processes."""
 
     store: Any
-    """Client of the shared store, for this object only."""
+    """Client of the shared store, used only by this object."""
     rank: int
     size: int
     on_failure: Callable[[PeerFailure], None]
-    """Callback invoked before a forced exit; it must return quickly."""
+    """Callback before a forced exit, which must return quickly."""
     failure: PeerFailure | None = None
     _waiting: bool = False
     _stop: Event = field(default_factory=Event)
     _loss_detected: Event = field(default_factory=Event)
 
     def start(self) -> None:
-        """Start the thread that sends the heartbeat and monitors the others."""
+        """Start the thread that sends the heartbeat and monitors the other processes."""
         self.store.set(f"place/{self.rank}", f"{socket.gethostname()}, process {os.getpid()}")
         Thread(target=self._run, name="heartbeat", daemon=True).start()
 
     def stop(self, well: bool) -> bool:
-        """Stop the heartbeat, and announce to the others that this process exits.
+        """Stop the heartbeat, and notify the other processes that this process exits.
 
-        If the store is unreachable, process 0, which hosts it, has exited: it has reported its own error, unless this
-        process has detected the loss.
+        If the store is unreachable, process 0, which hosts it, has exited. Process 0 has then reported its own error,
+        unless this process has detected the loss.
 
         Args:
-            well: True if the process succeeded. Otherwise, the others have to exit too.
+            well: True if this process succeeded, False if the other processes have to exit too.
         Returns:
-            Whether this process is the first to fail, and should report its error.
+            True if this process is the first to fail and should report its error.
         """
         self._stop.set()
-        with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
+        with suppress(Exception):  # a lost store raises various errors, and the other processes exit too
             first = not well and self.store.add("failures", 1) == 1
             self.store.set(f"end/{self.rank}", "well" if well else "failed")
-            if well and self.rank == 0:  # the store may be in this process
+            if well and self.rank == 0:  # this process may host the store
                 self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
             return first
         return self.rank == 0 or self.failure is not None
 
     def wait_for_failure(self) -> PeerFailure | None:
-        """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
+        """Wait for the cause of a communication error; return the failure, or None if all processes are running."""
         self._waiting = True
         self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
         return self.failure
@@ -100,7 +100,7 @@ class Heartbeat:
         self._loss_detected.set()
         if self._waiting:
             return
-        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
+        os.kill(os.getpid(), signal.SIGTERM)  # the handler of SIGTERM removes partial files
         if not self._stop.wait(_GRACE):
             self.on_failure(self.failure)
             os._exit(1)

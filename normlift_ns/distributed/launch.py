@@ -1,4 +1,4 @@
-"""Start of distributed lifts: launch processes on this machine, or join those of torchrun on any number of machines."""
+"""Start of distributed lifts, by launching processes on this machine or by joining processes of torchrun."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
 TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for distributed processes."""
 LAUNCHED_VARIABLE = "NORMLIFT_TEAM"
-"""Environment variable that marks processes launched by `launch_processes`, which reports if one is killed."""
+"""Environment variable of the processes that `launch_processes` has started, and whose termination it reports."""
 _RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
 _COLLECTIVE_TIMEOUT = timedelta(days=7)
-"""Longest wait for another process in a collective; heartbeats show whether it is alive."""
+"""Longest wait for other processes in a collective operation. Heartbeats detect lost processes earlier."""
 _JOIN_TIMEOUT = timedelta(minutes=10)
-"""Time limit for all processes to connect."""
+"""Time limit for the connection of all processes."""
 _QUIET_WAIT = 15.0
 """Seconds of waiting before a message is printed."""
 _PR_SET_PDEATHSIG = 1
-"""Option of Linux's prctl."""
+"""Constant of prctl on Linux, which sets the signal that a process receives when its parent exits."""
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return rank and world size from the variables that torchrun and `launch_processes` set; None: a single process.
+    """Return rank and world size from the variables of torchrun or `launch_processes`, or None for a single process.
 
     Raises:
-        InputError: if the values are not valid numbers.
+        InputError: If the values are not valid numbers.
 
     >>> address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
     >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", **address}), rank_and_world_size({})
@@ -63,12 +63,11 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
 def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
     """Run several processes on this machine that lift one scene together, and return the exit code.
 
-    If one process fails, the others are terminated.
+    If a process fails, all others are terminated. A process reports its own errors.
 
     Args:
-        commands: command line of each process.
-        log: callback for a message that names a process killed by a signal. Other failures are reported by the
-            process itself.
+        commands: Command line of each process.
+        log: Callback for a message about a process that a signal has killed.
     """
     count = len(commands)
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -80,7 +79,7 @@ def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], Non
         LAUNCHED_VARIABLE: "1",
     }
     env.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
-    env.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast is not faster here, and can fail
+    env.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast is not faster for these transfers, and can fail
     if sys.platform in _LOOPBACK:  # do not listen on the network
         env |= dict.fromkeys(("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"), _LOOPBACK[sys.platform])
     processes = [
@@ -94,24 +93,24 @@ def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], Non
     ]
     try:
         return _watch(processes, log)
-    finally:  # also after Ctrl-C or SIGTERM
+    finally:  # including Ctrl-C and SIGTERM
         end_processes(processes, 8.0)
 
 
 def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
-    """Return 0 when all processes have succeeded, or the exit code of the first one that fails."""
+    """Wait for all processes; return 0 if all succeed, or the exit code of the first process that fails."""
     while True:
         codes = [process.poll() for process in processes]
         rank, code = next(((r, code) for r, code in enumerate(codes) if code), (0, 0))
         if code < 0:
-            log(f"Process {rank} of 0..{len(processes) - 1} was killed by {describe_signal(-code)}. {_RESUME_HINT}")
+            log(f"Process {rank} (of 0..{len(processes) - 1}) was killed by {describe_signal(-code)}. {_RESUME_HINT}")
         if code != 0 or all(code == 0 for code in codes):
             return max(code, int(code != 0))
         time.sleep(0.1)
 
 
 def describe_signal(number: int) -> str:
-    """Return the name of a signal that killed a process, and a possible reason.
+    """Return the name of a signal that killed a process, with a possible reason.
 
     >>> describe_signal(15)
     'SIGTERM'
@@ -134,7 +133,7 @@ def end_processes(processes: Sequence[subprocess.Popen[bytes]], grace: float) ->
 
 
 def exit_with_parent() -> Callable[[], None] | None:
-    """Return a `preexec_fn` that makes a new process exit with this one, or None on systems other than Linux."""
+    """Return a `preexec_fn` that ends a new process when this process exits, or None on systems other than Linux."""
     if sys.platform != "linux":
         return None
     return partial(_die_with_parent, ctypes.CDLL(None).prctl, os.getpid())
@@ -142,15 +141,15 @@ def exit_with_parent() -> Callable[[], None] | None:
 
 def _die_with_parent(prctl: Callable[..., int], parent: int) -> None:
     prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent:  # the parent has exited already
+    if os.getppid() != parent:  # the parent has already exited
         os._exit(128 + signal.SIGTERM)
 
 
 def _use_single_gpu(local_rank: int, device: str) -> None:
-    """Make only the GPU with the process's local rank visible, before torch initializes CUDA.
+    """Hide all GPUs except the one with the local rank of the process, before torch initializes CUDA.
 
     Raises:
-        InputError: if the machine has fewer GPUs.
+        InputError: If the machine has no GPU for the local rank.
     """
     import torch  # noqa: PLC0415 (not needed by the launcher)
 
@@ -159,7 +158,7 @@ def _use_single_gpu(local_rank: int, device: str) -> None:
         return
     if local_rank >= count:
         raise InputError(
-            f"process {local_rank} on this machine needs its own GPU; start at most one per GPU ({count} found)"
+            f"process {local_rank} on this machine needs its own GPU; start at most one process per GPU ({count} found)"
         )
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[local_rank] if local_rank < len(visible) > 1 else str(local_rank)
@@ -167,20 +166,20 @@ def _use_single_gpu(local_rank: int, device: str) -> None:
 
 @contextmanager
 def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[TorchCommunicator | None]:
-    """Provide a context with the team of this process, or None if the environment describes no other processes.
+    """Provide a context with the communicator of this process, or with None for a single process.
 
     Args:
-        device: cpu, cuda or auto.
-        log: callback for a message that names a lost process, if no other process reports it.
+        device: "cpu", "cuda" or "auto".
+        log: Callback for a message about a lost process, called only if no other process reports it.
     Raises:
-        InputError: if the processes cannot connect, or there are too few GPUs.
-        SystemExit: if another process fails or is lost; the exit code is 1.
+        InputError: If the processes cannot connect, or the machine has too few GPUs.
+        SystemExit: If another process fails or is lost; the exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)
     if ranks is None:
         yield None
         return
-    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # hides warnings for developers; torch reads it on import
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # hides warnings for developers; read when torch is imported
     rank, size = ranks
     _use_single_gpu(int(os.environ.get("LOCAL_RANK", "0")), device)
     import torch  # noqa: PLC0415 (as above)
@@ -211,7 +210,7 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
 
 def describe_failure(lost: PeerFailure) -> str:
     """Return a message for the user about a lost process."""
-    return f"Process {lost.rank} ({lost.host}) was lost, so the others exit. {_RESUME_HINT}"
+    return f"Process {lost.rank} ({lost.host}) was lost, so the other processes exit. {_RESUME_HINT}"
 
 
 def _is_network_error(error: Exception) -> bool:
@@ -220,7 +219,7 @@ def _is_network_error(error: Exception) -> bool:
 
 
 def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> tuple[Any, Heartbeat]:
-    """Connect to the other processes; return a store for counters, and the running heartbeat of this process."""
+    """Connect to the other processes; return the store of counters, and the running heartbeat of this process."""
     import torch.distributed as dist  # noqa: PLC0415 (as above)
     from torch.distributed import PrefixStore, TCPStore  # noqa: PLC0415 # pyright: ignore[reportPrivateImportUsage]
 
@@ -256,7 +255,7 @@ def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> 
 
 
 def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) -> None:
-    """Wait in Python, which signals can interrupt; raise TimeoutError at the time limit."""
+    """Wait in Python, so that signals can interrupt it; raise TimeoutError at the time limit."""
     start_time, warned = time.monotonic(), False
     while not ready():
         waited = time.monotonic() - start_time
@@ -272,7 +271,7 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
 
 
 def _is_listening(host: str, port: int) -> bool:
-    """Return whether a server accepts connections at this address."""
+    """Return whether a server accepts connections at an address."""
     with suppress(OSError):
         socket.create_connection((host, port), timeout=5).close()
         return True

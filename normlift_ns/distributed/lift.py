@@ -1,4 +1,4 @@
-"""Lifting in several processes: the steps of `pipeline`, with the Gaussians and views divided among the processes.
+"""Distributed version of the steps of `pipeline`, with Gaussians and views divided among processes.
 
 The result does not depend on the number of processes. The evidence of a view does not depend on other views, and
 Gaussians are processed in the same blocks.
@@ -44,9 +44,9 @@ from normlift_ns.progress import StageTimer
 
 
 def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> LiftedRun | None:
-    """Run `run_lift` in several processes, all with the same request and the whole scene.
+    """Run `run_lift` in several processes, each with the same request and the whole scene.
 
-    Only rank 0 writes and returns the run.
+    Only process 0 writes and returns the run. All other processes return None.
     """
     prepared, before = api.prepare_lift(request), StageTimer(request.report)
     run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
@@ -102,7 +102,7 @@ def _collect(
     stages: StageTimer,
     wait_for_kernels: Callable[[], None],
 ) -> ViewObservations:
-    """Collect chunks of views that no other process has claimed; return all views, for this process's Gaussians."""
+    """Collect the chunks that this process can claim; return all views for the Gaussians of this process."""
     chunks = chunk_views(collection.views, team.world_size)
     tables: dict[int, tuple[Tensor, Tensor]] = {}
     pieces: dict[int, EvidenceShard] = {}
@@ -118,7 +118,7 @@ def _collect(
 
 
 def _gather_tables(tables: Mapping[int, tuple[Tensor, Tensor]], team: Communicator) -> tuple[Tensor, Tensor]:
-    """Return features and levels of the regions of all chunks, in order."""
+    """Return the features and levels of the regions of all chunks, in the order of the chunks."""
     local_chunks = sorted(tables)
     gathered = team.all_gather_object([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
     widths = {width for (shapes,) in gathered for _, _, width in shapes}
@@ -134,8 +134,8 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
     """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes.
 
     Args:
-        sample: as in `consensus`.
-        options: `power` and `least` of `consensus`.
+        sample: Number of Gaussians; see `consensus`.
+        options: Arguments `power` and `least` of `consensus`.
     """
     team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
@@ -163,8 +163,8 @@ def vote_distributed(
     """Run `vote_directions` in several processes.
 
     Returns:
-        For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians
-        that change their direction and that have no support.
+        The Gaussian whose direction each Gaussian of the partition takes, and statistics. The statistics are the
+        fractions of all Gaussians that change their direction and that have no support.
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):
@@ -195,15 +195,16 @@ def build_field_distributed(
     storage: str,
     provenance: Mapping[str, Any],
 ) -> SemanticField | None:
-    """Run `SemanticField.build` in several processes; return the field in process 0 and None in the others.
+    """Run `SemanticField.build` in several processes; return the field in process 0, and None in all others.
 
     Args:
-        lifted: lift of this process's Gaussians.
-        means: centers of all Gaussians.
-        source: result of the vote for this process's Gaussians; None: unrefined.
+        lifted: Lift of this process's Gaussians.
+        means: Centers of all Gaussians.
+        source: Result of the vote for this process's Gaussians, or None without a vote.
         portion: Gaussians of this process.
-        tolerance, storage: as in `SemanticField.build`.
-        provenance: as in `SemanticField.build`; only that of process 0 is used.
+        tolerance: See `SemanticField.build`.
+        storage: See `SemanticField.build`.
+        provenance: See `SemanticField.build`; only the argument of process 0 is used.
     """
     facts, basis = choose_form(lifted, storage, tolerance, portion)
     is_evidence = facts["form"] == "evidence"
@@ -216,7 +217,7 @@ def build_field_distributed(
 
 
 def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEvidence | None:
-    """Return E and F of all portions in process 0, and None in the others."""
+    """Return the evidence E and the features F of all partitions in process 0, and None in all others."""
     rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
     if rows is None or unlabeled is None:
         return None
@@ -224,7 +225,7 @@ def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEviden
 
 
 def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> lowrank.StoredDirections | None:
-    """Return the directions of all Gaussians with evidence in process 0, and None in the others."""
+    """Return the directions of all Gaussians with evidence in process 0, and None in all others."""
     coordinates, rows = lowrank.encode_directions(lifted, basis, portion.blocks())
     parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:

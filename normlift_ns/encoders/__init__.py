@@ -1,6 +1,6 @@
-"""2D features of images and text embeddings in one space.
+"""Encoders of image regions and prompts into a joint embedding space.
 
-Names are loaded on first use, so that `encoders.registry` can be imported without torch.
+Names are imported at first use, so that importing `encoders.registry` does not import torch.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _MODULES = {
     "SourceOptions": "options",
     "read_image": "segmentation.regions",
 }
-"""Module of each name that other packages may import from here."""
+"""Module that defines each public name of this package."""
 
 
 def __getattr__(name: str) -> Any:

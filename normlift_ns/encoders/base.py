@@ -1,11 +1,11 @@
-"""Protocols of feature sources, regions and encoders, dense features of patches, and precomputed features.
+"""Protocols of feature sources, segmentation methods and encoders, and sources of patch and precomputed features.
 
-The two steps are separate. `Regions` segments an image, an `Encoder` embeds regions and prompts in one space, and
-`RegionFeatures` combines the two into a `FeatureSource`. The rest of the package uses `FeatureSource` only. Code that
-gets labels and features together, such as an importer of preprocessed data, implements `FeatureSource` directly.
+Segmentation and encoding are separate steps. `Regions` segments an image, and an `Encoder` embeds regions and prompts
+in a joint space. `RegionFeatures` combines the two into a `FeatureSource`, the only protocol that the rest of the
+package uses. A source that reads labels and features together, such as an importer, implements it directly.
 
-An image may be segmented at several levels. Evidence is rasterized once, on the cells that all levels share
-(`joint_partition`), and then summed over the regions of the selected level.
+An image can be segmented at several levels. The rasterizer computes evidence once, for the cells that all levels share
+(see `joint_partition`). The lift then sums it over the regions of the selected levels.
 """
 
 from __future__ import annotations
@@ -36,23 +36,22 @@ from normlift_ns.segmentation.regions import is_downscaled, resample_nearest
 
 @dataclass(frozen=True)
 class ViewFeatures:
-    """2D features of one image, on the CPU. The rasterizer sums weights over cells; a region is a set of cells that
-    share one feature.
+    """2D features of one image, on the CPU.
 
-    Cells depend on all levels of an image, not on the selected one. Another level of the same source has the same
-    cells, so its evidence is already computed.
+    The rasterizer sums weights over cells. A region is a set of cells that share one feature. Cells depend on all
+    levels of an image, not only on the selected ones, so another selection can use the same cached evidence.
 
     Raises:
-        ValueError: If a type or shape is wrong, a label has no cell, a cell no feature row, or a row not unit length.
+        ValueError: If a type or shape is wrong, an id is out of range, or a feature row is not a unit vector.
     """
 
     labels: Int32[Tensor, "h w"]
-    """Cell of every pixel, in -1..C-1; -1: none."""
+    """Cell of each pixel, in 0..C-1, or -1 for none."""
     features: Float32[Tensor, "r d"]
-    """One unit row per region."""
+    """Feature of each region, a unit vector."""
     regions: Int32[Tensor, "levels c"] | None = None
-    """Region of every cell in each selected level, in -1..R-1; -1: none, as if the pixels were unlabeled. With several
-    levels, every pixel counts once in each. None: every cell is a region."""
+    """Region of each cell in each selected level, in 0..R-1, or -1 if the cell is unlabeled. Each pixel counts once in
+    each level. None: each cell is a region."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
@@ -72,7 +71,8 @@ class ViewFeatures:
             first = int(bad[0])
             raise InputError(
                 f"{bad.numel()} of {len(self.features)} rows of ViewFeatures.features are not unit vectors (row "
-                f"{first} has length {length[first]:.3g}); normalize them, and label regions without a feature -1"
+                f"{first} has length {length[first]:.3g}); normalize them, and use the label -1 for regions without a "
+                "feature"
             )
 
     @property
@@ -91,21 +91,21 @@ def _check_range(name: str, values: Tensor, count: int, unit: str) -> None:
 
 
 class FeatureSource(Protocol):
-    """A source of 2D image features and of text embeddings in the same space."""
+    """A source of 2D image features and of prompt embeddings in the same space."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes the result, as JSON-serializable values; the manifest stores it.
+        """All settings that change the result, as JSON-serializable values for the manifest.
 
-        Device and precision are left out: they change rounding only.
+        Device and precision are excluded, because they affect only rounding.
         """
         ...
 
     def available(self, names: Sequence[str]) -> list[str]:
-        """Return the given images that have features. A lift skips the others, as if they had never been taken.
+        """Return the names of those images that have features; the lift ignores all other images.
 
         Raises:
-            ValueError, FileNotFoundError: As `view`, for errors that can be detected without reading an image.
+            ValueError, FileNotFoundError: For the errors of `view` that can be detected without reading an image.
         """
         ...
 
@@ -116,15 +116,15 @@ class FeatureSource(Protocol):
             image: RGB, 0..255.
             name: Path of the image relative to its dataset, such as "images/0001.jpg".
         Raises:
-            ValueError, FileNotFoundError: With what was found, what was expected and what to do.
+            ValueError, FileNotFoundError: If the image or its features are missing or invalid.
         """
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt, on the CPU.
+        """Return one unit vector per prompt, on the CPU.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or the encoder does not understand one.
+            ValueError: If `prompts` or a prompt is empty, or the encoder cannot embed a prompt.
         """
         ...
 
@@ -134,59 +134,62 @@ class Regions(Protocol):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes `labels`, as JSON-serializable values; `chosen` is not part of it."""
+        """All settings that change `labels`, as JSON-serializable values. They do not include `chosen`."""
         ...
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices of the selected levels of `labels`; (): the only one."""
+        """Indices of the selected levels of `labels`; empty if there is only one level."""
         ...
 
     @property
     def at_once(self) -> int:
-        """Number of images to pass to `labels` concurrently, one per thread; 1 for a network, which uses its device
-        fully."""
+        """Number of images to segment concurrently, one per thread; 1 for a network, because one image is enough to
+        use its device fully."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """Return the files that `labels` reads for an image, other than the image itself.
+        """Return the files that `labels` reads for an image, excluding the image itself.
 
         Raises:
-            ValueError, FileNotFoundError: As `labels`.
+            ValueError, FileNotFoundError: For the same reasons as `labels`.
         """
         ...
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        """Return the region of every pixel in every level, selected or not, on any device. Region ids in a level are
-        0..R-1 without gaps; -1: none. A method without levels returns one.
+        """Return the region of each pixel in all levels, selected or not, on any device.
 
-        If regions overlap, depth 0 holds the one that counts for the lift; only the encoder uses deeper ones. A method
-        without overlaps returns depth 1.
+        The region ids of a level are consecutive, 0..R-1, and unlabeled pixels are -1. A method without levels returns
+        one level. If regions overlap, the lift uses the region at depth 0, and only the encoder uses the others. A
+        method without overlaps returns a depth of 1.
         """
         ...
 
 
 class Encoder(TextEncoder, Protocol):
-    """A joint embedding space of image regions and text."""
+    """An encoder of image regions and prompts into a joint embedding space."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """Return one unit row per region, on the CPU; a zero row: the region has no feature, so its pixels count as
-        unlabeled. `labels` is one level of `Regions.labels`; a region consists of all pixels that have its id at any
-        depth."""
+        """Return one unit vector per region, on the CPU, or a zero row if the region has no feature.
+
+        The lift treats the pixels of regions without a feature as unlabeled. `labels` is one level of `Regions.labels`.
+        A region consists of all pixels that have its id at any depth.
+        """
         ...
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        """Yield `encode` of several views in order; results may differ from `encode` by rounding. The iterator takes a
-        view from `views` only when all earlier features have been yielded, or when batching that view with earlier ones
-        is faster."""
+        """Yield the result of `encode` for each view, in order. Results may differ from `encode` by rounding.
+
+        The iterator reads ahead in `views` only if it batches the regions of several views.
+        """
         return (self.encode(image, labels) for image, labels in views)
 
 
 @dataclass(frozen=True)
 class RegionFeatures:
-    """A `FeatureSource` that combines a segmentation method and an encoder."""
+    """A `FeatureSource` that consists of a segmentation method and an encoder."""
 
     regions: Regions
     encoder: Encoder
@@ -226,7 +229,7 @@ class RegionFeatures:
             )
 
     def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
-        """Return the image, on the CPU, and its label maps; check that they contain the selected levels."""
+        """Return the image on the CPU and its label maps; raise InputError if a selected level is missing."""
         image, name = view
         check_image(image, name)
         image = image.cpu()
@@ -234,7 +237,7 @@ class RegionFeatures:
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
-            raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
+            raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; select one with --level")
         return image, maps
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -244,13 +247,13 @@ class RegionFeatures:
 def drop_zero_rows(
     features: Float32[Tensor, "r d"], regions: Int32[Tensor, "*n"]
 ) -> tuple[Float32[Tensor, "s d"], Int32[Tensor, "*n"]]:
-    """Return the features that are not zero, and the regions renumbered for them; -1: none.
+    """Remove zero rows from `features`, and renumber `regions`; regions without a feature become -1.
 
     >>> drop_zero_rows(torch.tensor([[0.0], [1.0]]), torch.tensor([0, 1, -1], dtype=torch.int32))
     (tensor([[1.]]), tensor([-1,  0, -1], dtype=torch.int32))
     """
     found = features.any(dim=1)
-    number = torch.cat([torch.where(found, found.cumsum(0) - 1, -1), torch.tensor([-1])]).int()  # row -1
+    number = torch.cat([torch.where(found, found.cumsum(0) - 1, -1), torch.tensor([-1])]).int()  # -1 stays -1
     return features[found], number[regions.long()]
 
 
@@ -262,8 +265,10 @@ def segmentation_workers(source: FeatureSource) -> int:
 def iterate_view_features(
     source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]
 ) -> Iterator[ViewFeatures]:
-    """Yield `source.view` of several images in order; results may differ from `view` by rounding. Images are requested
-    as needed; an encoder that batches regions of several images requests several of them ahead."""
+    """Yield the features of several images in order. Results may differ from `source.view` by rounding.
+
+    The iterator requests images as needed. An encoder that batches regions of several images requests images ahead.
+    """
     if isinstance(source, RegionFeatures):
         return source.views(images)
     return (source.view(image, name) for image, name in images)
@@ -278,13 +283,13 @@ def check_image(image: Tensor, name: str) -> None:
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
-    """Partition an image into cells: the sets of pixels that have the same label in every level.
+    """Partition an image into cells, the sets of pixels that have the same label in all levels.
 
     Args:
-        maps: Region of every pixel in every level; -1: none.
+        maps: Region of each pixel in each level, or -1 for none.
     Returns:
-        The cell of every pixel, with ids 0..C-1 without gaps; -1 marks pixels without a label in any level. Then the
-        region of every cell in every level; -1: none. With one level without gaps in its ids, cells equal regions.
+        The cell of each pixel, with consecutive ids 0..C-1, or -1 if the pixel is unlabeled in all levels; and the
+        region of each cell in each level, or -1 for none. For one level with consecutive ids, cells equal regions.
     """
     key = torch.zeros_like(maps[0], dtype=torch.int64)
     key_count = 1
@@ -294,7 +299,7 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
         if len(maps) > 2:  # keep the product of the region counts within 64 bits
             key, key_count = _renumber(key, key_count)
     cells, count = _renumber(key, key_count)
-    unlabeled = int((maps == -1).all(dim=0).any())  # key 0, the smallest
+    unlabeled = int((maps == -1).all(dim=0).any())  # these pixels have key 0, the smallest
     cells = cells - unlabeled
     regions = torch.empty(len(maps), count - unlabeled, dtype=torch.int32, device=maps.device)
     labeled = cells >= 0
@@ -314,36 +319,36 @@ def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, 
     return number[key] - 1, int(number[-1])
 
 
-# Dense features without masks: every patch of a vision transformer is a region with its own feature.
+# Dense features without masks: each patch of a vision transformer is a region with its own feature.
 
 
 class DenseEncoder(Encoder, Protocol):
-    """An encoder that also has features of patches."""
+    """An encoder that can also embed the patches of an image."""
 
     @property
     def why_not_dense(self) -> str | None:
-        """The reason that this network has no features of patches, and what to do; None if it has them."""
+        """Error message, with a remedy, if the network cannot embed patches; else None."""
         ...
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """Return one row per patch of a grid over the image, row by row, as `encode` does for regions.
+        """Return one unit vector or zero row per patch of a grid over the image, in row-major order.
 
         Raises:
-            FileNotFoundError, ValueError: As `Encoder.encode`.
+            FileNotFoundError, ValueError: For the same reasons as `Encoder.encode`.
         """
         ...
 
 
 @dataclass(frozen=True)
 class PatchFeatures:
-    """A `FeatureSource` of patches.
+    """A `FeatureSource` whose regions are the patches of a grid.
 
     Raises:
-        ValueError: If the network has no features of patches.
+        ValueError: If the encoder cannot embed patches.
     """
 
     encoder: DenseEncoder
-    """Encodes the patches and the prompts."""
+    """Encoder of the patches and of prompts."""
     count: int = 1024
     """Approximate number of patches per image, at least 1."""
 
@@ -360,19 +365,19 @@ class PatchFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """Return the regions and features of one image; raises like `features`."""
+        """Return the regions and features of one image. Raises the same errors as `features`."""
         features, labels = drop_zero_rows(self.features(image, name), self.labels(image))
         return ViewFeatures(labels, features)
 
     def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:
-        """Return the nearest patch of every pixel, numbered row by row."""
+        """Return the patch that contains each pixel, numbered in row-major order."""
         height, width = image.shape[:2]
         rows, columns = patch_grid(height, width, self.count)
         patches = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
         return torch.from_numpy(resample_nearest(patches, height, width)[0])
 
     def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float32[Tensor, "r d"]:
-        """Return one unit row per patch, or a zero row if it has no feature.
+        """Return one unit vector per patch, or a zero row if the patch has no feature.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
@@ -392,7 +397,7 @@ class PatchFeatures:
 
 
 def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:
-    """Return rows and columns of about `count` squares in an image, none smaller than a pixel.
+    """Return the numbers of rows and columns of a grid of about `count` squares, each at least one pixel wide.
 
     >>> patch_grid(960, 540, 1024)
     (43, 24)
@@ -402,7 +407,7 @@ def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:
 
 
 def resize_image(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Float32[Tensor, "1 3 y x"]:
-    """Return the image at another size, in 0..255: bicubic interpolation, with antialiasing when it shrinks."""
+    """Resize an image by bicubic interpolation with antialiasing; values stay in 0..255."""
     pixels = image.permute(2, 0, 1)[None].float()
     size = height, width
     return torch.nn.functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False).clamp(
@@ -412,18 +417,19 @@ def resize_image(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Floa
 
 @dataclass(frozen=True)
 class PrecomputedFeatures:
-    """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings, on the CPU."""
+    """A `FeatureSource` of precomputed labels, region features and prompt embeddings, on the CPU."""
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length, 0 for none."""
+    """Labels and vectors by image name. Labels are in 0..R-1, or -1 for none. Vectors can have any length; a zero
+    vector stands for no feature."""
     texts: Mapping[str, Float[Tensor, " d"]]
-    """Embeddings by text."""
+    """Embedding of each prompt."""
     divisor: int = 1
-    """Factor by which images were downscaled, lift_downscale. Labels of their size before are downscaled, too."""
+    """Factor by which images were downscaled (`lift_downscale`). Labels of full-size images are downscaled to match."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """A digest of the content of all images."""
+        """Digest of the labels and vectors of all images."""
         digest = blake2b(digest_size=16)
         for name, (labels, vectors) in self.views.items():
             digest.update(f"{name} {labels.dtype} {tuple(labels.shape)} {vectors.dtype}".encode())
@@ -435,8 +441,8 @@ class PrecomputedFeatures:
         unknown = sorted(set(self.views) - set(names))
         if len(unknown) > 0:
             raise InputError(
-                f"features were given for {unknown[0]!r}, which is not a training image; there are {len(names)}, from "
-                f"{names[0]!r} to {names[-1]!r}"
+                f"features has an entry for {unknown[0]!r}, which is not a training image; use the {len(names)} names "
+                f"in scene.train.names, from {names[0]!r} to {names[-1]!r}"
             )
         return [name for name in names if name in self.views]
 
@@ -445,8 +451,9 @@ class PrecomputedFeatures:
         if not is_downscaled(labels.shape, image.shape[:2], 1):
             if not is_downscaled(labels.shape, image.shape[:2], self.divisor):
                 raise InputError(
-                    f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
-                    f"width, undistorted, after lift_downscale {self.divisor}); pass labels of the undistorted image"
+                    f"labels of {name} have size {tuple(labels.shape)}, but the undistorted image has size "
+                    f"{tuple(image.shape[:2])} (height x width, after lift_downscale {self.divisor}); pass labels of "
+                    "the undistorted image"
                 )
             labels = torch.from_numpy(resample_nearest(labels.numpy()[None], *image.shape[:2])[0])
         vectors, labels = drop_zero_rows(vectors, labels.int())
@@ -454,25 +461,28 @@ class PrecomputedFeatures:
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
-        return torch.from_numpy(look_up_embeddings(prompts, self.texts, "the given texts"))
+        return torch.from_numpy(look_up_embeddings(prompts, self.texts, "the argument texts"))
 
 
 def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> PrecomputedFeatures:
-    """Return a source of precomputed features from tensors, arrays or lists.
+    """Convert tensors, arrays or lists to a source of precomputed features.
 
     Args:
-        features: One pair of labels and vectors per training image, in order; or a mapping from image names to pairs,
-            which may omit images.
-        texts: Vectors by text.
+        features: Either one (labels, vectors) pair per training image, in order, or a mapping from image names to such
+            pairs, which may omit images.
+        texts: Vector of each prompt.
         names: Names of all training images.
     Raises:
-        ValueError: If `features` is empty or a list of another length. If vectors are not finite, or not [regions, D]
-            ([D] for a text, and not zero) with the same D everywhere. Also if labels are not an integer matrix, or name
-            a region without a vector. Also if a text is empty, or cannot be a file name in an archive. The message
-            names the image or the text.
+        ValueError: If `features` is empty, or a list whose length differs from that of `names`.
+        ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
+        ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
+        ValueError: If the vector of a prompt is not [D], not finite or zero.
+        ValueError: If a prompt is empty, or cannot be a file name in an archive.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
-        raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")
+        raise InputError(
+            f"features must be a list or a dictionary of (labels, vectors) pairs, got {type(features).__name__}"
+        )
     if not isinstance(features, Mapping):
         if len(features) != len(names):
             raise InputError(
@@ -483,18 +493,17 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
     if len(features) == 0:
         raise InputError("features are empty; pass labels and vectors of at least one training image")
     if texts is not None and not (isinstance(texts, Mapping) and all(isinstance(text, str) for text in texts)):
-        raise InputError("texts must be a dictionary that maps texts to vectors")
+        raise InputError("texts must be None or a dictionary from prompts to vectors")
     views = {name: _convert_view(name, pair) for name, pair in features.items()}
     vectors = {text: _convert_text(text, vector) for text, vector in (texts or {}).items()}
     lengths = {rows.shape[1] for _, rows in views.values()} | set(map(len, vectors.values()))
     if len(lengths) > 1:
-        raise InputError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
+        raise InputError(f"all vectors in features and texts must have the same length, found {sorted(lengths)}")
     return PrecomputedFeatures(views, vectors)
 
 
 def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
-    """Return the labels and vectors of one image; raise InputError unless the labels name regions that have a
-    vector."""
+    """Return the labels and vectors of one image as tensors; raise InputError if they are invalid."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
     _check_dense(f"labels of {name}", pair[0])
@@ -507,7 +516,7 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
     if vectors.ndim != 2 or vectors.shape[1] == 0 or not bool(vectors.isfinite().all()):
-        raise InputError(f"vectors of {name} must be [regions, D] and finite; got {vectors.shape}")
+        raise InputError(f"vectors of {name} must be finite and of shape [regions, D], got {vectors.shape}")
     low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
     if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
         raise InputError(
@@ -518,18 +527,21 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
 
 
 def _check_dense(name: str, value: Any) -> None:
-    """Raise InputError for a sparse or nested tensor, or one without values."""
+    """Raise InputError if a tensor is sparse, nested or on the meta device."""
     if isinstance(value, Tensor):
         as_tensor(name, value, "an array")
 
 
 def _convert_text(text: str, values: Any) -> Tensor:
-    """Return the vector of a text; raise InputError unless the text can be stored and its vector has a direction."""
+    """Return the vector of a prompt as a tensor; raise InputError if the prompt or its vector is invalid."""
     vector = _to_floats(values)
     if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
-        raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
+        raise InputError(f"the vector of prompt {text!r} must be finite, not zero and of shape [D], got {vector.shape}")
     if text.strip() == "" or text.endswith(".npy") or re.search("[\0\ud800-\udfff]", text):
-        raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains invalid characters")
+        raise InputError(
+            f"{text!r} in texts is not a valid prompt, because it is empty, ends in .npy or contains invalid "
+            "characters; use another prompt"
+        )
     return vector
 
 

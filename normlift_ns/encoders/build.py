@@ -1,4 +1,4 @@
-"""Builders of feature sources and regions from `SourceOptions`."""
+"""Construction of feature sources from `SourceOptions`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, 
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
-    """Return the feature source of the options: regions combined with an encoder, or features read from a folder.
+    """Make the feature source that the options select: regions with an encoder, or features from a folder.
 
     Args:
-        device: As in `make_encoder`.
+        device: Device of the networks; see `make_encoder`.
     Raises:
-        ValueError: As `make_encoder`, `SamMasks` and `Sam3Masks`. Also if the regions are unknown, "files" has no
-            folder, or a folder or level does not apply. Also if imported features have no folder, or a folder is given
-            without imported features.
-        FileNotFoundError: As those. Also if the folder of features does not exist.
+        ValueError: If the name of the regions is unknown.
+        ValueError: If a folder or level is missing, or has no effect with the other options.
+        FileNotFoundError: If the folder of features does not exist.
+        ValueError, FileNotFoundError: For the same reasons as `make_encoder`, `SamMasks` and `Sam3Masks`.
     """
     if options.features != "none":
         return _make_masks(options, options.features, device)
@@ -35,7 +35,7 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
         )
     if (file := options.text_embeddings) is not None:
-        raise InputError(f"--text-embeddings {file} is for imported features; add --features langsplat")
+        raise InputError(f"--text-embeddings {file} has no effect without imported features; add --features langsplat")
     options = resolve_source(options, device)
     name = options.regions
     masks = _make_masks(options, name, device)
@@ -43,7 +43,7 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
 
 
 def _make_masks(options: SourceOptions, name: str, device: str) -> Any:
-    """Check the options of a mask source and make it: `Regions`, or a `FeatureSource` if it has features."""
+    """Check the options of a mask source, and make its `Regions`, or its `FeatureSource` if it has features."""
     source = check_mask_options(options, name)
     if name in MASK_SOURCES.built_in or source.has_features:
         return source.make(options, device)
@@ -51,12 +51,14 @@ def _make_masks(options: SourceOptions, name: str, device: str) -> Any:
 
 
 _PATHS = ("regions_dir", "features_dir", "text_embeddings")
-"""Options that are paths."""
+"""Names of options that are paths."""
 
 
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
-    """Return the options of a lift for its manifest, as JSON-serializable values. "auto" is resolved, and paths are
-    absolute."""
+    """Return the options of a lift as JSON-serializable values for its manifest.
+
+    The values "auto" are resolved, and paths are absolute.
+    """
     options = resolve_source(options, device)
     settings = {**asdict(options), **absolute_paths(options)}
     settings["sam_model"] = None if options.sam_model is None else absolute_if_exists(options.sam_model)
@@ -67,17 +69,18 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
     """Recreate the feature source that a field was lifted from.
 
     Args:
-        device: As in `make_encoder`.
+        device: Device of the networks; see `make_encoder`.
     Raises:
-        ValueError: If the manifest does not name the features, because they were passed in from Python or the version
-            was older. Also if the recorded options give other features now.
+        ValueError: If the manifest has no feature options, because features were passed from Python or an older
+            version lifted the run.
+        ValueError: If the recorded options now give different features.
         FileNotFoundError: If a recorded file no longer exists.
     """
     settings = manifest.get("source")
     if settings is None:
         raise InputError(
-            "the run does not record how its regions and features were made: they were passed in from Python, or an "
-            "earlier version lifted it; lift again with: ns-normlift"
+            "the run does not record its feature options: the features were passed from Python, or an older version "
+            "lifted the run; lift again with: ns-normlift"
         )
     try:
         if not isinstance(settings, Mapping):
@@ -86,14 +89,14 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
         options = SourceOptions(**values)
     except TypeError as error:
         raise InputError(
-            f"the run's manifest has feature options that this version does not know ({error}); lift again "
+            f"the run's manifest has feature options that this version does not support ({error}); lift again "
             "with: ns-normlift"
         ) from error
     source = make_source(options, device)
     recorded, current = (json.dumps(x, sort_keys=True) for x in (manifest.get("features"), source.identity))
     if recorded != current:
         raise InputError(
-            f"the options recorded in the run give other features now: {recorded} at the lift, {current} now; lift "
-            "again with: ns-normlift"
+            f"the recorded options of the run now give different features ({recorded} at the lift, {current} now); "
+            "lift again with: ns-normlift"
         )
     return source

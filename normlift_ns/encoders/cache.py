@@ -1,7 +1,7 @@
-"""Disk cache of regions and features per image: an interrupted run resumes, and a second run recomputes neither.
+"""Disk cache of the regions and features of images, for interrupted and repeated lifts.
 
-Cache keys are digests of everything that an entry depends on. Files are written atomically; a damaged file, or one
-under the wrong name, is recomputed. The folders may be deleted at any time.
+The key of an entry is a digest of everything that the entry depends on. Files are written atomically, and damaged or
+renamed files are recomputed. The folders can be deleted at any time.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from normlift_ns.io.arrays import load_arrays, save_arrays
 from normlift_ns.io.guard import read_file
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
-REMEDY = "restore it by lifting again with: ns-normlift (the same options)"
+REMEDY = "lift again with the same options: ns-normlift"
 
 
 class NotCachedError(InputError):
-    """A result that is not in the cache."""
+    """Error for a result that is not in the cache and must not be computed."""
 
 
 def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool] = lambda part: True) -> FeatureSource:
-    """Return a source that caches expensive results in a folder; sources without any are returned unchanged.
+    """Return a source that caches its expensive results in a folder; return a source without such results unchanged.
 
     Args:
-        compute: whether regions or an encoder may compute results that are not cached.
-    Raises (later, when a view is requested):
-        OSError: If the folder cannot be written to, as when the disk is full.
-        NotCachedError: If a result for the image is missing, and must not be computed.
+        compute: Function that returns whether the given regions or encoder may compute results that are not cached.
+    Raises (when a view is requested):
+        OSError: If the folder is not writable, for example because the disk is full.
+        NotCachedError: If a result is not cached and `compute` returns False.
     """
     if isinstance(source, PatchFeatures):
         return cast(Any, CachedPatches(source, folder / "features", compute(source.encoder)))
@@ -54,15 +54,15 @@ def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool
 
 @dataclass(frozen=True)
 class _Cached:
-    """A part of a source whose results are cached; everything else is as in `inner`."""
+    """Base class of caches, which have all attributes of `inner`."""
 
     inner: Any
-    """Computes the results."""
+    """Object that computes the results."""
     folder: Path
-    """Folder with one safetensors file per image, and per level if an encoder computes them; created if it does not
+    """Folder with one safetensors file per image, or per image and level for an encoder; created if it does not
     exist."""
     compute: bool = True
-    """False: raise an error instead of computing results that are not cached."""
+    """True to compute results that are not cached, False to raise an error."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.inner, name)
@@ -72,7 +72,7 @@ class _Cached:
 class CachedRegions(_Cached):
     """`Regions` that cache the label maps of all levels.
 
-    The key: the image, its name, the files that are read for it, and the settings except the selected level.
+    The key depends on the image, its name, the files read for it, and all settings except the selected levels.
     """
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
@@ -85,7 +85,7 @@ class CachedRegions(_Cached):
         return labels.int()
 
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
-        """Return the cache path of the label maps of an image, whether the file exists or not."""
+        """Return the cache path of the label maps of an image; the file may not exist."""
         files = [read_file(file, max_bytes=2**31) for file in self.files(name)]
         return cache_path(self.folder, self.identity, name.encode(), *_key_parts(image), *files)
 
@@ -94,7 +94,7 @@ class CachedRegions(_Cached):
 class CachedEncoder(_Cached):
     """An `Encoder` that caches region features.
 
-    The key: the image, the labels, and the settings.
+    The key depends on the image, the labels and the settings.
     """
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
@@ -103,7 +103,7 @@ class CachedEncoder(_Cached):
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        pending: deque[Tensor | None] = deque()  # cached features of views taken but not yielded; None: being encoded
+        pending: deque[Tensor | None] = deque()  # cached features of views not yet yielded; None if being encoded
         paths: deque[Path] = deque()  # cache paths of the views being encoded
 
         def uncached() -> Iterator[tuple[Tensor, Tensor]]:
@@ -123,7 +123,7 @@ class CachedEncoder(_Cached):
         yield from (rows for rows in pending if rows is not None)
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
-        """Return the cache path of the features of the regions of an image, whether the file exists or not."""
+        """Return the cache path of the region features of an image; the file may not exist."""
         return cache_path(self.folder, self.identity, *_key_parts(image), *_key_parts(labels))
 
 
@@ -131,7 +131,7 @@ class CachedEncoder(_Cached):
 class CachedPatches(_Cached):
     """A `PatchFeatures` that caches the features of images.
 
-    The key: the image, and the settings.
+    The key depends on the image and the settings.
     """
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
@@ -147,20 +147,20 @@ class CachedPatches(_Cached):
 
 @dataclass(frozen=True)
 class CachedTextMasks:
-    """A cache of SAM 3 masks for prompts in images. The network is loaded only for prompts that are not cached.
+    """A cache of SAM 3 masks for prompts. It loads the network only for prompts that are not cached.
 
-    The key: the image, the text, and the network. Masks are stored as bits.
+    The key depends on the image, the prompt and the network. Masks are stored as bits.
     """
 
     checkpoint: str
-    """A folder, or a name on the hub."""
+    """Folder, or name on the Hugging Face hub."""
     device: str
     folder: Path
-    """Folder with one safetensors file per image and text, created if it does not exist. If it is not writable, nothing
-    is cached."""
+    """Folder with one safetensors file per image and prompt, created if it does not exist. If it is not writable,
+    nothing is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
-        """Return the union of the masks of each text; raises like `Sam3Network.load` and `Sam3Network.segment`."""
+        """Return the union of the masks of each prompt. Raises the errors of `Sam3Network.load` and `segment`."""
         size = (image.shape[0], image.shape[1])
         paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
         expected = torch.Size((size[0], -(-size[1] // 8)))  # packed bits
@@ -187,15 +187,18 @@ class CachedTextMasks:
 
 
 def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
-    """Return the parts of a cache key that identify a tensor: its type and shape, and its content."""
+    """Return the parts of a cache key that identify a tensor, its type with its shape and its content."""
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
 def _read(
     path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True, image: str = "the images"
 ) -> Tensor | None:
-    """Return a cached tensor; if it is missing, damaged, cached under another key, or not valid, return None, or raise
-    NotCachedError if results must not be computed."""
+    """Return a cached tensor, or None if it is missing, damaged, renamed or invalid.
+
+    Raises:
+        NotCachedError: Instead of returning None, if `compute` is False.
+    """
     with suppress(FileNotFoundError, ValueError, KeyError):
         tensor = load_arrays(path, key=path.stem, framework="pt").arrays[name] if os.path.isfile(path) else None
         if tensor is not None and is_valid(tensor):
@@ -206,7 +209,7 @@ def _read(
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:
-    """Return whether a cached tensor is a valid label map of the image, without gaps in the ids of a level."""
+    """Return whether a cached tensor has valid label maps of the image, with consecutive ids in each level."""
     matches = labels.dtype in (torch.int16, torch.int32) and labels.ndim == 4 and labels.shape[2:] == image.shape[:2]
     if not matches or labels.numel() == 0 or int(labels.min()) < -1 or int(labels.max()) >= labels[0].numel():
         return False
@@ -222,8 +225,8 @@ def _are_units(rows: Tensor, count: int) -> bool:
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:
-    """Write a tensor to the cache; raise OSError with advice if that fails."""
+    """Write a tensor to the cache; raise OSError if this fails."""
     try:
         save_arrays(path, {name: tensor}, key=path.stem, overwrite=True)
     except OSError as error:
-        raise OSError(f"cannot cache 2D {name}: {error}; the next lift reuses the views cached so far") from error
+        raise OSError(f"cannot cache 2D {name} ({error}); the next lift reuses the views cached so far") from error

@@ -1,22 +1,21 @@
-"""A joint embedding space of image regions and text without learned weights: colors, robust to changes in lighting.
+"""Encoder that compares the colors of regions with color names. It has no learned weights and is robust to lighting.
 
-A region is represented by its mean CIELAB color, a text by the colors that it names. `xkcd.json` has the 949 names of
-the XKCD color survey. Shade multiplies the light of a surface by a factor, which multiplies L* + 16, a* and b* by a
-common factor too. Colors are therefore compared in coordinates that discount this factor, and that are close to those
-of CIELAB at L* = 50::
+A region is represented by its mean CIELAB color, and a prompt by the colors that it names. `xkcd.json` has the 949
+names of the XKCD color survey. Shading scales the light of a surface, and thereby scales L* + 16, a* and b* by a common
+factor. Colors are therefore compared in coordinates that discount this factor and resemble CIELAB at L* = 50::
 
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
 
-Lightness counts fully among whites, grays and blacks, which differ in nothing else. It counts half among strong colors,
-whose lightness varies most in photographs. A color becomes the unit vector phi(x), such that the cosine falls with the
-distance of coordinates::
+Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half for strong colors,
+whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two such vectors
+falls with the distance of their coordinates::
 
     <phi(x), phi(y)> = exp(-|x - y|^2 / (2 sigma^2)),    sigma = 30
 
-The cosine is 0.95 at a distance of 10 (neighboring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. No finite number
-of dimensions reproduces this exactly. Here phi is the Nystroem approximation on 343 anchors, a lattice of 7 levels per
-sRGB channel. With L L^T the kernel matrix of the anchors, phi(x) = L^-1 k(anchors, x), normalized. For random pairs of
-sRGB colors, the cosine is accurate to 4e-3, and to 1e-3 for 99 % of them. The encoder represents nothing but color.
+The cosine is 0.95 at a distance of 10 (neighboring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. An exact phi would
+need infinitely many dimensions. This module uses the Nystroem approximation on 343 anchors, a lattice of 7 levels per
+sRGB channel. If L L^T is the kernel matrix of the anchors, phi(x) is the normalized vector L^-1 k(anchors, x). For
+random pairs of sRGB colors, cosines are accurate to 4e-3, and for 99 % of the pairs to 1e-3.
 """
 
 from __future__ import annotations
@@ -43,33 +42,33 @@ if TYPE_CHECKING:
 KERNEL_SIGMA = 30.0
 """Width of the kernel, in units of `shading_coordinates`."""
 _STRONG_CHROMA = 40.0
-"""Relative chroma above which a color counts as strong."""
+"""Chroma, in units of `shading_coordinates`, above which a color counts as strong."""
 _LEVELS = 7
 _LEVEL_POWER = 1.5
-"""Above 1, the lattice is denser among dark colors, whose coordinates change fast."""
+"""Exponent of the levels. Values above 1 make the lattice denser for dark colors, whose coordinates change fastest."""
 _OWN_SHARE = 0.2
-"""Weight of a color name's own color beside the mean of its shades; with less, pure blue would be nearer to purple."""
+"""Weight of a name's own color, with the rest for the mean of its shades. A smaller weight would move pure blue closer
+to purple than to blue."""
 _JITTER = 1e-10
 _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
-"""Words of the survey that are accepted in prompts, but not suggested."""
+"""Words of the survey that are accepted in prompts but not suggested in messages."""
 
 
 @dataclass(frozen=True)
 class ColorEncoder(LazyTextEncoder):
-    """Encoder that compares mean CIELAB colors with color names; formulas in the module docstring. Needs neither
-    weights nor a GPU."""
+    """Encoder that compares mean CIELAB colors with color names, without weights or a GPU; see the module docstring."""
 
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "colour", "sigma": KERNEL_SIGMA}
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.
+        """Return one unit vector per prompt, the normalized mean of the vectors of all colors that it names.
 
-        A name means every color of the survey whose name ends in it: "red" is also brick red and dull red.
+        A name stands for all colors of the survey whose names end in it: "red" includes brick red and dull red.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or one contains no color name.
+            ValueError: If `prompts` or a prompt is empty, or a prompt contains no color name.
         """
         check_prompts(prompts)
         rows = []
@@ -99,7 +98,7 @@ class ColorEncoder(LazyTextEncoder):
 
 @cache
 def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
-    """Return the unit mean of the vectors of all colors whose names end in a name; its own color counts a fifth."""
+    """Return the unit vector of a name, a weighted mean of its own color and of all colors whose names end in it."""
     shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
     family = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
     (row,) = _normalized(_OWN_SHARE * embed_colors(_names()[name][None]) + (1 - _OWN_SHARE) * family)
@@ -107,7 +106,7 @@ def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
 
 
 def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"]:
-    """Return phi of CIELAB colors (D65, L* in 0..100): unit rows."""
+    """Return the unit vectors phi of CIELAB colors (D65, L* in 0..100)."""
     from scipy.linalg import solve_triangular  # noqa: PLC0415 (as in `_names`)
 
     anchors, cholesky = _anchors()
@@ -116,7 +115,7 @@ def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"
 
 
 def shading_coordinates(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return x of CIELAB colors; see the formula in the module docstring.
+    """Return the coordinates x of CIELAB colors; see the formula in the module docstring.
 
     >>> shading_coordinates(np.array([[50.0, 0.0, 0.0], [50.0, 160.0, -120.0], [17.0, 80.0, -60.0]])).round(4)
     array([[  50. ,    0. ,    0. ],
@@ -134,7 +133,7 @@ def _normalized(rows: np.ndarray) -> np.ndarray:
 
 
 def find_color_names(prompt: str) -> list[str]:
-    """Return the color names in a prompt from left to right, each as long as possible; other words are ignored.
+    """Return the longest color names in a prompt, from left to right; other words are ignored.
 
     >>> find_color_names("dark red shoes on a grey-green floor")
     ['dark red', 'grey green']
@@ -143,20 +142,23 @@ def find_color_names(prompt: str) -> list[str]:
 
 
 def _words(text: str) -> list[str]:
-    """Return the words in lower case; the survey spells gray as "grey"."""
+    """Return the words of a text in lower case, with gray spelled "grey" as in the survey."""
     return re.findall(r"[a-z]+(?:'[a-z]+)?", text.lower().replace("gray", "grey"))
 
 
 @cache
 def xkcd_colors() -> dict[str, str]:
-    """Return "#rrggbb" by name, with the names as the XKCD color survey spells them."""
+    """Return the color "#rrggbb" of each name, in the spelling of the XKCD color survey."""
     return json.loads(Path(__file__).with_name("xkcd.json").read_text(encoding="utf8"))
 
 
 @cache
 def _names() -> dict[str, np.ndarray]:
-    """Return the CIELAB color by name. The survey lists eleven names twice, as "blue green" and "blue/green"; the
-    spelling without the slash wins."""
+    """Return the CIELAB color of each name.
+
+    The survey has eleven names in two spellings, such as "blue green" and "blue/green". The color of the spelling
+    without a slash is used.
+    """
     from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 
     colors = sorted(xkcd_colors().items(), key=lambda item: "/" in item[0], reverse=True)
@@ -167,7 +169,7 @@ def _names() -> dict[str, np.ndarray]:
 
 @cache
 def _name_pattern() -> re.Pattern[str]:
-    """Return the pattern of all names, the longest first; they consist of whole words."""
+    """Return a pattern that matches all names as whole words, and prefers longer names."""
     names = sorted(_names(), key=len, reverse=True)
     return re.compile(rf"(?<!\S)(?:{'|'.join(map(re.escape, names))})(?!\S)")
 
@@ -194,7 +196,7 @@ def _no_color_message(prompt: str) -> str:
     near = [name for name in near if _NOT_SUGGESTED.isdisjoint(name.split())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
-        f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD "
-        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip or imagenet for other "
-        "words (ns-normlift-weights lists their weights)"
+        f"prompt {truncate_text(prompt)!r} contains no color name; use a name of the XKCD color survey, such as "
+        f"{suggestions}. For other words, lift with --encoder open_clip or --encoder imagenet (ns-normlift-weights "
+        "lists their weights)"
     )

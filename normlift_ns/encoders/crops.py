@@ -1,9 +1,9 @@
-"""Networks that embed images and texts in a joint space, as encoders of masked square crops of regions.
+"""Encoders that embed masked square crops of regions with a joint image-text network.
 
-As in LangSplat, pixels outside of a region are filled, and the image is cropped to the bounding box of the region. The
-crop is padded with black to a centered square and resized bilinearly. LangSplat fills with black; LaGa and SFS fill
-with white (and also pad with black). LangSplat's boxes, which come from SAM, omit the last row and column of a mask;
-the boxes here include them.
+As in LangSplat, pixels outside a region are filled, and the image is cropped to the bounding box of the region. The
+crop is then padded with black to a centered square and resized bilinearly. LangSplat fills with black. LaGa and SFS
+fill with white, and also pad with black. LangSplat's boxes come from SAM and omit the last row and column of a mask;
+the boxes of this module include them.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from normlift_ns.encoders.text_files import check_prompts, check_template, promp
 from normlift_ns.options import CropFill
 
 _GPU_BATCH, _BATCH = 128, 8
-"""Crops or texts per batch on a GPU and elsewhere."""
+"""Number of crops or texts per batch, on a GPU and on a CPU."""
 
 
 class JointNetwork(Protocol):
-    """A network with its weights on a device. Embeddings are on the device and not normalized."""
+    """A joint image-text network with loaded weights. Its embeddings are on its device and not normalized."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the training images."""
+        """Height and width of the training images, in pixels."""
         ...
 
     @property
@@ -43,11 +43,15 @@ class JointNetwork(Protocol):
         ...
 
     def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
-        """Embed images, 0..255, of `size`, on the device."""
+        """Embed images of size `size` with values in 0..255, on the device of the network."""
         ...
 
     def patches(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
-        """Embed all patches, row by row, of images, 0..255, of a whole number of patches, on the device."""
+        """Embed all patches of images in row-major order.
+
+        Args:
+            pixels: Images with values in 0..255 and sides that are multiples of `patch_size`, on the device.
+        """
         ...
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
@@ -56,18 +60,18 @@ class JointNetwork(Protocol):
 
 
 class NetworkEncoder(ABC):
-    """An `Encoder` and `DenseEncoder` with a joint network: features of masked crops, or of patches.
+    """Base class of encoders (`DenseEncoder`) that embed masked crops or patches with a joint network.
 
-    The weights are loaded at their first use, in half precision on a GPU and in float32 elsewhere. Vectors are
-    normalized in float32. Subclasses are frozen dataclasses that describe and load a network.
+    Weights are loaded at first use, in half precision on a GPU and in float32 on a CPU. Vectors are normalized in
+    float32. Subclasses are frozen dataclasses that identify and load a network.
     """
 
     fill: CropFill
-    """Color of the pixels outside of a region."""
+    """Color of the pixels outside a region."""
     device: str
     """Device of the network; results are always on the CPU."""
     template: str
-    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
+    """Prompt template with the placeholder {}, or "ensemble" for the mean over open_clip's seven templates."""
 
     def __post_init__(self) -> None:
         check_template(self.template)
@@ -79,7 +83,7 @@ class NetworkEncoder(ABC):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Settings of the image features. Files are identified by their content, independent of their path."""
+        """Settings that change image features. Files are identified by their content, not by their path."""
         return self._identity
 
     @cached_property
@@ -95,30 +99,30 @@ class NetworkEncoder(ABC):
     @cached_property
     @abstractmethod
     def network(self) -> JointNetwork:
-        """The network with its weights, loaded at its first use; raises like `encode`."""
+        """The network with its weights, loaded at first use. Raises the same errors as `encode`."""
 
     @abstractmethod
     def _width(self) -> int:
         """Return the embedding dimension D."""
 
     def _prepare(self, prompt: str, text: str) -> str:
-        """Return a text in the form that the tokenizer expects; `text` is `prompt` in a template."""
+        """Return the form of `text` that the tokenizer expects. `text` is a template filled with `prompt`."""
         return text
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """Return one unit row per region; see `Encoder.encode`.
+        """Return one unit vector per region; see `Encoder.encode`.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the weights are damaged or of another architecture.
-            MemoryError: If not even one crop fits into the memory of the device.
+            ValueError: If the weights are damaged or belong to another architecture.
+            MemoryError: If the memory of the device is too small for a single crop.
         """
         return next(self.encode_each([(image, labels)]))
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        """Yield the features of several views; their crops share batches. Raises as `encode`."""
+        """Yield the features of several views, whose crops share batches. Raises the same errors as `encode`."""
         pending: dict[int, _PendingView] = {}
 
         def crop_ids() -> Iterator[list[tuple[int, int]]]:
@@ -140,13 +144,18 @@ class NetworkEncoder(ABC):
             yield torch.stack(rows) if len(rows) > 0 else torch.empty(0, self._width())
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """Return one unit row per patch; see `DenseEncoder.patches`."""
+        """Return one unit vector per patch; see `DenseEncoder.patches`."""
         height, width = self.network.patch_size
         pixels = resize_image(image.to(self.device), rows * height, columns * width)
         return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises like `encode`, and ValueError if `prompts` or a prompt is empty."""
+        """Return one unit vector per prompt.
+
+        Raises:
+            ValueError: If `prompts` or a prompt is empty.
+            FileNotFoundError, ValueError, MemoryError: For the same reasons as `encode`.
+        """
         check_prompts(prompts)
         templates = prompt_templates(self.template)
         texts = [self._prepare(prompt, template(prompt)) for prompt in prompts for template in templates]
@@ -175,7 +184,7 @@ def _batches(device: str) -> AdaptiveBatches:
 
 
 class _PendingView(NamedTuple):
-    """A view, on the device, with regions that wait for a batch."""
+    """A view on the device whose regions are not all encoded yet."""
 
     image: UInt8[Tensor, "h w 3"]
     labels: Int32[Tensor, "depth h w"]
@@ -183,7 +192,7 @@ class _PendingView(NamedTuple):
 
 
 def region_boxes(labels: Int32[Tensor, "depth h w"]) -> Int64[Tensor, "r 4"]:
-    """Return the first and last column and row of each region as inclusive boxes (x0, y0, x1, y1)."""
+    """Return the bounding box (x0, y0, x1, y1) of each region, in pixels and with inclusive ends."""
     depth, y, x = (labels >= 0).nonzero(as_tuple=True)
     region = labels[depth, y, x].long()
     count = int(region.max()) + 1 if len(region) > 0 else 0
@@ -200,12 +209,12 @@ def masked_crops(
     size: tuple[int, int],
     fill: CropFill,
 ) -> Float[Tensor, "b 3 size_y size_x"]:
-    """Return masked crops of regions, 0..255; see `encoders.crops`.
+    """Return masked crops of regions, with values in 0..255; see the module docstring.
 
     Args:
-        labels: A region consists of all pixels that have its id at any depth.
+        labels: Region ids. A region consists of all pixels that have its id at any depth.
         boxes: Boxes of these regions from `region_boxes`.
-        size: Height and width of the result.
+        size: Height and width of the crops, in pixels.
     """
     x0, y0, x1, y1 = boxes.T
     width, height = x1 - x0 + 1, y1 - y0 + 1
@@ -229,10 +238,10 @@ def masked_crops(
 def _bilinear_samples(
     side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Return the bilinear samples of each square along one axis.
+    """Return the positions and weights of bilinear interpolation of each square along one axis.
 
-    The result has one entry for each of the two pixels next to a sample. It holds the position in the image, the
-    weight, and whether the pixel is in the box rather than in the margin.
+    The result has two entries, for the pixels before and after each sample. An entry holds the positions in the image,
+    the weights, and True for pixels inside the box, False for pixels in the margin.
     """
     center = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
     center = center.clamp(min=0)

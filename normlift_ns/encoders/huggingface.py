@@ -1,4 +1,4 @@
-"""Model families, folders and names of Hugging Face networks, without torch."""
+"""Families, folders and hub names of Hugging Face networks. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
 def _canonicalize(text: str) -> str:
-    """Convert to lower case without punctuation, which SigLIP was trained on, like `SiglipTokenizer.canonicalize_text`.
+    """Convert a text to lower case without punctuation, like `SiglipTokenizer.canonicalize_text` of transformers.
 
     >>> _canonicalize("A red mug,  on the table!")
     'a red mug on the table'
@@ -30,27 +30,27 @@ def _canonicalize(text: str) -> str:
 
 @dataclass(frozen=True)
 class ModelFamily:
-    """Networks with the same training and preprocessing."""
+    """A family of networks with the same training and preprocessing."""
 
     name: str
     """Value of `--encoder`."""
     title: str
-    """Name in messages."""
+    """Name of the family in messages."""
     model_types: tuple[str, ...]
-    """Values of "model_type" in config.json. Fixed-resolution SigLIP 2 models have the architecture of SigLIP and use
-    its name."""
+    """Accepted values of "model_type" in config.json. Fixed-resolution SigLIP 2 models have the architecture of SigLIP,
+    and therefore its model type."""
     default_model: str
     """Hub name of the default model."""
     preprocess_text: Callable[[str], str]
-    """Prepares a text for the tokenizer."""
+    """Function that prepares a text for the tokenizer."""
     pad_token: str
-    """Token that pads texts to full length, if the tokenizer's configuration names none."""
+    """Padding token for folders whose tokenizer configuration does not set one."""
     tokenizer_names: tuple[str, ...]
-    """Substrings of the class names of its tokenizers."""
+    """Substrings of the class names of the tokenizers."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Mean of pixels in 0..1, if the configuration names none."""
+    """Mean of pixels in 0..1 for folders whose configuration does not set it."""
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Standard deviation of pixels in 0..1, if the configuration names none."""
+    """Standard deviation of pixels in 0..1 for folders whose configuration does not set it."""
 
 
 MODEL_FAMILIES = {
@@ -64,7 +64,7 @@ MODEL_FAMILIES = {
             "SigLIP 2",
             ("siglip", "siglip2"),
             "google/siglip2-base-patch16-224",
-            str.lower,  # as in its training; not every tokenizer that is published with it does so
+            str.lower,  # as in training; not all published tokenizers convert to lower case
             "<pad>",
             ("Siglip2", "Gemma"),
         ),
@@ -73,7 +73,7 @@ MODEL_FAMILIES = {
             "MetaCLIP 2",
             ("metaclip_2",),
             "facebook/metaclip-2-worldwide-huge-quickgelu",
-            str,  # unchanged, as it expects them
+            str,  # texts stay unchanged
             "<pad>",
             ("XLMRoberta",),
             (0.48145466, 0.4578275, 0.40821073),
@@ -81,11 +81,11 @@ MODEL_FAMILIES = {
         ),
     )
 }
-"""Families by name."""
+"""Families by `--encoder` name."""
 
 
 def family_of_tokenizer(name: str) -> ModelFamily | None:
-    """Return the family of a tokenizer class; None if it may belong to any family.
+    """Return the family that the name of a tokenizer class identifies, or None if it identifies none.
 
     >>> family_of_tokenizer("GemmaTokenizerFast").title, family_of_tokenizer("SiglipTokenizer").title
     ('SigLIP 2', 'SigLIP')
@@ -98,14 +98,14 @@ def family_of_tokenizer(name: str) -> ModelFamily | None:
 
 # Model folders of transformers: config.json, safetensors weights, tokenizer.json and image preprocessing.
 #
-# Files are untrusted until checked. Of a configuration, only the sizes of the network are used, each within bounds,
-# because configurations may name code, kernels to download and quantized formats. Needs no torch.
+# Files are not trusted until they are checked. Configurations can refer to code, downloadable kernels and quantized
+# formats. This module therefore uses only their network sizes, and limits each of them. It does not import torch.
 
 
 WEIGHTS_FILE, WEIGHTS_INDEX_FILE, TOKENIZER_FILE = "model.safetensors", "model.safetensors.index.json", "tokenizer.json"
 _TOKENIZER_CONFIG, _SPECIAL_TOKENS = "tokenizer_config.json", "special_tokens_map.json"
 _PREPROCESSING_FILES = ("preprocessor_config.json", "processor_config.json")
-"""The second file holds the contents of the first under "image_processor", among other entries."""
+"""Files with preprocessing settings. The second file has the content of the first under "image_processor"."""
 METADATA_FILES = (
     CONFIG_FILE,
     WEIGHTS_INDEX_FILE,
@@ -120,21 +120,21 @@ _MAX_SIZES = {
     "num_attention_heads": 256, "max_position_embeddings": 2**12, "projection_size": 2**14, "projection_dim": 2**14,
     "image_size": 2**12, "patch_size": 2**8, "num_patches": 2**16, "eos_token_id": 2**21, "num_channels": 3,
 }  # fmt: skip
-"""Configuration entries that are used, and their largest accepted values."""
+"""Configuration entries in use, with their largest accepted values."""
 _ACTIVATIONS = ("gelu", "gelu_fast", "gelu_new", "gelu_pytorch_tanh", "quick_gelu", "relu", "silu")
 
 
 @dataclass(frozen=True)
 class PixelNormalization:
-    """Normalization of pixels, 0..255, for the network: (factor x - mean) / std."""
+    """Normalization of pixel values x in 0..255 for the network: (rescale_factor x - mean) / std."""
 
     rescale_factor: float
     mean: tuple[float, ...]
     std: tuple[float, ...]
     image_size: int | None
-    """Height and width of input images; None: unknown, or not equal."""
+    """Side of square input images in pixels, or None if it is unknown or images are not square."""
     max_patches: int | None
-    """Largest number of patches of an image, if images keep their aspect ratio; else None."""
+    """Largest number of patches per image if images keep their aspect ratio, else None."""
 
 
 @dataclass(frozen=True)
@@ -144,41 +144,40 @@ class TokenPadding:
     pad_token: str
     """Padding token."""
     padding_side: str
-    """left or right."""
+    """Side of the padding, "left" or "right"."""
     attention_mask: bool
     """True if an attention mask hides padding from the network; SigLIP was trained without one."""
 
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """The checked contents of a model folder."""
+    """Checked contents of a model folder."""
 
     path: Path
     model_type: str
     text: dict[str, Any]
     vision: dict[str, Any]
     sizes: dict[str, Any]
-    """Network sizes, by their names in the configurations of transformers: of the text part, the vision part, and the
-    whole network."""
+    """Sizes of the whole network. The keys, also of `text` and `vision`, are those of transformers configurations."""
     pixels: PixelNormalization
     tokens: TokenPadding
     weights: tuple[Path, ...]
-    """safetensors files."""
+    """Weight files in the safetensors format."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that change the embeddings, in a fixed order."""
+        """All files that affect the embeddings, in a fixed order."""
         small = (self.path / name for name in METADATA_FILES)
         return (*(file for file in small if file.is_file()), *self.weights)
 
 
 def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
-    """Read and check a model folder; weights and vocabulary are not read.
+    """Read and check a model folder, without reading its weights and vocabulary.
 
     Raises:
-        InputError: If the folder is of another architecture, incomplete or damaged.
+        InputError: If the folder is incomplete, damaged or of another architecture.
     """
-    remedy = f"give --encoder-model the folder of a {family.title} network, or a name such as {family.default_model}"
+    remedy = f"set --encoder-model to a folder of a {family.title} network or to a name such as {family.default_model}"
     try:
         return _read(path, family)
     except InputError as error:
@@ -186,7 +185,7 @@ def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
 
 
 def _read(path: Path, family: ModelFamily) -> ModelFolder:
-    """Read a model folder; error messages do not name it."""
+    """Read a model folder. Error messages do not include its path."""
     config = read_json(path / CONFIG_FILE)
     kind = config.get("model_type")
     if kind not in family.model_types:
@@ -194,20 +193,20 @@ def _read(path: Path, family: ModelFamily) -> ModelFolder:
     text, vision = (_sizes(config.get(f"{part}_config"), f"{part}_config") for part in ("text", "vision"))
     whole = {key: value for key, value in _sizes(config, CONFIG_FILE).items() if key == "projection_dim"}
     if vision.pop("vision_use_head", True) is not True:
-        raise InputError(f"the network has no pooling head according to {CONFIG_FILE}, and thus no joint space")
+        raise InputError(f"according to {CONFIG_FILE}, the network has no pooling head and therefore no joint space")
     tokens = _tokens(path, family)
     return ModelFolder(path, kind, text, vision, whole, _pixels(path, family, kind), tokens, _weights(path))
 
 
 def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFamily) -> str:
-    """Return the message for a network of another family."""
+    """Return the error message for a network of another family."""
     expected = " or ".join(map(repr, family.model_types))
     kind = config.get("model_type")
-    return f"{origin} has the architecture {kind!r:.60}, expected that of {family.title}, {expected}"
+    return f"{origin} has the architecture {kind!r:.60}, expected a {family.title} network ({expected})"
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:
-    """Return the checked sizes of a configuration that are present and not null."""
+    """Check and return the sizes that a configuration contains."""
     if values is None:
         return {}
     if not isinstance(values, Mapping):
@@ -218,7 +217,7 @@ def _sizes(values: object, where: str) -> dict[str, Any]:
         if value is None:
             continue
         if type(value) is not int or not (0 if key.endswith("_id") else 1) <= value <= maximum:
-            raise InputError(f"{key} of {where} is {value!r:.40}, expected an integer, at most {maximum:,}")
+            raise InputError(f"{key} of {where} is {value!r:.40}, expected an integer up to {maximum:,}")
         sizes[key] = value
     if (activation := values.get("hidden_act")) is not None:
         if activation not in _ACTIVATIONS:
@@ -239,7 +238,7 @@ def _number(value: object, name: str, minimum: float, maximum: float) -> float:
 
 
 def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
-    """Read the normalization of pixels."""
+    """Read the pixel normalization of a model folder."""
     names = [name for name in _PREPROCESSING_FILES if (path / name).is_file()]
     if len(names) == 0:
         raise InputError(f"{_PREPROCESSING_FILES[0]}, which describes image preprocessing, is missing")
@@ -258,14 +257,14 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
         return PixelNormalization(factor, mean, std, _side(settings), None)
     patches = settings.get("max_num_patches", 256)
     if type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]:
-        raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer")
+        raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected a positive integer")
     return PixelNormalization(factor, mean, std, None, patches)
 
 
 def _channels(
     settings: Mapping[str, Any], key: str, default: tuple[float, ...], minimum: float, file: str
 ) -> tuple[float, ...]:
-    """Return one number per color channel."""
+    """Return a preprocessing setting with one number per color channel."""
     values = settings.get(key, list(default))
     if not isinstance(values, list) or len(values) != 3:
         raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
@@ -273,7 +272,7 @@ def _channels(
 
 
 def _side(settings: Mapping[str, Any]) -> int | None:
-    """Return the side of square input images; None if unknown or not square."""
+    """Return the side of square input images in pixels, or None if it is unknown or images are not square."""
     cropped = settings.get("do_center_crop", "crop_size" in settings) is True
     size = settings.get("crop_size" if cropped else "size")
     if isinstance(size, Mapping):
@@ -282,9 +281,9 @@ def _side(settings: Mapping[str, Any]) -> int | None:
 
 
 def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
-    """Read the padding of texts; raise InputError if the tokenizer is missing or of another family."""
+    """Read the padding of texts; raise InputError if the tokenizer is missing or belongs to another family."""
     if not (path / TOKENIZER_FILE).is_file():
-        older = "; there is only an older spiece.model" if (path / "spiece.model").is_file() else ""
+        older = "; spiece.model, an older format, is not supported" if (path / "spiece.model").is_file() else ""
         raise InputError(f"{TOKENIZER_FILE}, which encodes texts, is missing{older}")
     files = [path / name for name in (_SPECIAL_TOKENS, _TOKENIZER_CONFIG) if (path / name).is_file()]
     settings = {key: value for file in files for key, value in read_json(file).items()}
@@ -292,24 +291,24 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
     owner = family_of_tokenizer(name) if isinstance(name, str) else None
     if owner is not None and owner != family:
         raise InputError(
-            f"its tokenizer {truncate_text(str(name))} belongs to {owner.title}, not {family.title}: use "
+            f"its tokenizer {truncate_text(str(name))} belongs to {owner.title}, not to {family.title}; use "
             f"--encoder {owner.name}"
         )
     pad = settings.get("pad_token") or family.pad_token
     pad = pad.get("content") if isinstance(pad, Mapping) else pad
     side = settings.get("padding_side", "right")
     if not isinstance(pad, str) or side not in ("left", "right"):
-        raise InputError(f"{_TOKENIZER_CONFIG} has the unknown pad_token {pad!r:.40} or padding_side {side!r:.40}")
+        raise InputError(f"{_TOKENIZER_CONFIG} has an invalid pad_token ({pad!r:.40}) or padding_side ({side!r:.40})")
     inputs = settings.get("model_input_names", ["input_ids"])
     return TokenPadding(pad, side, isinstance(inputs, list) and "attention_mask" in inputs)
 
 
 def _weights(path: Path) -> tuple[Path, ...]:
-    """Return the weight files: one, or the shards that the index names."""
+    """Return the weight files, either a single file or the shards that the index lists."""
     if (path / WEIGHTS_FILE).is_file():
         return (path / WEIGHTS_FILE,)
     if not (path / WEIGHTS_INDEX_FILE).is_file():
-        pickled = "; pickles such as pytorch_model.bin are not read" if any(path.glob("*.bin")) else ""
+        pickled = "; pickle files such as pytorch_model.bin are not supported" if any(path.glob("*.bin")) else ""
         raise InputError(f"{WEIGHTS_FILE} is missing{pickled}")
     shards = read_json(path / WEIGHTS_INDEX_FILE).get("weight_map")
     names = sorted({*shards.values()} if isinstance(shards, Mapping) and all(map(_is_shard, shards.values())) else ())
@@ -319,45 +318,47 @@ def _weights(path: Path) -> tuple[Path, ...]:
         )
     missing = [name for name in names if not (path / name).is_file()]
     if len(missing) > 0:
-        raise InputError(f"{missing[0]}, which {WEIGHTS_INDEX_FILE} names, is missing")
+        raise InputError(f"{missing[0]}, which {WEIGHTS_INDEX_FILE} lists, is missing")
     return tuple(path / name for name in names)
 
 
 def _is_shard(name: object) -> bool:
-    """Return whether a name is that of a safetensors file in the same folder."""
+    """Return whether a value is the name of a safetensors file, without a folder."""
     return isinstance(name, str) and name.endswith(".safetensors") and name == os.path.basename(name)
 
 
-# Location of a network: a local folder, the Hugging Face hub cache, or a download. Needs no torch.
+# Location of networks: local folders, the Hugging Face hub cache, and downloads.
 
 
 _MIN_VERSIONS = {"torch": "2.6", "transformers": "4.56"}
 
 
 def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
-    """Return the hub name or folder that the options select. The default of `--encoder-model` is an OpenCLIP model and
-    stands for the family's own default."""
+    """Return the hub name or folder of the selected network.
+
+    The default of `--encoder-model` is an OpenCLIP model, so it selects the default network of the family instead.
+    """
     return family.default_model if options.encoder_model == DEFAULT_MODEL else options.encoder_model
 
 
 def check_transformers_version(family: ModelFamily) -> None:
-    """Raise InputError if installed packages are missing or too old."""
-    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "--encoder open_clip does not")
+    """Raise InputError if torch or transformers is missing or too old."""
+    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "use --encoder open_clip")
 
 
 def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
     """Check the options as far as possible without torch.
 
     Raises:
-        InputError: If packages are missing or too old, an option belongs to another encoder, or the folder has another
-            architecture.
+        InputError: If packages are missing or too old, an option applies only to another encoder, or the folder has
+            another architecture.
         FileNotFoundError: If the folder does not exist, or the network cannot be downloaded.
     """
     check_transformers_version(family)
     if options.encoder_pretrained != DEFAULT_PRETRAINED:
         raise InputError(
-            f"--encoder-pretrained {options.encoder_pretrained} is for --encoder open_clip; give the folder of a "
-            f"{family.title} network with --encoder-model"
+            f"--encoder-pretrained {options.encoder_pretrained} applies only to --encoder open_clip; remove it, and "
+            f"give the folder of a {family.title} network with --encoder-model"
         )
     model = resolve_model_name(options, family)
     check_model_name(model, family)
@@ -373,7 +374,7 @@ def check_model_name(model: str, family: ModelFamily) -> None:
     """Check that a name is a folder or can be a hub name.
 
     Raises:
-        InputError, FileNotFoundError: If it cannot.
+        InputError, FileNotFoundError: If it is neither.
     """
     example = (
         f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default_model}"
@@ -383,18 +384,17 @@ def check_model_name(model: str, family: ModelFamily) -> None:
 
 
 def find_local_model(model: str) -> Path | None:
-    """Return the folder of a network on this machine, which may be in the hub cache; None if it is missing or
-    incomplete."""
+    """Return the local folder of a network, possibly in the hub cache, or None if it is missing or incomplete."""
     files = (WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
     return Path(model).resolve() if os.path.isdir(model) else weights.find_cached_model(model, files)
 
 
 def fetch_model(model: str, family: ModelFamily) -> Path:
-    """Return the folder of a network. If necessary, download it: only JSON and safetensors files.
+    """Return the folder of a network, and download its JSON and safetensors files if necessary.
 
     Raises:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
-        InputError: If it has another architecture.
+        InputError: If the network has another architecture.
     """
     local = find_local_model(model)
     if local is not None:
@@ -402,7 +402,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 
     def choose_files(config: Mapping[str, Any]) -> Sequence[str]:
         if config.get("model_type") not in family.model_types:
-            remedy = f"give --encoder-model a name such as {family.default_model}"
+            remedy = f"set --encoder-model to a name such as {family.default_model}"
             raise InputError(f"{_other_architecture(model, config, family)}; {remedy}")
         return [*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]
 
@@ -413,7 +413,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
     return weights.third_party_errors(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded",
-        f"{weights.CONNECT_ONCE}, give a folder with --encoder-model, or use --encoder imagenet, whose weights come "
-        "from the Python index, or --encoder color, which needs none",
+        f"{weights.CONNECT_ONCE}, or give a folder with --encoder-model. Alternatives are --encoder imagenet (weights "
+        "from the Python package index) and --encoder color (no weights)",
         FileNotFoundError,
     )

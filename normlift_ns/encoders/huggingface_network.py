@@ -1,13 +1,12 @@
-"""Hugging Face networks as encoders of images and prompts.
+"""Encoder of images and prompts with Hugging Face networks.
 
-SigLIP pools the tokens of all patches by attention with one learned query. As MaskCLIP (Zhou, Loy and Dai, ECCV 2022)
-does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. After the final
-norm, every token passes through the pooling's value and output projections as if the query attended to it alone. The
-rest of the head follows.
+SigLIP pools the tokens of all patches by attention with one learned query. Patch features use only the value path of
+this pooling, as MaskCLIP (Zhou, Loy and Dai, ECCV 2022) does for the attention pooling of CLIP's ResNets. After the
+final norm, each token passes through the value and output projections of the pooling and the rest of the head.
 
-MetaCLIP 2 has CLIP's class token instead. Of the last layer, only the first norm and the value and output projections
-are used (MaskCLIP's rule for vision transformers). The final norm and the projection into the joint space follow.
-Position embeddings are interpolated as in transformers.
+MetaCLIP 2 has a class token, like CLIP. As in MaskCLIP for vision transformers, each token passes only through the
+first norm and the value and output projections of the last layer. The final norm and the projection into the joint
+space follow. Position embeddings are interpolated as in transformers.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ _CLASSES = {"siglip": "Siglip", "siglip2": "Siglip2", "metaclip_2": "MetaClip2"}
 
 @dataclass
 class HuggingFaceNetwork:
-    """A network in half precision on a GPU, in float32 elsewhere. If values overflow in half precision, the network
-    switches to float32."""
+    """A network in half precision on a GPU, or in float32 on a CPU. It switches to float32 if half precision
+    overflows."""
 
     model: Any
     tokenizer: Any
@@ -50,7 +49,7 @@ class HuggingFaceNetwork:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the training images."""
+        """Height and width of the training images, in pixels."""
         config, count = self.model.config.vision_config, self.folder.pixels.max_patches
         side = config.image_size if count is None else math.isqrt(count) * config.patch_size
         return side, side
@@ -72,30 +71,30 @@ class HuggingFaceNetwork:
         return self.folder.model_type == "metaclip_2"
 
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Return pixels, 0..255, on the device, normalized for the model."""
+        """Normalize pixels with values in 0..255 for the model, on its device."""
         normalized = (pixels.to(self.mean.dtype) * self.folder.pixels.rescale_factor - self.mean) / self.std
         return normalized.to(self.model.logit_scale.dtype)
 
     def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
-        """Return unnormalized embeddings of images, 0..255, of `size`, on the device."""
+        """Return unnormalized embeddings of images of size `size` with values in 0..255, on the device."""
         return self._finite(lambda: self._pooled(pixels))
 
     def patches(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
-        """Return unnormalized embeddings of all patches, row by row; see the module docstring.
+        """Return unnormalized embeddings of all patches in row-major order; see the module docstring.
 
         Args:
-            pixels: Images, 0..255, of a whole number of patches, on the device.
+            pixels: Images with values in 0..255 and sides that are multiples of the patch size, on the device.
         """
         return self._finite(lambda: self._value_path(pixels))
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
-        """Return unnormalized embeddings of texts that the family has preprocessed."""
+        """Return unnormalized embeddings of texts, which `ModelFamily.preprocess_text` has prepared."""
         encoded = self.tokenizer.encode_batch(list(texts))
         vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
         if largest >= vocab_size:
             raise InputError(
-                f"{huggingface.TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has "
-                f"{vocab_size} tokens"
+                f"{huggingface.TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network has only "
+                f"{vocab_size} tokens; download the folder again"
             )
         inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
         if self.folder.tokens.attention_mask:
@@ -134,7 +133,7 @@ class HuggingFaceNetwork:
         return mixed + head.mlp(head.layernorm(mixed))
 
     def _input_of(self, module: Any, pixels: Tensor) -> Tensor:
-        """Return the input of a module while the network processes images."""
+        """Run the network on images, and return the input of one of its modules."""
         recorded: list[Tensor] = []
         hook = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0]))
         try:
@@ -145,7 +144,7 @@ class HuggingFaceNetwork:
 
     @torch.no_grad()
     def _finite(self, compute: Callable[[], Tensor]) -> Tensor:
-        """Compute embeddings, in float32 if half precision overflows; raise InputError if they are not finite."""
+        """Compute embeddings, in float32 if half precision overflows; raise InputError if any are not finite."""
         rows = compute()
         if rows.dtype == torch.float16 and not bool(rows.isfinite().all()):
             self.model.float()
@@ -158,7 +157,7 @@ class HuggingFaceNetwork:
 
 
 def _pooled_output(output: Any) -> Tensor:
-    """Return the embeddings: transformers 4 returns them directly, transformers 5 inside an output object."""
+    """Return the embeddings, which transformers 4 returns directly and transformers 5 inside an output object."""
     return output if isinstance(output, Tensor) else output.pooler_output
 
 
@@ -168,12 +167,11 @@ def load_huggingface_network(
     """Load the network of a model folder.
 
     Raises:
-        InputError: If the folder is damaged or does not match its configuration, or transformers does not know the
+        InputError: If the folder is damaged or does not match its configuration, or transformers does not support the
             network.
     """
     remedy = (
-        f"give another folder with --encoder-model, or a name such as {family.default_model}; or use "
-        "--encoder open_clip"
+        f"set --encoder-model to another folder or to a name such as {family.default_model}, or use --encoder open_clip"
     )
     with third_party_errors(f"{folder.path} is damaged or not a {family.title} network", remedy):
         model = _build_model(folder)
@@ -204,16 +202,16 @@ def _build_model(folder: huggingface.ModelFolder) -> Any:
     state = {name: value for name, value in state.items() if not name.endswith(".position_ids")}
     integers = [name for name, value in state.items() if not value.is_floating_point()]
     if len(integers) > 0:
-        raise InputError(f"the weight {integers[0]} is of type {state[integers[0]].dtype}, expected floats")
+        raise InputError(f"the weight {integers[0]} has type {state[integers[0]].dtype}, expected floats")
     model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
-    for name, buffer in [*model.named_buffers()]:  # position_ids, which weight files do not contain
+    for name, buffer in [*model.named_buffers()]:  # position_ids, which are not in weight files
         owner = model.get_submodule(name.rpartition(".")[0])
         setattr(owner, name.rpartition(".")[2], torch.arange(buffer.shape[-1])[None])
     return model
 
 
 def _load_tokenizer(folder: huggingface.ModelFolder, config: Any) -> Any:
-    """Load the tokenizer; it pads texts to the length used in training, and truncates longer ones."""
+    """Load the tokenizer, and set it to pad or truncate texts to the length used in training."""
     tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / huggingface.TOKENIZER_FILE))
     length, tokens = cast(int, config.max_position_embeddings), folder.tokens
     pad_id = tokenizer.token_to_id(tokens.pad_token)
@@ -226,16 +224,16 @@ def _load_tokenizer(folder: huggingface.ModelFolder, config: Any) -> Any:
 
 @dataclass(frozen=True)
 class HuggingFaceEncoder(NetworkEncoder):
-    """SigLIP, SigLIP 2 or MetaCLIP 2 features; see `NetworkEncoder`.
+    """An encoder with a SigLIP, SigLIP 2 or MetaCLIP 2 network; see `NetworkEncoder`.
 
     Raises:
-        ValueError: If the model is neither a folder nor a hub name, or the template has no placeholder for the text.
+        ValueError: If the model is neither a folder nor a hub name, or the template has no placeholder.
         FileNotFoundError: If the folder does not exist.
     """
 
     family: huggingface.ModelFamily
     model: str
-    """Folder, or name on the hub."""
+    """Folder, or name on the Hugging Face hub."""
     fill: CropFill = "black"
     device: str = "cpu"
     template: str = "{}"
@@ -245,8 +243,7 @@ class HuggingFaceEncoder(NetworkEncoder):
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
-        """Settings of the image features. The network is identified by the content of its files, which are downloaded
-        if missing."""
+        """Settings that change image features. Files are identified by their content, and downloaded if missing."""
         return {"kind": self.family.name, "weights": file_digest(*self._folder.files), "fill": self.fill}
 
     @cached_property
@@ -260,7 +257,8 @@ class HuggingFaceEncoder(NetworkEncoder):
         text = self.family.preprocess_text(text)
         if not text.strip():
             raise InputError(
-                f"text {prompt!r} has no letters or digits, and {self.family.title} ignores everything else; use words"
+                f"prompt {prompt!r} has no letters or digits, and {self.family.title} ignores all other characters; "
+                "use words"
             )
         return text
 

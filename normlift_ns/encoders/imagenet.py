@@ -1,9 +1,9 @@
-"""Words for the 1,000 classes of ImageNet: names, synonyms, hypernyms and the last words of names.
+"""Vocabulary of the 1,000 classes of ImageNet, with names, synonyms, hypernyms and the last words of names.
 
-`imagenet_words.json` has the names of every class and the hypernyms above them, from WordNet 3.0;
-research/imagenet_words.py makes it. A name, such as "red fox", means its class, or several classes with that name. A
-hypernym, such as "dog" or "furniture", means all classes below it. The last word of names, such as "panda", means the
-classes with these names, unless it is a name or a hypernym itself: "dog" is not a hot dog.
+`imagenet_words.json` has the names and hypernyms of all classes from WordNet 3.0. research/imagenet_words.py writes it.
+A name, such as "red fox", stands for all classes with that name. A hypernym, such as "dog" or "furniture", stands for
+all classes below it. The last word of a name, such as "panda", stands for all classes whose names end in it, unless it
+is itself a name or a hypernym. For example, "dog" does not include hot dog.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from normlift_ns.errors import InputError, truncate_text
 
 _ENDINGS = (("ches", "ch"), ("shes", "sh"), ("ses", "s"), ("xes", "x"), ("zes", "z"), ("ies", "y"), ("men", "man"),
             ("s", ""))  # fmt: skip
-"""Endings of plurals and of their singulars, as in WordNet."""
+"""Plural endings and the singular endings that replace them, as in WordNet."""
 _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|that|which)\b.*")
-"""End of a phrase, after the noun that it is about."""
+"""Part of a phrase that follows its main noun."""
 
 
 def find_classes(prompt: str) -> list[int]:
     """Return the classes that a prompt names, in ascending order.
 
-    The longest known words at the end of the prompt count, so that articles and adjectives are ignored, and so is what
-    follows a preposition.
+    The longest known phrase at the end of the prompt counts. Articles, adjectives and everything after a preposition
+    are ignored.
 
     >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
     ([277], [277, 278, 279, 280], [968])
 
     Raises:
-        InputError: If it names none.
+        InputError: If the prompt names no class.
     """
     _, word = _find_words(prompt)
     if word is not None:
@@ -45,13 +45,13 @@ def find_classes(prompt: str) -> list[int]:
     near += [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
     raise InputError(
-        f"text {truncate_text(prompt)!r} names none of the 1,000 classes of ImageNet, nor a group of them; words "
-        f"spelled like it are {suggestions}: use one that means it, or lift with --encoder open_clip for other words"
+        f"prompt {truncate_text(prompt)!r} is not the name of an ImageNet class or of a group of classes. Words with a "
+        f"similar spelling are {suggestions}; use one of them, or lift with --encoder open_clip for other words"
     )
 
 
 def known_words(prompt: str) -> str:
-    """Return the words of a prompt that count, see `find_classes`; "" if it names no class.
+    """Return the words of a prompt that `find_classes` uses, or "" if the prompt names no class.
 
     >>> known_words("A red fox"), known_words("blue fox that sleeps")
     ('red fox', 'fox')
@@ -60,7 +60,7 @@ def known_words(prompt: str) -> str:
 
 
 def _find_words(prompt: str) -> tuple[str, str | None]:
-    """Return the words of a prompt that count, and the word of the vocabulary that they are; "" and None: none."""
+    """Return the words of a prompt that count and the vocabulary entry that they match, or "" and None."""
     text = _normalized(prompt)
     head = _AFTER_HEAD.sub("", text).split()
     for phrase in (text, *(" ".join(head[start:]) for start in range(len(head)))):
@@ -71,7 +71,7 @@ def _find_words(prompt: str) -> tuple[str, str | None]:
 
 
 def _normalized(text: str) -> str:
-    """Return the words in lower case, without hyphens and other signs between them."""
+    """Return the words of a text in lower case, separated by spaces instead of hyphens and other signs."""
     return " ".join(re.findall(r"[^\W_]+(?:['.][^\W_]+)*", text.lower()))
 
 
@@ -91,7 +91,7 @@ def _table() -> dict[str, Any]:
 
 @cache
 def _vocabulary() -> dict[str, tuple[int, ...]]:
-    """Return the classes of every word, normalized."""
+    """Return the classes of each normalized word."""
     known: dict[str, set[int]] = {}
     heads: dict[str, set[int]] = {}
     for number, names in enumerate(_table()["classes"].values()):

@@ -1,13 +1,13 @@
-"""EfficientNet-Lite2 as an encoder: its dense features inside regions, and its class vectors as texts.
+"""Encoder based on EfficientNet-Lite2, with dense features for regions and class vectors for prompts.
 
-The network is a classifier: it averages 1,280 feature maps over the image and multiplies the mean with one vector per
-class. Here the features are normalized and averaged over a region instead, so that the cosine of the mean with a class
-vector says how much the region looks like the class, with every pixel counted alike. One feature covers 32 pixels; the
-image is therefore encoded at twice its size.
+The classifier averages 1,280 feature maps over an image and multiplies the mean by one vector per class. The encoder
+normalizes the features and averages them over a region, so that all pixels count equally. The cosine of this mean and a
+class vector measures how much the region looks like the class. Features are 32 pixels apart, so the image is encoded at
+twice its size.
 
-Convolutions are padded on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image of 32 m + 1
-rows has m + 1 features, the first and last on its first and last row. TensorFlow, which trained the network, pads more
-on one side; this shifts the features by three pixels and changes nothing else away from the border.
+Convolutions are padded equally on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image with
+32 m + 1 rows has m + 1 rows of features, from its first to its last row. TensorFlow, which was used for training, pads
+more on one side. Away from the border, the only effect is a shift of the features by three pixels.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from normlift_ns.encoders.text_files import check_prompts
 from normlift_ns.segmentation.regions import resample_nearest
 
 WIDTH, CLASSES = 1280, 1000
-"""Channels of a feature, and number of classes."""
+"""Number of feature channels, and number of classes."""
 _STAGES = ((1, 3, 1, 1, 16), (3, 3, 2, 6, 24), (3, 5, 2, 6, 48), (4, 3, 2, 6, 88), (4, 5, 1, 6, 120), (5, 5, 2, 6, 208),
            (1, 3, 1, 6, 352))  # fmt: skip
 """Blocks, kernel size, stride of the first block, expansion and channels of each stage of EfficientNet-Lite2."""
 _STEM = 32
 _LAYERS = (("conv_stem", "bn0"), ("expand_conv", "bn0"), ("depthwise_conv", "bn1"), ("project_conv", "bn2"),
            ("conv_head", "bn1"))  # fmt: skip
-"""Convolutions and the normalizations that follow them."""
+"""Names of convolutions and of the batch normalizations that follow them."""
 _EPSILON = 1e-3
 _STRIDE = 32
-"""Pixels per feature."""
+"""Distance between features, in pixels."""
 _SCALE, _MAX_SIDE = 2.0, 2048
-"""Enlargement of images, and their largest side after it."""
+"""Scale factor of images, and their largest side after scaling, in pixels."""
 
 
 def _convolution(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Conv2d:
@@ -57,7 +57,7 @@ def _norm(channels: int) -> nn.BatchNorm2d:
 
 
 class _Block(nn.Module):
-    """Inverted residual: expansion, depthwise convolution, projection."""
+    """An inverted residual block with an expansion, a depthwise convolution and a projection."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ class _Block(nn.Module):
 
 
 class EfficientNetLite2(nn.Module):
-    """The network of Tan and Le without squeeze and excitation, with ReLU6, as published by TensorFlow."""
+    """EfficientNet of Tan and Le in TensorFlow's Lite2 variant, with ReLU6 and without squeeze-and-excitation."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,15 +91,15 @@ class EfficientNetLite2(nn.Module):
         self.fc = nn.Linear(WIDTH, CLASSES)
 
     def forward(self, pixels: Float[Tensor, "b 3 y x"]) -> Float[Tensor, "b 1280 rows columns"]:
-        """Return the features of images, 0..255."""
+        """Return the features of images with values in 0..255."""
         x = relu6(self.bn0(self.conv_stem((pixels - 127) / 128)))
         return relu6(self.bn1(self.conv_head(self.blocks(x))))
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Return the network with the weights in a file of PyTorch, whose names begin with underscores.
+    """Load the network from the content of a PyTorch weight file, whose names begin with underscores.
 
-    Normalizations become part of the convolutions before them, which halves the time on a CPU.
+    Batch normalizations are fused into the preceding convolutions, which halves the time on a CPU.
     """
     state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     with torch.device("meta"):
@@ -117,10 +117,10 @@ def load_network(content: bytes, device: str) -> EfficientNetLite2:
 
 @dataclass(frozen=True)
 class ImageNetEncoder:
-    """An `Encoder` and `DenseEncoder` with EfficientNet-Lite2; formulas in the module docstring.
+    """A `DenseEncoder` based on EfficientNet-Lite2; see the module docstring.
 
-    The weights are loaded at their first use. A region whose features are all zeros, as ReLU6 may leave them, has a row
-    of zeros, which `RegionFeatures` treats as unlabeled.
+    Weights are loaded at first use. ReLU6 can set all features of a region to zero. `RegionFeatures` then treats the
+    region as unlabeled.
     """
 
     device: str = "cpu"
@@ -135,7 +135,7 @@ class ImageNetEncoder:
 
     @cached_property
     def network(self) -> EfficientNetLite2:
-        """The network with its weights; raises as `PackageFile.read`."""
+        """The network with its weights. Raises the same errors as `PackageFile.read`."""
         return load_network(IMAGENET.read(), self.device)
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
@@ -153,13 +153,13 @@ class ImageNetEncoder:
         return self.encode(image, torch.from_numpy(resample_nearest(grid, *image.shape[:2])))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt: the normalized sum of the unit vectors of all classes that it names.
+        """Return one unit vector per prompt, the normalized sum of the unit vectors of all classes that it names.
 
-        A sum weighs all kinds of a thing alike, and what tells them apart cancels out. The largest of their cosines
-        would find one kind better, but no vector has it as its cosine, and a query needs a vector.
+        The sum weights all these classes equally. The maximum of their cosines would detect a single class better, but
+        a query needs one vector.
 
         Raises:
-            InputError: If `prompts` or a prompt is empty, or one names no class.
+            InputError: If `prompts` or a prompt is empty, or a prompt names no class.
             FileNotFoundError: If the weights are not on this machine.
         """
         check_prompts(prompts)
@@ -180,10 +180,10 @@ class ImageNetEncoder:
 
 
 def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-    """Return the mean feature of every region, normalized, on the CPU; zeros if there is nothing to normalize.
+    """Return the normalized mean feature of each region, on the CPU, or a zero row if the mean is zero.
 
-    The features are interpolated bilinearly at the pixels. The weight of every feature in a region is summed first, so
-    that only regions and features are multiplied.
+    Features are interpolated bilinearly at the pixels. The interpolation weights are summed per region first, so that
+    one product of a regions x features matrix with the features is enough.
     """
     rows, columns = maps.shape[1:]
     depth, y, x = (part.numpy() for part in (labels >= 0).nonzero(as_tuple=True))
@@ -201,8 +201,10 @@ def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, 
 
 
 def _positions(pixels: int, features: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the feature before each pixel along one axis, and the share of the next one; the first and last features
-    lie on the first and last pixel of the enlarged image."""
+    """Return the feature before each pixel along one axis, and the interpolation weight of the next feature.
+
+    The first and last features are centered on the first and last pixels of the enlarged image.
+    """
     place = ((np.arange(pixels) + 0.5) * ((features - 1) * _STRIDE + 1) / pixels - 0.5) / _STRIDE
     place = place.clip(0, features - 1)
     before = place.astype(np.int64)

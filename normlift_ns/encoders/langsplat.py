@@ -1,12 +1,12 @@
-"""Reading and writing of the files of LangSplat's preprocessing, including the variants that other programs produce.
+"""Reader and writer of LangSplat's preprocessed features, including the variants that other programs write.
 
-Every image has two files. `<stem>_f.npy` holds one CLIP vector per mask, [T, D], from four consecutive lists of masks:
-all SAM masks, subparts, parts and wholes. `<stem>_s.npy`, [4, H, W], holds for each list the row of that table that a
-pixel belongs to, -1 for none. The reader also accepts:
+Each image has two files. The feature table `<stem>_f.npy`, [T, D], holds one CLIP vector per mask. Its rows are four
+consecutive lists of masks: all SAM masks, subparts, parts and wholes. The segment map `<stem>_s.npy`, [4, H, W], holds
+the table row of each pixel in each list, or -1 for none. The reader also accepts:
 
-* `_s` files of any float or integer type, with one channel or four;
-* ids past the end of the table, NaN or negative ids, and table rows that are zero or not finite. These pixels have no
-  region; the reader warns, except for negative ids.
+* segment maps of any float or integer type, with one channel or four;
+* ids past the end of the table, NaN or negative ids, and table rows that are zero or not finite. These pixels are
+  unlabeled, and the reader warns about them, except for negative ids.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from normlift_ns.options import MissingFeatures
 from normlift_ns.segmentation.regions import resample_nearest
 
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")
-"""Channels of `_s`."""
+"""Channels of a segment map."""
 _MAX_EXACT_HALF = 2048
-"""Half precision cannot represent all integers above this one."""
+"""Largest integer up to which half precision represents all integers exactly."""
 _MIN_LENGTH = 1e-30
-"""Shorter vectors count as zero, because their components have lost their precision."""
+"""Length below which a vector counts as zero, because its components have lost precision."""
 _MIN_DIMENSION = 16
-"""LangSplat's autoencoder outputs 3 numbers; no CLIP model has so few."""
+"""Smallest accepted vector length. CLIP vectors are longer; the codes of LangSplat's autoencoder have length 3."""
 
 
 def open_segment_map(path: Path) -> np.ndarray:
-    """Open a segment map, [C, H, W], memory-mapped; values are not checked.
+    """Open a segment map, [C, H, W], as a memory map without checking its values.
 
     Raises:
         FileNotFoundError, ValueError: If the file does not exist, is damaged, or has another type or shape.
@@ -63,19 +63,19 @@ def open_segment_map(path: Path) -> np.ndarray:
     if segments.dtype.kind not in "fiu" or not shape_fits:
         raise InputError(
             f"segment map {path} holds {segments.dtype} {segments.shape}, expected numbers [4, H, W], [1, H, W] or "
-            "[H, W]"
+            "[H, W]; preprocess the image again"
         )
     return segments
 
 
 def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
-    """Read the table row of every pixel in every channel; -1: none.
+    """Read the table row of each pixel in each channel, or -1 for none.
 
     Args:
         rows: Number of rows of the table.
     Raises:
-        ValueError: If ids are not integers, or may have been rounded by half precision. Also for the same reasons as
-            `open_segment_map`.
+        ValueError: If ids are not integers, or may have been rounded by half precision.
+        FileNotFoundError, ValueError: For the same reasons as `open_segment_map`.
     """
     segments = open_segment_map(path)
     values = segments.astype(np.float64)
@@ -86,7 +86,7 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
         channel, y, x = fractional[0].tolist()
         raise InputError(
             f"segment map {path}: channel {channel}, row {y}, column {x} holds {values[channel, y, x]:g}, which is "
-            "not an id; the map was interpolated: make it again with nearest-neighbor interpolation"
+            "not an integer, so the map was interpolated; make it again with nearest-neighbor interpolation"
         )
     if segments.dtype.kind == "f" and segments.dtype.itemsize == 2 and bool((values >= _MAX_EXACT_HALF).any()):
         raise InputError(
@@ -100,27 +100,31 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
             ids = shorten_list([f"{value:g}" for value in np.unique(segments[invalid])])
             warnings.warn(
                 f"segment map {path}: channels {channels} hold ids {problem} ({ids}), in {int(invalid.sum())} pixels; "
-                "these count as unlabeled",
+                "these pixels are treated as unlabeled",
                 stacklevel=2,
             )
     return np.where(past | (values < 0), -1, values).astype(np.int32)
 
 
 def open_feature_table(path: Path) -> np.ndarray:
-    """Open a feature table, [T, D], memory-mapped; values are not checked. Raises as `open_segment_map`."""
+    """Open a feature table, [T, D], as a memory map without checking its values.
+
+    Raises:
+        FileNotFoundError, ValueError: For the same reasons as `open_segment_map`.
+    """
     table = read_npy(path, "feature table")
     if table.dtype.kind != "f" or table.ndim != 2 or table.shape[1] < _MIN_DIMENSION:
         raise InputError(
-            f"feature table {path} holds {table.dtype} {table.shape}, expected floats [T, D], one CLIP vector per mask "
-            "(the autoencoder's codes in language_features_dim3 cannot be compared with text: give language_features)"
+            f"feature table {path} holds {table.dtype} {table.shape}, expected floats [T, D], one CLIP vector per "
+            "mask. If these are autoencoder codes (language_features_dim3), give the folder language_features instead"
         )
     return table
 
 
 def read_feature_table(path: Path) -> tuple[Float32[Tensor, "t d"], Bool[Tensor, " t"]]:
-    """Read the unit rows of a feature table, and which rows are valid; raises like `open_segment_map`.
+    """Read a feature table as unit vectors, with a mask of valid rows; invalid rows are zero.
 
-    Rows of unit length are kept bit for bit.
+    Rows that already have unit length are kept bit for bit. Raises the same errors as `open_segment_map`.
     """
     table = torch.from_numpy(np.array(open_feature_table(path), dtype=np.float64))
     length = torch.linalg.vector_norm(table, dim=1)
@@ -130,10 +134,10 @@ def read_feature_table(path: Path) -> tuple[Float32[Tensor, "t d"], Bool[Tensor,
 
 
 def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
-    """Write an NPY file atomically; an existing file with the same content is left alone.
+    """Write an NPY file atomically, unless a file with the same content exists.
 
     Raises:
-        FileExistsError: If the file exists with other content, and `overwrite` is False.
+        FileExistsError: If the file exists with different content, and `overwrite` is False.
     """
     buffer = io.BytesIO()
     np.save(buffer, array)
@@ -147,32 +151,32 @@ def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
             return
         if not overwrite:
             raise FileExistsError(
-                f"{path} exists with other content; export to another folder, or give --overwrite True"
+                f"{path} exists with different content; export to another folder, or add --overwrite True"
             )
     with atomic_file(path, overwrite=overwrite) as draft:
         draft.write_bytes(content)
 
 
 def shorten_list(values: Sequence[object]) -> str:
-    """Return the first ten values as text, for messages."""
+    """Format the first ten values for a message."""
     return ", ".join(map(str, values[:10])) + (", ..." if len(values) > 10 else "")
 
 
-# Features of LangSplat's preprocessing as a source, and export of the features of any source in the same format.
+# Source of LangSplat's preprocessed features, and export of the features of any source in the same format.
 #
-# The module docstring lists the accepted variants of the files. Images may also lack features, or be larger than their
-# maps, because LangSplat shrinks large images; maps are then resized by nearest neighbor. The folder may be the
-# dataset with its language_features/, or language_features/ with another such folder inside, as in one published
-# archive.
+# The module docstring lists the accepted variants of the files. Images can also be larger than their maps, because
+# LangSplat shrinks large images. The maps are then resized by nearest-neighbor interpolation. The folder can be
+# language_features/ itself, or the dataset that contains it. language_features/ can also contain another folder of that
+# name, as in one published archive.
 
 
 LangSplatLevel = Literal["default", "s", "m", "l", "sum"]
 _NESTED = "language_features"
 _CROP_TOLERANCE = 0.02
-"""Sizes that differ by a smaller fraction indicate another crop, that of an undistorted image, rather than another
-resolution."""
+"""Relative difference below which different sizes indicate another crop, such as that of undistortion, instead of
+another resolution."""
 _MIN_SUM = 1e-6
-"""Sums of unit vectors shorter than this have no direction."""
+"""Length below which a sum of unit vectors has no direction."""
 
 
 class _Files(NamedTuple):
@@ -182,37 +186,36 @@ class _Files(NamedTuple):
 
 @dataclass(frozen=True)
 class LangSplat:
-    """A `FeatureSource` of preprocessed images.
+    """A `FeatureSource` that reads LangSplat's preprocessed features.
 
     Raises:
         FileNotFoundError: If the folder does not exist, or contains no features.
     """
 
     root: Path
-    """The folder with `*_s.npy` and `*_f.npy`, or one above it."""
+    """Folder with `*_s.npy` and `*_f.npy`, or a parent folder."""
     texts: TextEncoder
-    """The text encoder of the model that made the features."""
+    """Text encoder of the model that computed the features."""
     level: LangSplatLevel = "l"
-    """The channel that counts. sum: the sum of the vectors of all channels at every pixel, as in Splat Feature
-    Solver."""
+    """Channel to use, or "sum" for the sum of the vectors of all channels at each pixel, as in Splat Feature Solver."""
     missing: MissingFeatures = "error"
-    """Handling of images without features: raise an error, or skip them with a warning."""
+    """Handling of images without features: "error" raises an error, "skip" skips them with a warning."""
     resample: bool = False
-    """Accept maps of any size, not only those of the same image at another resolution."""
+    """True to accept maps of any size, even if they may show another crop of the image."""
 
     def __post_init__(self) -> None:
         _ = self.folder
 
     @cached_property
     def folder(self) -> Path:
-        """The folder that contains the files."""
+        """Folder that contains the files."""
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:
                 return folder
         raise FileNotFoundError(
-            f"{self.root} contains no LangSplat features (--features-dir): there is no *_s.npy in it, in {folders[1]} "
-            f"or in {folders[2]}"
+            f"{self.root} contains no LangSplat features; expected *_s.npy files in it, in {folders[1]} or in "
+            f"{folders[2]}. Give their folder with --features-dir"
         )
 
     @property
@@ -223,8 +226,7 @@ class LangSplat:
         """Return the given images that have features; see `FeatureSource.available`.
 
         Raises:
-            FileNotFoundError: If images have no features; with `missing` "skip", only if none has any. The message
-                lists them.
+            FileNotFoundError: If an image has no features, or, with `missing="skip"`, if no image has features.
             ValueError: If a file is damaged or has another shape, tables have rows of different lengths, or two images
                 share their files.
         """
@@ -237,10 +239,10 @@ class LangSplat:
             problem = f"{len(absent)} of {len(names)} images have no features in {self.folder}: {', '.join(absent)}"
             if self.missing == "error" or len(files_of) == 0:
                 raise FileNotFoundError(
-                    f"{problem}. Expected <name>_s.npy and <name>_f.npy; preprocess them, or skip these images: "
-                    "--features-missing skip"
+                    f"{problem}. Expected <name>_s.npy and <name>_f.npy for each; preprocess these images, or skip "
+                    "them with --features-missing skip"
                 )
-            warnings.warn(f"{problem}; they are skipped", stacklevel=2)
+            warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
         check_files_distinct(maps, "features", "by naming the images such that they differ before the first dot")
         dimensions: dict[int, Path] = {}
@@ -250,23 +252,27 @@ class LangSplat:
         if len(dimensions) > 1:
             (a, first), (b, second) = list(dimensions.items())[:2]
             raise InputError(
-                f"the rows of {first} have {a} numbers, those of {second} have {b}; all must come from one encoder"
+                f"the rows of {first} have {a} numbers, but those of {second} have {b}; preprocess all images with the "
+                "same encoder"
             )
         return list(files_of)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """Return the regions and features of an image; raises like `available`, and ValueError if ids are not
-        integers."""
+        """Return the regions and features of an image.
+
+        Raises:
+            FileNotFoundError, ValueError: For the same reasons as `available` and `read_segment_map`.
+        """
         files = self._files(name)
         table, valid = read_feature_table(files.features)
-        valid = torch.cat([valid, valid.new_zeros(1)])  # row -1
+        valid = torch.cat([valid, valid.new_zeros(1)])  # for the row -1
         maps = read_segment_map(files.segments, len(table))
         cells, rows = joint_partition(torch.from_numpy(self._fit(maps, image, files.segments)))
         invalid = rows[(rows >= 0) & ~valid[rows.long()]].unique().tolist()
         if len(invalid) > 0:
             warnings.warn(
                 f"{files.features}: rows {shorten_list(invalid)} of the table are zero or not finite; their pixels "
-                "count as unlabeled",
+                "are treated as unlabeled",
                 stacklevel=2,
             )
             rows = torch.where(valid[rows.long()], rows, -1)
@@ -281,38 +287,42 @@ class LangSplat:
         return self.texts.text(prompts)
 
     def _files(self, name: str) -> _Files:
-        """Return the files of an image. LangSplat cuts names at the first dot, other programs at the last one."""
+        """Return the files of an image. LangSplat cuts image names at the first dot, other programs at the last."""
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")
             if stem != "" and all(map(os.path.isfile, files)):
                 return files
-        raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
+        raise FileNotFoundError(
+            f"image {name} has no features in {self.folder}; expected <name>_s.npy and <name>_f.npy. Preprocess the "
+            "image, or skip it with --features-missing skip"
+        )
 
     def _fit(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
-        """Return maps of the size of the image; raise InputError if they may show another crop."""
+        """Resize maps to the size of the image; raise InputError if they may show another crop."""
         height, width = image.shape[:2]
         if maps.shape[1:] == (height, width):
             return maps
         if not self.resample and not is_same_image(maps.shape[2], maps.shape[1], width, height):
             raise InputError(
-                f"{path} is {maps.shape[2]}x{maps.shape[1]} (width x height), its image is {width}x{height}: another "
-                "aspect ratio or almost the same size, which indicates another crop or orientation. Preprocess the "
-                "images that the run was trained with (nerfstudio undistorts and crops them), or stretch the maps: "
-                "--regions-resample True"
+                f"{path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image is {width}x{height}. These "
+                "sizes indicate another crop or orientation. Preprocess the images that the run was trained with, "
+                "which nerfstudio undistorts and crops, or stretch the maps with --regions-resample True"
             )
         return resample_nearest(maps, height, width)
 
     def size(self, name: str) -> tuple[Path, int, int]:
-        """Return the path, width and height of the segment map of an image; raises like `view`."""
+        """Return the path, width and height of the segment map of an image. Raises the same errors as `view`."""
         files = self._files(name)
         _, height, width = open_segment_map(files.segments).shape
         return files.segments, width, height
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return whether a map can show the same image at another resolution. The two sizes must differ by one factor,
-    except for rounding of the smaller one to whole pixels.
+    """Return whether a map can show the same image at another resolution.
+
+    The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. If they differ
+    by less than 2 %, they must be equal.
 
     >>> sizes = [(606, 1080, 1079, 1921), (1080, 1920, 1079, 1919), (606, 1090, 1079, 1921)]
     >>> tuple(is_same_image(*size) for size in sizes)
@@ -327,8 +337,8 @@ def is_same_image(map_width: int, map_height: int, width: int, height: int) -> b
 
 
 def _sum_levels(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
-    """Return cells with the normalized sum of their rows as features."""
-    zero = table.new_zeros(1, table.shape[1])  # row -1
+    """Return features that are the normalized sums of the table rows of each cell."""
+    zero = table.new_zeros(1, table.shape[1])  # for the row -1
     sums = torch.cat([table, zero])[rows.long()].double().sum(dim=0)
     valid = torch.linalg.vector_norm(sums, dim=1) > _MIN_SUM
     regions = torch.where(valid, valid.cumsum(0) - 1, -1)
@@ -356,13 +366,13 @@ def write_langsplat(
 ) -> None:
     """Write the regions and features of an image as `<stem>_s.npy` and `<stem>_f.npy`.
 
-    Regions with LangSplat's four levels fill its four channels; other regions fill all four with the selected level.
+    Regions with four levels fill LangSplat's four channels. For other regions, the selected level fills all four.
 
     Args:
-        overwrite: Replace files of other content.
+        overwrite: True to replace existing files that have different content.
     Raises:
         ValueError: If the source selects several levels.
-        FileExistsError: If a file with other content exists, and `overwrite` is False.
+        FileExistsError: If a file with different content exists, and `overwrite` is False.
     """
     levels: list[tuple[Tensor, Tensor]] = []
     if isinstance(source, RegionFeatures):

@@ -1,7 +1,7 @@
-"""Null vocabulary: unrelated texts that a prompt is compared with, so that cosines of any encoder get a meaning.
+"""Null vocabulary of unrelated words, whose cosines calibrate the cosines of prompts for any encoder.
 
-A Gaussian belongs to a prompt if the prompt is nearer to it than almost all unrelated words are, and a prompt is in the
-scene if its best match is better than those of almost all unrelated words. See `core.null_level`.
+A Gaussian matches a prompt if its cosine with the prompt is larger than its cosines with almost all unrelated words. A
+prompt is in the scene if its best match is better than those of almost all unrelated words. See `core.null_level`.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from normlift_ns.encoders.text_files import TextEmbeddingFile
 from normlift_ns.errors import InputError
 
 _FEWEST = 5
-"""Number of texts below which there is no null vocabulary."""
+"""Smallest number of words in a null vocabulary."""
 
 
 @cache
 def null_words() -> tuple[str, ...]:
-    """Return 200 names of things; research/null_words.py chooses them."""
+    """Return 200 names of objects, which research/null_words.py selects."""
     return tuple(json.loads(Path(__file__).with_name("null_words.json").read_text(encoding="utf8")))
 
 
 def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Tensor, "m d"] | None:
-    """Return the vectors of the null vocabulary of a lift; None if it has none.
+    """Return the vectors of the null vocabulary of a lift, or None if it has none.
 
-    Features of one's own, and imported ones, are compared with the texts that were given with them.
+    The vocabulary of precomputed or imported features consists of the texts that were supplied with them.
 
     Args:
-        encoder: settings of the encoder, as in the manifest.
+        encoder: Encoder settings from the manifest.
     """
     kind, file = find_encoder_kind(encoder.get("encoder")), encoder.get("text_vectors")
     if isinstance(source, PrecomputedFeatures):
@@ -49,5 +49,5 @@ def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Ten
         return None
     try:
         return source.text(words)
-    except InputError:  # an encoder that does not know them
+    except InputError:  # the encoder cannot embed these words
         return None

@@ -1,7 +1,7 @@
-"""Architectures and weight files of OpenCLIP, without importing open_clip.
+"""Architectures and weight files of OpenCLIP, without importing all of open_clip.
 
-Parts of open_clip without importing the whole package. That import takes ten seconds, mostly for torchvision and
-transformers, and only networks need it.
+Importing the whole package takes ten seconds, mostly for torchvision and transformers, and is necessary only to build a
+network. This module imports single modules of open_clip instead.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _WEIGHT_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
 
 
 def import_open_clip_module(name: str) -> ModuleType:
-    """Import a module of open_clip without the rest of the package, unless that has been imported already.
+    """Import a module of open_clip, without the rest of the package if that is not imported yet.
 
     Raises:
         ImportError: If the module does not exist, or needs the rest of the package.
@@ -58,7 +58,7 @@ def open_clip_model_names() -> list[str]:
 
 
 def open_clip_model_config(model: str) -> dict[str, Any] | None:
-    """Return the configuration of an architecture; None if open_clip does not know it."""
+    """Return the configuration of an architecture, or None if open_clip does not have it."""
     if "open_clip" in sys.modules:
         return importlib.import_module("open_clip").get_model_config(model)
     if model not in open_clip_model_names():
@@ -68,34 +68,37 @@ def open_clip_model_config(model: str) -> dict[str, Any] | None:
 
 
 def missing_patches_reason(model: str) -> str | None:
-    """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
+    """Return the reason that an OpenCLIP architecture cannot embed patches, or None if it can."""
     vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
     if "timm_model_name" in vision:
         return "its image encoder comes from timm"
     if not isinstance(vision.get("layers"), int):
         return "its image encoder is a convolutional network"
-    return "it pools by attention" if vision.get("attentional_pool") else None
+    return "its image encoder pools by attention" if vision.get("attentional_pool") else None
 
 
 def _folder() -> Path:
     """Return the folder of the open_clip package."""
     spec = find_spec("open_clip")
     if spec is None or spec.origin is None:
-        raise InputError("open_clip is not installed (pip install open_clip_torch); --encoder color works without it")
+        raise InputError(
+            "open_clip is not installed; install it with pip install open_clip_torch, or use --encoder color, which "
+            "does not need it"
+        )
     return Path(spec.origin).parent
 
 
 OPEN_CLIP_REMEDY = (
-    "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
-    "--encoder imagenet, whose weights come from the Python index, or --encoder color, which needs none"
+    "give a local weight file (.safetensors, .bin or .pt) with --encoder-pretrained FILE, or use --encoder imagenet "
+    "(weights from the Python package index) or --encoder color (no weights)"
 )
 
 
 def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
     """Return whether the weights of an OpenCLIP model are on this machine.
 
-    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
-    Face hub.
+    Return None if this cannot be determined without importing open_clip, for example if the weights are not on the
+    Hugging Face hub.
 
     >>> has_local_clip_weights("ViT-B-16", __file__)
     True
@@ -107,7 +110,7 @@ def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
 
 
 def find_cached_clip_weights(location: str) -> Path | None:
-    """Return the path of the weights of an OpenCLIP model in the hub cache, or None.
+    """Return the path of the weights of an OpenCLIP model in the hub cache, or None if they are not cached.
 
     Args:
         location: "OWNER/NAME/" or "OWNER/NAME/FILE", as in open_clip's table of pretrained weights.
@@ -119,8 +122,8 @@ def find_cached_clip_weights(location: str) -> Path | None:
 def hub_location(model: str, tag: str) -> str | None:
     """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
 
-    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
-    hub, or the source has an unexpected form.
+    The function parses the source of open_clip, because importing it takes seconds. It returns None if the weights are
+    not on the hub or the source has an unexpected form.
     """
     try:
         source = (_folder() / "pretrained.py").read_text("utf8")
@@ -146,14 +149,14 @@ def _argument(call: ast.AST, name: str) -> ast.expr:
 
 
 def import_open_clip() -> Any:
-    """Import open_clip, which takes seconds, at its first use.
+    """Import open_clip, which takes seconds the first time.
 
-    Suppress the warnings of the old timm that nerfstudio pins. Block wandb, which timm would import to log training and
-    which takes a quarter of the time.
+    Warnings of the old timm version that nerfstudio pins are suppressed. The import of wandb is blocked, because timm
+    needs it only to log training and it takes a quarter of the time.
     """
     blocked = "wandb" not in sys.modules
     if blocked:
-        sys.modules["wandb"] = None  # type: ignore[assignment]  # importing it raises ImportError, which timm expects
+        sys.modules["wandb"] = None  # type: ignore[assignment]  # importing it raises ImportError, which timm handles
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -167,7 +170,7 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     """Check an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If open_clip does not know the model or the weights tag, or the installed timm does not know the
+        ValueError: If open_clip does not have the model or the weights tag, or the installed timm does not have the
             model.
         FileNotFoundError: If the name looks like a weight file that does not exist.
     """
@@ -175,31 +178,31 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     if config is None:
         near = ", ".join(difflib.get_close_matches(model, open_clip_model_names()) or [DEFAULT_MODEL])
         raise InputError(
-            f"unknown OpenCLIP model {model!r} (--encoder-model); similar names: {near}. List all: "
+            f"unknown OpenCLIP model {model!r} (--encoder-model); use one such as {near}. To list all, run: "
             'python -c "import open_clip; print(open_clip.list_models())"'
         )
     tower = config["vision_cfg"].get("timm_model_name")
     if tower is not None and not (timm := importlib.import_module("timm")).is_model(tower):
         raise InputError(
-            f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
-            f"{timm.__version__} does not have (nerfstudio pins an old version); use a model that open_clip builds "
-            f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or install another timm at your own risk"
+            f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, but the installed timm "
+            f"{timm.__version__} does not have it, because nerfstudio pins an old version. Use a model without timm, "
+            f"such as {DEFAULT_MODEL} or ViT-L-14, or install another timm version at your own risk"
         )
     if os.path.isfile(pretrained) or tags.is_pretrained_cfg(model, pretrained):
         return
     check_not_local(pretrained, 1, "--encoder-pretrained", "not a weight file of an OpenCLIP model", OPEN_CLIP_REMEDY)
     known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
     raise InputError(
-        f"unknown weights {pretrained!r} of OpenCLIP model {model}; known tags: {known}. Otherwise, {OPEN_CLIP_REMEDY}"
+        f"unknown weights {pretrained!r} of OpenCLIP model {model}; known tags: {known}. Use one of them, "
+        f"{OPEN_CLIP_REMEDY}"
     )
 
 
 def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
-    """Return the weight file, downloaded if necessary, and open_clip's description of its training: "mean" and "std" of
-    the images, and "quick_gelu".
+    """Return the weight file, downloaded if necessary, and its training settings.
 
-    A local file has no such description. It gets the mean and standard deviation of the architecture's published
-    weights, if there are any, and the activation that the architecture specifies.
+    The settings are "mean" and "std" of the training images, and "quick_gelu". A local file gets "mean" and "std" of
+    the architecture's published weights, if there are any, and the activation that the architecture specifies.
 
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
@@ -217,7 +220,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
 
 
 def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
-    """Return the weight file, None if it is not on this machine, and the description of `find_open_clip_weights`."""
+    """Return the weight file, or None if it is not on this machine, and the settings as in `find_open_clip_weights`."""
     table = import_open_clip_module("pretrained")
     if os.path.isfile(pretrained):
         tags = table.list_pretrained_tags_by_model(model)

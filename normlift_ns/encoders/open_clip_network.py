@@ -1,4 +1,4 @@
-"""OpenCLIP as an encoder of images and prompts, and its text tower in plain torch."""
+"""Encoder of images and prompts with OpenCLIP networks, and OpenCLIP's text tower in plain torch."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
 
 
 class OpenClipNetwork(NamedTuple):
-    """A model, in half precision on a GPU and in float32 elsewhere, with its tokenizer and preprocessing."""
+    """An OpenCLIP model with its tokenizer and preprocessing, in half precision on a GPU and in float32 on a CPU."""
 
     model: Any
     tokenizer: Any
     size: tuple[int, int]
-    """Height and width of the training images."""
+    """Height and width of the training images, in pixels."""
     mean: Float[Tensor, "3 1 1"]
     std: Float[Tensor, "3 1 1"]
 
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Return pixels, 0..255, on the device, normalized for the model."""
+        """Normalize pixels with values in 0..255 for the model, on its device."""
         return ((pixels / 255 - self.mean) / self.std).to(torch.float16 if pixels.is_cuda else torch.float32)
 
     @property
@@ -66,18 +66,18 @@ class OpenClipNetwork(NamedTuple):
 
 
 def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
-    """Load the network of an architecture and weights that have passed `check_open_clip_names`.
+    """Load a network whose architecture and weights have passed `check_open_clip_names`.
 
     Raises:
         FileNotFoundError: If the weights or the tokenizer cannot be downloaded.
-        ValueError: If the installed packages cannot build the architecture, or the weight file is damaged or of another
-            architecture.
+        ValueError: If the installed packages cannot build the architecture, or the weight file is damaged or belongs to
+            another architecture.
     """
     open_clip = import_open_clip()
     path, training = find_open_clip_weights(model, pretrained)
     with third_party_errors(
         f"OpenCLIP model {model} cannot be built with the packages installed here",
-        f"choose another with --encoder-model, such as {DEFAULT_MODEL}",
+        f"choose another model with --encoder-model, such as {DEFAULT_MODEL}",
     ):
         network = open_clip.create_model(
             model,
@@ -87,14 +87,14 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
     with third_party_errors(
-        f"weight file {path} is damaged or not of OpenCLIP model {model}",
-        f"give its architecture with --encoder-model, or {OPEN_CLIP_REMEDY}",
+        f"weight file {path} is damaged or does not belong to OpenCLIP model {model}",
+        f"give its architecture with --encoder-model, {OPEN_CLIP_REMEDY}",
     ):
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     with third_party_errors(
         f"the tokenizer of OpenCLIP model {model} cannot be loaded",
-        f"{CONNECT_ONCE}, use a model with OpenCLIP's own tokenizer such as "
-        f"{DEFAULT_MODEL}, or use the encoder that needs none: --encoder color",
+        f"{CONNECT_ONCE}, use a model with OpenCLIP's own tokenizer, such as "
+        f"{DEFAULT_MODEL}, or use --encoder color, which needs no tokenizer",
         FileNotFoundError,
     ):
         tokenizer = open_clip.get_tokenizer(model)
@@ -107,19 +107,19 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
 
 # Patch features of OpenCLIP's vision transformers.
 #
-# The last layer of CLIP mixes all patches into one vector. As in MaskCLIP (Zhou, Loy and Dai, ECCV 2022), only the
-# value path of that layer is used. Patch tokens of the preceding layer pass through the last layer's first norm, its
-# value and output projections, the final norm, and the joint-space projection. The image is scaled to a whole number
-# of patches, preserving its aspect ratio, and position embeddings are interpolated to that grid.
+# The last layer of CLIP mixes all patches into one vector. Patch features use only the value path of this layer, as in
+# MaskCLIP (Zhou, Loy and Dai, ECCV 2022). Patch tokens of the preceding layer pass through the first norm and the value
+# and output projections of the last layer, the final norm, and the projection into the joint space. The image is scaled
+# to a whole number of patches, and position embeddings are interpolated to their grid.
 
 
 @torch.no_grad()
 def patch_embeddings(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
-    """Return patch tokens in the joint space, row by row, not normalized.
+    """Return unnormalized patch embeddings in the joint space, in row-major order.
 
     Args:
         visual: open_clip's VisionTransformer.
-        pixels: Normalized images of a whole number of patches.
+        pixels: Normalized images with sides that are multiples of the patch size.
     """
     tokens = visual.conv1(pixels)
     rows, columns = tokens.shape[2:]
@@ -136,7 +136,7 @@ def patch_embeddings(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Ten
 
 
 def _positions(visual: Any, rows: int, columns: int) -> Float[Tensor, "n d"]:
-    """Return position embeddings of the class token and of a grid of patches, interpolated bicubically."""
+    """Return the position embeddings of the class token and, interpolated bicubically, of a grid of patches."""
     learned = visual.positional_embedding.float()
     grid = learned[1:].reshape(*visual.grid_size, -1).permute(2, 0, 1)[None]
     grid = interpolate(grid, (rows, columns), mode="bicubic", antialias=True, align_corners=False)
@@ -145,18 +145,17 @@ def _positions(visual: Any, rows: int, columns: int) -> Float[Tensor, "n d"]:
 
 @dataclass(frozen=True)
 class OpenClipEncoder(NetworkEncoder):
-    """CLIP features, computed with open_clip; see `NetworkEncoder`.
+    """An encoder with a CLIP network of open_clip; see `NetworkEncoder`.
 
     Raises:
-        ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
-            tag. Also if the template has no placeholder for the text.
+        ValueError: If the model or the weights tag is unknown, or the template has no placeholder.
         FileNotFoundError: If a weight file does not exist.
     """
 
     model: str = DEFAULT_MODEL
-    """Architecture, a name in open_clip.list_models()."""
+    """Name of the architecture, one of open_clip.list_models()."""
     pretrained: str = DEFAULT_PRETRAINED
-    """Tag of weights to download, or a weight file of that architecture. Pickles are read with weights_only=True."""
+    """Tag of the weights to download, or a local weight file. Pickle files are read with weights_only=True."""
     fill: CropFill = "black"
     device: str = "cpu"
     template: str = "{}"
@@ -176,7 +175,7 @@ class OpenClipEncoder(NetworkEncoder):
         if reason is None:
             return None
         return (
-            f"--regions patches needs a vision transformer of open_clip, which {self.model} is not: {reason}. "
+            f"--regions patches does not support the OpenCLIP model {self.model}, because {reason}. "
             f"Use --encoder-model {DEFAULT_MODEL}, or other regions"
         )
 
@@ -190,9 +189,9 @@ class OpenClipEncoder(NetworkEncoder):
 
 # The CLIP text tower in plain torch, for prompts that are not cached.
 #
-# Most architectures of open_clip share one kind of text tower: a causal transformer over byte pairs, read out at the
-# end of the text. This module computes those from the same weights with open_clip's own tokenizer, which avoids
-# importing the rest of open_clip. Other kinds are left to open_clip.
+# Most architectures of open_clip have the same kind of text tower, a causal transformer over byte pairs. The embedding
+# of a text is the output at its end token. This module computes it with the same weights and open_clip's own tokenizer,
+# without importing the rest of open_clip. open_clip computes all other kinds of text towers.
 
 
 _PLAIN_KEYS = {"context_length", "vocab_size", "width", "heads", "layers"}
@@ -202,20 +201,20 @@ _TEXT_BATCH_SIZE = 64
 
 @dataclass(frozen=True)
 class TextTower:
-    """A text tower with its weights in float32; formulas as in open_clip's transformer.py."""
+    """A text tower with weights in float32. The formulas are those of open_clip's transformer.py."""
 
     tokenizer: Callable[[Sequence[str]], Int64[Tensor, "b length"]]
     templates: Sequence[Callable[[str], str]]
-    """Functions that fill the prompt templates; the embedding of a text is the mean over them."""
+    """Functions that fill the prompt templates. The embedding of a prompt is the mean over all templates."""
     weights: Mapping[str, Float32[Tensor, ...]]
-    """Weights by their names in the model's state dict."""
+    """Weights by name in the model's state dict."""
     heads: int
     layers: int
     quick_gelu: bool
     device: str
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt, on the CPU.
+        """Return one unit vector per prompt, on the CPU.
 
         Raises:
             ValueError: If `prompts` or a prompt is empty.
@@ -250,10 +249,10 @@ class TextTower:
 
 
 def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
-    """Load the text tower of an OpenCLIP model.
+    """Load the plain text tower of an OpenCLIP model, or return None if this is not possible.
 
-    Return None if it is not of the plain kind, its weights are not on this machine, or anything is unexpected.
-    `OpenClipEncoder` then handles the model, or reports what is wrong.
+    The result is None if the tower is of another kind, its weights are not on this machine, or loading fails.
+    `OpenClipEncoder` then loads the model, or reports the error.
     """
     try:
         config = open_clip_model_config(model) or {}
@@ -268,7 +267,7 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
         tokenizer = import_open_clip_module("tokenizer").SimpleTokenizer(context_length=sizes["context_length"])
     except MemoryError:
         raise
-    except Exception:  # torch, safetensors and open_clip raise many kinds for a bad file or name
+    except Exception:  # torch, safetensors and open_clip raise many types of errors for a bad file or name
         return None
     if {name: weight.shape for name, weight in weights.items()} != shapes:
         return None
@@ -278,7 +277,7 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
 
 
 def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Read the named tensors of a weight file and nothing else. Raises any exception for a bad file."""
+    """Read only the named tensors of a weight file. A bad file can raise any exception."""
     check_regular(path)
     if path.suffix == ".safetensors":
         with safe_open(path, "pt") as file:

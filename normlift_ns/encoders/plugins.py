@@ -1,4 +1,4 @@
-"""Adapters for encoders and mask sources of other packages: check their results and attribute their errors."""
+"""Adapters for encoders and mask sources of other packages, which check results and add the plugin's name to errors."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class PluginEncoder(Encoder):
-    """An encoder of another package. The wrapped object needs only `identity`, `encode` and `text`; if it has
-    `patches`, so does the adapter. Error messages name the encoder that failed.
+    """An adapter for an encoder of another package.
 
-    Raises (from every method):
-        InputError: If the encoder fails, or returns something that `Encoder` does not allow.
+    The wrapped object needs only `identity`, `encode` and `text`. If it also has `patches`, so does the adapter. Error
+    messages include the name of the encoder.
+
+    Raises (from all methods):
+        InputError: If the encoder fails, or returns a result that violates the `Encoder` protocol.
     """
 
     name: str
@@ -50,8 +52,10 @@ class PluginEncoder(Encoder):
         return self._check_rows(rows, len(prompts), "texts")
 
     def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
-        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length 1.
-        Rows of regions and patches may be zero."""
+        """Return the rows as float32 on the CPU; raise InputError unless there are `count` rows of unit length.
+
+        Rows of regions and patches may also be zero.
+        """
         if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
             received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
             raise InputError(
@@ -64,14 +68,14 @@ class PluginEncoder(Encoder):
         if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
             raise InputError(
                 f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "
-                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them"
+                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them in that package"
             )
         return rows
 
 
 @dataclass(frozen=True)
 class DensePluginEncoder(PluginEncoder):
-    """An encoder of another package that also has features of patches."""
+    """An adapter for an encoder of another package that can also embed patches."""
 
     @property
     def why_not_dense(self) -> str | None:
@@ -85,11 +89,13 @@ class DensePluginEncoder(PluginEncoder):
 
 @dataclass(frozen=True)
 class PluginRegions:
-    """A mask source of another package. The wrapped object needs only `identity` and `labels(image, name)`, which
-    returns integers [H, W], or as `Regions.labels`. Error messages name the mask source that failed.
+    """An adapter for a mask source of another package.
 
-    Raises (from every method):
-        InputError: If the mask source fails, or returns something that `Regions` does not allow.
+    The wrapped object needs only `identity` and `labels(image, name)`. `labels` returns integers, either [H, W] or as
+    in `Regions.labels`. Error messages include the name of the mask source.
+
+    Raises (from all methods):
+        InputError: If the mask source fails, or returns a result that violates the `Regions` protocol.
     """
 
     name: str
@@ -132,13 +138,13 @@ class PluginRegions:
             if not torch.equal(ids, torch.arange(len(ids), device=ids.device).to(ids.dtype)):
                 raise InputError(
                     f"mask source {self.name!r} of another package returned ids in {int(level.min())}.."
-                    f"{int(level.max())}, expected 0..R-1 without gaps, and -1 for none; fix that package"
+                    f"{int(level.max())}, expected ids 0..R-1 without gaps, and -1 for none; fix that package"
                 )
         return labels.int()
 
 
 def _make(noun: str, name: str, make: Callable[[], Any], needed: Sequence[str]) -> Any:
-    """Make an object of another package; raise InputError if it lacks an attribute."""
+    """Make an object of another package; raise InputError if it lacks a required attribute."""
     plugin = _call(noun, name, make)
     missing = [x for x in needed if not hasattr(plugin, x)]
     if len(missing) > 0:
@@ -147,10 +153,12 @@ def _make(noun: str, name: str, make: Callable[[], Any], needed: Sequence[str]) 
 
 
 def _call(noun: str, name: str, function: Callable[[], _Result]) -> _Result:
-    """Call a function of another package; attribute exceptions to it."""
+    """Call a function of another package, and convert its exceptions to errors that name the plugin."""
     try:
         return function()
     except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
         raise
-    except Exception as error:  # a third-party module may raise anything
-        raise InputError(f"{noun} {name!r} of another package failed ({summarize_error(error)})") from error
+    except Exception as error:  # other packages can raise any exception
+        raise InputError(
+            f"{noun} {name!r} of another package failed ({summarize_error(error)}); fix that package"
+        ) from error

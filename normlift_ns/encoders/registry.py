@@ -1,7 +1,7 @@
-"""Encoders by their `--encoder` names, with the built-in ones.
+"""Registry of encoders by `--encoder` name, and the built-in encoders.
 
-Every encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. Imports nothing
-heavy.
+Each encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. This module does
+not import torch.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EncoderKind:
-    """An encoder and its query defaults; the object that an entry point of the group `normlift_ns.encoders` names.
+    """An encoder with its query defaults, as registered by an entry point of the group `normlift_ns.encoders`.
 
-    The module that defines it should import torch only inside `make`, so that queries and error messages stay fast.
+    The module of an entry point should import torch only inside `make`, so that queries and error messages stay fast.
 
     >>> from normlift_ns.encoders.registry import encoder_kind
     >>> encoder_kind("color").negatives, encoder_kind("open_clip").rule
@@ -53,39 +53,43 @@ class EncoderKind:
     """
 
     make: Callable[[SourceOptions, str], Encoder]
-    """Makes the encoder from the options and a device such as "cuda". It should load weights at their first use."""
+    """Function that makes the encoder for options and a device such as "cuda". Weights should be loaded at first
+    use."""
     rule: RelevancyRule = "lerf"
-    """Relevancy rule of queries that set none."""
+    """Default relevancy rule of queries."""
     negatives: tuple[str, ...] = CANONICAL_NEGATIVES
-    """Negative prompts of queries that set none; (): no negatives."""
+    """Default negative prompts of queries, or () for none."""
     threshold: float | Literal["auto"] = 0.5
-    """Relevancy by `rule` above which a Gaussian is selected; "auto": chosen from the histogram."""
+    """Default threshold of queries on the relevancy by `rule`, or "auto" for a threshold from the histogram."""
     check: Callable[[SourceOptions], None] = lambda options: None
-    """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
+    """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
     texts: Callable[[SourceOptions, str, Path | None, Mapping[str, Any]], LazyTextEncoder] | None = None
-    """Makes the text encoder of a lifted run. Its arguments: the options, the device, the folder in which to cache
-    embeddings, and the encoder's identity recorded at the lift ({} if unknown). None: the encoder itself embeds the
-    prompts, and the embeddings are cached."""
+    """Function that makes the text encoder of a lifted run, or None to use the encoder itself and cache its embeddings.
+    The arguments are the options, the device, the cache folder, and the identity of the encoder at the lift ({} if it
+    is unknown)."""
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
-    """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
+    """Function that returns whether the encoder is a `DenseEncoder`, which can embed patches."""
     has_null_words: bool = True
-    """True if the encoder knows the words of `encoders.null_words`. Queries of new lifts then use rule contrast."""
+    """True if the encoder can embed the words of `encoders.null_words`. Queries of new lifts then use the rule
+    "contrast"."""
     known_words: Callable[[str], str] = str
-    """Returns the words of a prompt that count; "" if there are none. The encoder ignores all others."""
+    """Function that returns the words of a prompt that the encoder uses, or "" if it ignores them all."""
     words: Callable[[], Sequence[str]] = tuple
-    """Returns the words that an inventory names objects by; (): none."""
+    """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: float = 0.6
     """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
-    """Best cosines from which a prompt is a weak match, and from which it is found. None: see `query.presence`."""
+    """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.presence`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False
-    """True if it encodes an image once and averages inside regions, so that regions cost no more than patches."""
+    """True if the encoder processes each image once and averages inside regions, so that regions cost as much as
+    patches."""
     is_here: Callable[[], bool] = lambda: False
-    """Returns whether `--encoder auto` may choose it: its default weights and its packages are on this machine."""
+    """Function that returns whether the default weights and the packages of the encoder are on this machine. If not,
+    `--encoder auto` skips it."""
     paths: tuple[str, ...] = ()
-    """Options that may be the path of a file or folder; they are stored as absolute paths."""
+    """Names of options that can be the path of a file or folder. Runs store them as absolute paths."""
 
 
 _DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
@@ -102,7 +106,8 @@ def _make_encoder(options: SourceOptions, device: str) -> Encoder:
 def _make_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Make the text encoder of a lifted run, see `EncoderKind.texts`. A weight file is read completely at every use."""
+    """Make the text encoder of a lifted run; see `EncoderKind.texts`. A local weight file is read in full each
+    time."""
     from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
 
     model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.prompt_template
@@ -124,7 +129,7 @@ def _make_texts(
 def _check_unchanged(pretrained: str, expected: object) -> None:
     """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
     remedy = (
-        "restore the file of the lift, give embeddings of your texts by the same network with --text-embeddings, or "
+        "restore the weight file of the lift, give prompt embeddings of the same network with --text-embeddings, or "
         "lift again with: ns-normlift"
     )
     if not isinstance(expected, str):
@@ -140,8 +145,8 @@ def _check_unchanged(pretrained: str, expected: object) -> None:
         raise FileNotFoundError(f"weight file {path}, which the run was lifted with, does not exist; {remedy}")
     if identity != expected:
         raise InputError(
-            f"{path} differs from the weights that the run was lifted with, and would give other results: it is "
-            f"{identity}, expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+            f"{path} differs from the weights that the run was lifted with: found {identity}, expected {expected}. "
+            f"{remedy[0].upper()}{remedy[1:]}"
         )
 
 
@@ -166,18 +171,18 @@ OPEN_CLIP = EncoderKind(
     is_here=lambda: open_clip.has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED) is True,
     paths=("encoder_pretrained",),
 )
-"""CLIP features of masked crops, or of patches."""
+"""Encoder with CLIP features of masked crops or patches."""
 
 
 # Registration of `--encoder siglip`, `siglip2` and `metaclip2`, without torch.
 #
-# SigLIP is trained with a sigmoid. The match of a text and an image is sigmoid(scale * cosine + bias), with one scale
-# > 0 and one bias for all pairs. Of two texts, the one with the larger cosine also has the larger sigmoid, whatever
-# scale and bias are. LERF's comparison with negatives therefore applies as with a softmax, and its tie, 0.5, is where
-# the sigmoids of text and negative are equal. That rule and that threshold are the defaults.
+# SigLIP is trained with a sigmoid. The match of a text and an image is sigmoid(scale * cosine + bias), and all pairs
+# share the same scale > 0 and bias. A larger cosine therefore always means a larger sigmoid, so LERF's comparison with
+# negatives is valid. Its relevancy is 0.5 if the sigmoids of the prompt and the negative are equal. LERF's rule and the
+# threshold 0.5 are therefore the defaults.
 #
-# The sigmoid itself is not a suitable default. Its 0.5 stands for one right caption among the tens of thousands of a
-# batch, odds that crops of regions hardly ever reach.
+# The sigmoid itself is not a suitable default. It is calibrated to find one caption among the tens of thousands of a
+# training batch, and crops of regions hardly ever reach 0.5.
 
 
 def _make_kind(family: ModelFamily) -> EncoderKind:
@@ -206,7 +211,7 @@ def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
 
     for name in _options_of_clip(options):
         flag = f"--{name.replace('_', '-')} {getattr(options, name)}"
-        raise InputError(f"{flag} has no effect on --encoder imagenet; leave it out")
+        raise InputError(f"{flag} has no effect on --encoder imagenet; remove it")
     return ImageNetEncoder(device)
 
 
@@ -234,14 +239,17 @@ IMAGENET_CLASSES = EncoderKind(
     pools=True,
     is_here=lambda: IMAGENET.is_here,
 )
-"""Dense features of a classifier, compared with the vectors of its classes."""
+"""Encoder with dense features of a classifier, which are compared with the vectors of its classes."""
 
 
 def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
     from normlift_ns.encoders.color import ColorEncoder  # noqa: PLC0415 (needs numpy)
 
     if options.prompt_template != "{}":
-        raise InputError(f"--prompt-template {options.prompt_template!r} is for --encoder open_clip; leave it out")
+        raise InputError(
+            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or use "
+            "--encoder open_clip"
+        )
     return ColorEncoder()
 
 
@@ -272,7 +280,8 @@ COLOR = EncoderKind(
     learned=False,
     is_here=lambda: True,
 )
-"""Mean colors compared with color names: a shade has a cosine of 0.7 or more, another color less."""
+"""Encoder with mean colors, which are compared with color names. Shades of a color have cosines of 0.7 or more, other
+colors have smaller ones."""
 
 
 ENCODERS = Registry(
@@ -287,23 +296,23 @@ ENCODERS = Registry(
     "--encoder",
     "open_clip",
 )
-"""Encoders by their `--encoder` names."""
+"""Encoders by `--encoder` name."""
 
 
 _PREFERENCE = ("open_clip", "siglip2", "siglip", "metaclip2", "imagenet", "color")
-"""Encoders of `--encoder auto`, the preferred first; the last is on every machine."""
+"""Encoders that `--encoder auto` tries, in order of preference. The last one is always available."""
 
 
 def _options_of_clip(options: SourceOptions) -> list[str]:
-    """Return the names of options that are set and that networks trained with captions alone take."""
+    """Return the names of those options that differ from their defaults and apply only to networks with captions."""
     names, default = ("encoder_model", "encoder_pretrained", "prompt_template"), SourceOptions()
     return [name for name in names if getattr(options, name) != getattr(default, name)]
 
 
 def with_encoder(options: SourceOptions) -> SourceOptions:
-    """Return the options with an encoder in place of "auto": the preferred one on this machine.
+    """Return the options with "auto" replaced by the preferred encoder on this machine.
 
-    Options of OpenCLIP, and features of LangSplat, which are OpenCLIP's, stand for `open_clip`.
+    The encoder is `open_clip` if its options are set, or for LangSplat's features, which OpenCLIP computed.
     """
     if options.encoder != "auto":
         return options
@@ -313,17 +322,17 @@ def with_encoder(options: SourceOptions) -> SourceOptions:
 
 
 def canonical_name(encoder: str) -> str:
-    """Return the documented name of an encoder; commands accept the spelling "colour", which runs record."""
+    """Return the documented name of an encoder. Commands and recorded runs can also use the spelling "colour"."""
     return "color" if encoder == "colour" else encoder
 
 
 def encoder_kind(name: str) -> EncoderKind:
-    """Return the encoder kind of a name; raises like `Registry.load`."""
+    """Return the encoder kind of a name. Raises the same errors as `Registry.load`."""
     return ENCODERS.load(canonical_name(name))
 
 
 def find_encoder_kind(name: object) -> EncoderKind | None:
-    """Return the encoder kind of a name; None if it is unknown or cannot be loaded."""
+    """Return the encoder kind of a name, or None if it is unknown or cannot be loaded."""
     try:
         return encoder_kind(name) if isinstance(name, str) else None
     except InputError:
@@ -331,7 +340,7 @@ def find_encoder_kind(name: object) -> EncoderKind | None:
 
 
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
-    """Return the encoder's options that may be paths. The path of an existing file or folder is made absolute."""
+    """Return the options of the encoder that can be paths. Paths of existing files and folders are made absolute."""
     kind = find_encoder_kind(options.encoder)
     return {name: absolute_if_exists(getattr(options, name)) for name in (() if kind is None else kind.paths)}
 
@@ -342,7 +351,7 @@ def absolute_if_exists(name: str) -> str:
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
-    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
+    """Make the text encoder that the options select. For errors, see `make_encoder` and `TextEmbeddingFile`."""
     from normlift_ns.encoders.text_files import TextEmbeddingFile  # noqa: PLC0415 (needs numpy)
 
     file = options.text_embeddings
@@ -350,7 +359,7 @@ def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """Return the encoder of the options.
+    """Make the encoder that the options select.
 
     Args:
         device: Device of the network, such as "cuda"; results are always on the CPU.

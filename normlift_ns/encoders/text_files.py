@@ -1,4 +1,4 @@
-"""Prompts, their templates, and their embeddings in files and in the cache. Imports no torch."""
+"""Prompts, prompt templates, and prompt embeddings in files and in the cache. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class TextEncoder(Protocol):
-    """The part of an encoder that queries need."""
+    """The text part of an encoder, which is sufficient for queries."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -47,7 +47,7 @@ class LazyTextEncoder(TextEncoder, Protocol):
     """A text encoder that imports torch only if it has to run a network."""
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
+        """Return one unit vector per prompt; raise ValueError if the encoder cannot embed a prompt."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -58,28 +58,28 @@ class LazyTextEncoder(TextEncoder, Protocol):
 
 
 UNIT_TOLERANCE = 1e-3
-"""Largest deviation from length 1 of a unit vector; half precision leaves 5e-4."""
+"""Largest accepted difference between the length of a unit vector and 1. Half precision causes up to 5e-4."""
 
 
 def check_prompts(prompts: Sequence[str]) -> None:
-    """Raise ValueError unless `prompts` is a list of at least one text, none of them empty."""
+    """Raise ValueError unless `prompts` is a list of at least one prompt and no prompt is empty."""
     if isinstance(prompts, str):
-        raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
+        raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise InputError('no text given; name at least one object to search for, such as --text "orange"')
+        raise InputError('no prompt given; name at least one object to search for, for example --text "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
-            raise InputError(f"a text must be a str of valid characters, got {prompt!r:.60}")
+            raise InputError(f"a prompt must be a string of valid characters, got {prompt!r:.60}")
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(
-            f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or describe what "
+            f"prompt {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or name an object "
             "to search for"
         )
 
 
 def unit_rows(vectors: Any) -> Float32[np.ndarray, "*n d"]:
-    """Return vectors normalized to unit length, without overflow or underflow; they must be finite and not zero.
+    """Normalize vectors to unit length without overflow or underflow. They must be finite and not zero.
 
     >>> unit_rows(np.array([3e-320, 4e-320])), unit_rows(np.array([3e38, 3e38], np.float32))
     (array([0.6, 0.8], dtype=float32), array([0.70710677, 0.70710677], dtype=float32))
@@ -90,20 +90,20 @@ def unit_rows(vectors: Any) -> Float32[np.ndarray, "*n d"]:
 
 
 ENSEMBLE = "ensemble"
-"""Name of the set of open_clip's seven templates."""
+"""Name that selects open_clip's seven prompt templates."""
 
 
 def check_template(template: str) -> None:
-    """Raise InputError if a template has no placeholder for the text."""
+    """Raise InputError if a prompt template has no placeholder."""
     if template != ENSEMBLE and "{}" not in template:
         raise InputError(
-            f"text template {template!r} has no placeholder {{}} for the text; write it like "
-            f'"a photo of a {{}}", or give {ENSEMBLE} for the mean of several templates'
+            f"prompt template {template!r} has no placeholder {{}}; give a template such as "
+            f'"a photo of a {{}}", or {ENSEMBLE} for the mean of several templates'
         )
 
 
 def prompt_templates(template: str) -> Sequence[Callable[[str], str]]:
-    """Return the functions that fill the templates; the embedding of a text is the mean over them.
+    """Return the functions that fill the prompt templates. The embedding of a prompt is the mean over all templates.
 
     >>> [make("mug") for make in prompt_templates("a {}, a big {}")]
     ['a mug, a big mug']
@@ -116,14 +116,14 @@ def prompt_templates(template: str) -> Sequence[Callable[[str], str]]:
 
 
 _MAX_VECTOR_BYTES, _MAX_FILE_BYTES = 2**20, 2**30
-"""Limits in bytes, because a small archive can decompress to any number of equal bytes."""
+"""Limits on decompressed sizes in bytes, because a small archive can decompress to a very large size."""
 _COMMENT_PREFIX = b"normlift_ns "
-"""Prefix of the comment of archives that this package writes; the digest follows. NumPy's archives have no comment."""
+"""Prefix of the digest in the comment of archives that this package writes. NumPy's archives have no comment."""
 
 
 @dataclass(frozen=True)
 class TextEmbeddingFile(LazyTextEncoder):
-    """Text embeddings from an NPZ file that holds one vector [D] per text, with the text as the name of the array.
+    """A text encoder that reads embeddings from an NPZ file with one vector [D] per prompt, named by the prompt.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -134,38 +134,38 @@ class TextEmbeddingFile(LazyTextEncoder):
     def __post_init__(self) -> None:
         if not os.path.isfile(self.file):
             if os.path.lexists(self.file):
-                raise InputError(f"{self.file} is not a file of text vectors; give an NPZ file with --text-embeddings")
+                raise InputError(f"{self.file} is not a file of text embeddings; set --text-embeddings to an NPZ file")
             raise FileNotFoundError(
-                f"file of text vectors {self.file} does not exist; give an NPZ file with one vector per text with "
-                "--text-embeddings"
+                f"file of text embeddings {self.file} does not exist; set --text-embeddings to an NPZ file with one "
+                "vector per prompt"
             )
 
     @property
     def identity(self) -> dict[str, Any]:
-        """A digest of the content of the file, independent of its path."""
+        """Digest of the content of the file, independent of its path."""
         content = read_file(self.file, max_bytes=_MAX_FILE_BYTES)
         return {"kind": "text_vectors", "content": blake2b(content, digest_size=16).hexdigest()}
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """The texts that have an embedding.
+        """Prompts that have an embedding.
 
         Raises:
-            ValueError: If the file is damaged, or holds anything but vectors of one length.
+            ValueError: If the file is damaged, or does not consist of vectors of the same length.
         """
         return tuple(self._vectors)
 
     @property
     def dimension(self) -> int | None:
-        """Length D of the embeddings; None for an empty file. Raises as `texts`."""
+        """Length D of the embeddings, or None for an empty file. Raises the same errors as `texts`."""
         return next((len(vector) for vector in self._vectors.values()), None)
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt.
+        """Return one unit vector per prompt.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty, or one is not in the file. Also for the same reasons as
-                `texts`.
+            ValueError: If `prompts` or a prompt is empty, or a prompt is not in the file.
+            ValueError: For the same reasons as `texts`.
         """
         check_prompts(prompts)
         return look_up_embeddings(prompts, self._vectors, str(self.file))
@@ -183,7 +183,7 @@ class TextEmbeddingFile(LazyTextEncoder):
             zipfile.BadZipFile, zlib.error, struct.error,
         ) as error:  # fmt: skip
             raise InputError(
-                f"file of text vectors {self.file} is damaged or not an NPZ file ({error}); write it again with "
+                f"file of text embeddings {self.file} is damaged or not an NPZ file ({error}); write it again with "
                 "numpy.savez(file, **{text: vector, ...})"
             ) from None
         lengths = {array.shape for array in arrays.values()}
@@ -191,23 +191,23 @@ class TextEmbeddingFile(LazyTextEncoder):
             if array.ndim != 1 or array.dtype.kind != "f" or len(lengths) > 1:
                 raise InputError(
                     f"{self.file}: the array of {name!r} is {array.dtype} {array.shape}; expected floats, [D], with "
-                    f"the same D for every text (found {', '.join(map(str, sorted(lengths)))})"
+                    f"the same D for all prompts (found {', '.join(map(str, sorted(lengths)))})"
                 )
             if not np.isfinite(array).all() or not array.any():
-                raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
+                raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the prompt again")
         return {name: array.astype(np.float64) for name, array in arrays.items()}
 
 
 def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield texts and vectors, unchecked. Declared sizes are compared with the limits before data is read.
+    """Yield the prompts and vectors of an archive without checking them, except for their declared sizes.
 
     Raises:
-        ValueError: If two entries have the same name, or an entry is too large or not an array. Also for the same
-            reasons as zipfile.
+        ValueError: If two entries have the same name, or an entry is too large or not an array.
+        Exception: If zipfile cannot read the archive.
     """
     entries = archive.infolist()
     if sum(entry.file_size for entry in entries) > _MAX_FILE_BYTES:
-        raise InputError(f"its vectors would take more than {_MAX_FILE_BYTES:,} bytes")
+        raise InputError(f"its vectors take more than {_MAX_FILE_BYTES:,} bytes")
     names: set[str] = set()
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
@@ -223,27 +223,31 @@ def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origin: str) -> Float32[np.ndarray, "q d"]:
-    """Return one unit row per prompt.
+    """Return one unit vector per prompt.
 
     Args:
-        vectors: Arrays, or tensors on the CPU.
-        origin: Origin of the vectors, for the message.
+        vectors: Vector of each known prompt, an array or a tensor on the CPU.
+        origin: Origin of the vectors, for messages.
     Raises:
         ValueError: If a prompt has no vector.
     """
     for prompt in prompts:
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
-            hint = f"which holds {len(vectors)}; closest: {', '.join(near)}" if len(vectors) > 0 else "which is empty"
-            raise InputError(f"text {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
+            hint = (
+                f"which has {len(vectors)} for other prompts; use one of these, such as {', '.join(near)}"
+                if len(vectors) > 0
+                else "which is empty; write the vectors of your prompts to it"
+            )
+            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
 def write_text_embeddings(file: Path, vectors: Mapping[str, Any]) -> None:
-    """Write unit vectors in float32 and a digest, atomically, in the format that `TextEmbeddingFile` reads.
+    """Write unit vectors in float32 with a digest, atomically and in the format of `TextEmbeddingFile`.
 
     Raises:
-        FileExistsError, OSError: As `atomic_file`.
+        FileExistsError, OSError: For the same reasons as `atomic_file`.
     """
     units = {text: unit_rows(vector) for text, vector in vectors.items()}
     with atomic_file(file, own=True) as draft, zipfile.ZipFile(draft, "w") as archive:
@@ -254,17 +258,17 @@ def write_text_embeddings(file: Path, vectors: Mapping[str, Any]) -> None:
 
 
 def _digest_comment(vectors: Mapping[str, np.ndarray]) -> bytes:
-    """Return the archive comment, with the digest of the vectors."""
+    """Return the comment of an archive, which contains the digest of its vectors."""
     return _COMMENT_PREFIX + array_digest(vectors, {}).encode()
 
 
 CACHE_FORMAT = "normlift_ns.encoders/3"
-"""Part of every cache key; to be increased when labels or features change for the same settings."""
+"""Part of all cache keys. Increase its number if labels or features change for the same settings."""
 _ARRAY = "text"
 
 
 def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Path:
-    """Return the cache path of a result with the given settings and content, whether the file exists or not."""
+    """Return the cache path of a result with the given settings and content; the file may not exist."""
     parts = (CACHE_FORMAT.encode(), json.dumps(identity, sort_keys=True).encode(), *content)
     key = blake2b(b"".join(xxh3_128(part).digest() for part in parts), digest_size=16).hexdigest()
     return folder / f"{key}.safetensors"
@@ -272,22 +276,22 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 @dataclass(frozen=True)
 class CachedTextEncoder(LazyTextEncoder):
-    """A text encoder that caches its embeddings. The key: the text, and the settings that change its vector."""
+    """A text encoder that caches its embeddings. The key depends on the prompt and on `identity`."""
 
     make_identity: Callable[[], dict[str, Any]]
-    """Returns every setting that changes `text`, as JSON-serializable values; weight files are identified by their
-    content."""
+    """Function that returns all settings that change `text`, as JSON-serializable values. Weight files are identified
+    by their content."""
     make_encoder: Callable[[], TextEncoder]
-    """Makes the encoder; called only for texts that are not cached."""
+    """Function that makes the encoder, called only for prompts that are not cached."""
     folder: Path | None
-    """Folder with one safetensors file per text, created if it does not exist. If it is None or not writable, nothing
+    """Folder with one safetensors file per prompt, created if it does not exist. If it is None or not writable, nothing
     is cached."""
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit row per prompt.
+        """Return one unit vector per prompt.
 
         Raises:
-            ValueError, FileNotFoundError, MemoryError: As the network and its `text`.
+            ValueError, FileNotFoundError, MemoryError: For the same reasons as `make_encoder` and the encoder's `text`.
         """
         check_prompts(prompts)
         rows = {prompt: self._load(prompt) for prompt in prompts}
@@ -305,7 +309,7 @@ class CachedTextEncoder(LazyTextEncoder):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes `text`."""
+        """All settings that change `text`."""
         return self._identity
 
     @cached_property
@@ -316,7 +320,7 @@ class CachedTextEncoder(LazyTextEncoder):
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
 
     def _load(self, prompt: str) -> Float32[np.ndarray, " d"] | None:
-        """Return the cached vector of a prompt; None if it is missing, damaged, or not a unit vector."""
+        """Return the cached vector of a prompt, or None if it is missing, damaged or not a unit vector."""
         path = self._path(prompt)
         try:
             row = None if path is None or not os.path.isfile(path) else load_arrays(path, key=path.stem).arrays[_ARRAY]
@@ -328,6 +332,6 @@ class CachedTextEncoder(LazyTextEncoder):
 
 
 def open_clip_text_identity(model: str, pretrained: str, template: str) -> dict[str, Any]:
-    """Return every setting of an OpenCLIP model that changes its text embeddings."""
+    """Return all settings of an OpenCLIP model that change its prompt embeddings."""
     weights = file_digest(Path(pretrained)) if os.path.isfile(pretrained) else pretrained
     return {"model": model, "pretrained": weights, "template": template}

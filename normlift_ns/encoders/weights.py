@@ -1,4 +1,4 @@
-"""Weight files on this machine and on the hub. Imports nothing heavy."""
+"""Weight files on this machine and on the Hugging Face hub. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
-CONNECT_ONCE = "connect to the internet once (ns-normlift-weights lists all weights and fetches them)"
+CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads all weights)"
 """Advice in messages about missing weights."""
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
-"""Names of the weight files of SAM in the format of transformers."""
+"""Names of SAM's weight files in the format of transformers."""
 
 
 @contextmanager
 def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = InputError) -> Iterator[None]:
-    """Turn exceptions of other libraries, which have no common base class, into an error with a problem and a remedy.
+    """Convert exceptions of other libraries, which have no common base class, to one error with a remedy.
 
     Args:
-        error_type: InputError, or FileNotFoundError for downloads; the latter passes on InputErrors.
+        problem: Start of the message.
+        remedy: End of the message.
+        error_type: InputError, or FileNotFoundError for downloads. With the latter, an InputError is not converted.
     """
     try:
         yield
@@ -46,19 +48,21 @@ def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = 
 
 
 def find_local_sam(checkpoint: str) -> Path | None:
-    """Return the path of a SAM checkpoint on this machine, given as a path or a hub name; None if there is none."""
+    """Return the local path of a SAM checkpoint, given its path or hub name, or None if it is not on this machine."""
     return Path(checkpoint).resolve() if os.path.exists(checkpoint) else find_cached_model(checkpoint, SAM_WEIGHT_FILES)
 
 
 def find_cached_model(name: str, weight_files: Sequence[str]) -> Path | None:
-    """Return the folder of a network in the hub cache; None if it lacks config.json, or all of the weight files."""
+    """Return the folder of a network in the hub cache, or None if config.json or all weight files are missing."""
     config, weights = find_in_hub_cache(name, CONFIG_FILE), find_in_hub_cache(name, *weight_files)
     return None if config is None or weights is None else config.parent
 
 
 def find_in_hub_cache(repository: str, *names: str) -> Path | None:
-    """Return the path of the first of these files that the Hugging Face hub cache holds in the main revision of a
-    repository, or None. Needs no network."""
+    """Return the path of the first of `names` in the cached main revision of a hub repository, or None.
+
+    The function does not use the network.
+    """
     folder = hub_folder(repository)
     try:
         snapshot = folder / "snapshots" / read_text(folder / "refs" / "main").strip()
@@ -68,14 +72,16 @@ def find_in_hub_cache(repository: str, *names: str) -> Path | None:
 
 
 def hub_folder(repository: str) -> Path:
-    """Return the folder of a repository in the Hugging Face hub cache, which may not exist."""
+    """Return the folder of a repository in the Hugging Face hub cache; it may not exist."""
     constants = importlib.import_module("huggingface_hub.constants")
     return Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
 
 
 def check_hub_access() -> None:
-    """Raise OSError if the Hugging Face hub is not available for downloads; its own client would retry for most of a
-    minute."""
+    """Raise OSError if the Hugging Face hub cannot be reached.
+
+    The hub's own client would retry for most of a minute.
+    """
     if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
         raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
     address = os.environ.get("HF_ENDPOINT", _HUB)
@@ -88,12 +94,12 @@ def check_hub_access() -> None:
 
 
 def download_model(name: str, choose_files: Callable[[dict[str, Any]], Sequence[str]]) -> Path:
-    """Download a model from the hub and return its folder: config.json first, then the files chosen by its content.
+    """Download config.json and the other files of a model from the hub, and return their folder.
 
     Args:
-        choose_files: Returns patterns of further files; errors that it raises are passed on.
+        choose_files: Function that returns patterns of the other files, given the content of config.json.
     Raises:
-        Exception: See `third_party_errors`.
+        Exception: If `choose_files` or the download fails; see `third_party_errors`.
     """
     check_hub_access()
     download = importlib.import_module("huggingface_hub").snapshot_download
@@ -105,7 +111,7 @@ def is_local_path(name: str, parts: int) -> bool:
     """Return whether a name can only be a local path.
 
     Args:
-        parts: Largest number of parts that names of other kinds have.
+        parts: Largest number of parts, separated by slashes, of names that are not paths.
 
     >>> is_local_path("google/siglip2-base-patch16-224", 2), is_local_path("a/b/c", 2), is_local_path("clip.pt", 2)
     (False, True, True)
@@ -118,7 +124,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object.
 
     Raises:
-        InputError: If the file does not exist, is not JSON, or holds anything but an object.
+        InputError: If the file does not exist, is not JSON, or does not hold an object.
     """
     if not path.is_file():
         raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
@@ -134,23 +140,27 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: str) -> None:
-    """Raise unless a name can be of another kind than local paths; for a name that is not the path of usable weights.
+    """Raise an error unless a name, which is not the path of usable weights, can be a tag or a hub name.
 
     Args:
-        parts: As in `is_local_path`; 2: names on the hub, OWNER/NAME.
-        subject: What the name is, for the message.
-        problem: What a path is if it exists, for the message.
+        parts: 1 for tags, 2 for hub names, OWNER/NAME; see `is_local_path`.
+        subject: Description of the name in messages.
+        problem: Description of an existing file or folder in messages.
+        remedy: End of messages.
+    Raises:
+        InputError: If the path exists, or the name is not a valid hub name.
+        FileNotFoundError: If the name can only be a path, and the path does not exist.
     """
     if os.path.lexists(name):
         raise InputError(f"{subject} {name} is {problem}; {remedy}")
     if is_local_path(name, parts):
         raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
     if parts == 2 and len(Path(name).parts) != parts:
-        raise InputError(f"{subject} {name!r} is neither a path nor a name on the hub; {remedy}")
+        raise InputError(f"{subject} {name!r} is neither a path nor a hub name; {remedy}")
 
 
 def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:
-    """Raise InputError if installed packages are missing or older than "MAJOR.MINOR"."""
+    """Raise InputError if a package is missing or older than its minimum version, "MAJOR.MINOR"."""
     for package, minimum in minimums.items():
         try:
             installed = version(package)
@@ -159,6 +169,6 @@ def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) 
         found, needed = (tuple(int(x) for x in text.split(".")[:2] if x.isdigit()) for text in (installed, minimum))
         if found < needed:
             raise InputError(
-                f"{subject} needs {package} {minimum} or later, found {installed} (pip install -U "
-                f'"{package}>={minimum}"); {alternative}'
+                f"{subject} needs {package} {minimum} or later, found {installed}. Install it with: pip install -U "
+                f'"{package}>={minimum}". Alternatively, {alternative}'
             )

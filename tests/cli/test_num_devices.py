@@ -95,7 +95,7 @@ def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained
     _, said = process.communicate(timeout=120)
     if killed:
         assert process.returncode == 1
-        assert f"Process {rank} of 0..1" in said and "SIGKILL" in said and "Traceback" not in said
+        assert f"Process {rank} (of 0..1)" in said and "SIGKILL" in said and "Traceback" not in said
     again = lifted(*words(trained, output, 2, "--overwrite", "True"))
     assert again.returncode == 0, again.stderr
     check_same([alone, output])

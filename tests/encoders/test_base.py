@@ -35,7 +35,7 @@ def test_own_features_of_no_use_are_refused_by_name():
     labels = torch.zeros(2, 2).long()
     for pair, texts, name in (
         ((labels.to("meta"), UNIT), None, "labels of a"), ((labels, UNIT.to_sparse()), None, "vectors of a"),
-        ((labels, UNIT[:, :0]), None, "vectors of a"), ((labels, UNIT), {"\ud800": UNIT[0]}, "not a valid text"),
+        ((labels, UNIT[:, :0]), None, "vectors of a"), ((labels, UNIT), {"\ud800": UNIT[0]}, "not a valid prompt"),
     ):  # fmt: skip
         refused(lambda given=(pair, texts): precomputed_features([given[0]], given[1], ["a"]), name)
 
