@@ -1,7 +1,7 @@
 """Consensus of regions across views, computed before the lift.
 
 An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
-that cover the same Gaussians do not. The consensus therefore pulls each feature to those of overlapping regions in
+that cover the same Gaussians do not. The consensus therefore moves each feature toward those of overlapping regions in
 other views. Let E be the evidence, and W_jv(s) the weight of Gaussian j in the view of region s, including pixels
 without a region. Sums run over the Gaussians that are visible in both views::
 
@@ -63,7 +63,7 @@ class Overlaps(NamedTuple):
     iou: SparseRows
     """J, a symmetric [S, S] matrix without its diagonal."""
     inside: Float[Tensor, " nnz"]
-    """c_ts of every entry (s, t): the share of t that lies in s."""
+    """c_ts of every entry (s, t), the share of t that lies in s."""
     agreement: float
     """B, in 0..1."""
 
@@ -315,7 +315,7 @@ def _shares(
     estimate the sums over all Gaussians.
 
     Returns:
-        Three matrices: p of visible Gaussians [M, S], 1 for visible Gaussians [M, views], and sums of p [M, views].
+        The matrices p of visible Gaussians [M, S], 1 for visible Gaussians [M, views], and sums of p [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)
     if total is None:

@@ -39,9 +39,9 @@ class TensorRecord:
 
 @cache
 def has_triton() -> bool:
-    """Return True if Triton 3 or newer is installed, which is part of torch 2.4 and later on Linux.
+    """Return True if Triton 3 or newer is installed.
 
-    Without Triton, the default backend on a GPU is gsplat.
+    torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat.
     """
     if find_spec("triton") is None:
         return False

@@ -71,7 +71,7 @@ class Evidence(TensorRecord):
     num_views: int
     """Number of views, including those without regions."""
     weight_power: int = 1
-    """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code). 0: E counts pixels."""
+    """Exponent of A_ij in E. The paper uses 1, and SFS's code uses 2. With 0, E counts pixels."""
     num_excluded: int = 0
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 

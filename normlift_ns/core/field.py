@@ -216,7 +216,7 @@ class SemanticField(TensorRecord):
         beside: Mapping[str, str] = MappingProxyType({}),
         own: bool = False,
     ) -> None:
-        """Write field.safetensors, also evidence.safetensors for storage "evidence", and finally manifest.json.
+        """Write field.safetensors, evidence.safetensors (only for storage "evidence") and finally manifest.json.
 
         A folder with a manifest is complete. The manifest contains the digests of the files.
 

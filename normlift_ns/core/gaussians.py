@@ -61,7 +61,9 @@ class GaussianScene(TensorRecord):
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities"):
             if (device := getattr(self, name).device) != self.means.device:
-                raise InputError(f"GaussianScene.{name} is on {device}, but means are on {self.means.device}")
+                raise InputError(
+                    f"GaussianScene.{name} is on {device}, but means are on {self.means.device}; use one device"
+                )
         if bool((self.scales < 0).any()):
             raise InputError(
                 "GaussianScene.scales has negative values, expected linear scales; apply exp() to `scales` of a "

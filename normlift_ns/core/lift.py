@@ -146,7 +146,7 @@ def lift(
 
     Args:
         evidence: E, from `rasterize_evidence`.
-        features: one unit row per column of the evidence. Rounding of the lengths, up to 0.01, is corrected.
+        features: one unit row per column of the evidence. Deviations of the lengths up to 0.01 are corrected.
         beta: prior strength of the shrinkage of R, as a number of views, >= 0.
         unlabeled: "ignore" omits unlabeled pixels. "dilute" counts them in every W_jv, as observations of the zero
             vector.

@@ -63,7 +63,7 @@ def nearest_neighbors(
 
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
     uses `kernels.nearest`, which certifies every row of its result. It cannot certify rows with more ties than it keeps
-    candidates. For these, the GPU computes all distances, or the CPU repeats the search if they are many. A Gaussian
+    candidates. For such rows, the GPU computes all distances. If there are many, the CPU repeats the search. A Gaussian
     whose mean is not finite has no neighbors and is not a neighbor of others.
 
     Args:
@@ -191,7 +191,7 @@ def _members(position_of: np.ndarray, limit: int) -> np.ndarray:
     first = np.cumsum(count) - count
     slot = np.arange(min(limit, count.max()))
     member = np.where(slot < count[:, None], by_position[np.minimum(first[:, None] + slot, len(position_of) - 1)], -1)
-    return np.pad(member, ((0, 1), (0, 0)), constant_values=-1)  # the tree's index if distances overflow
+    return np.pad(member, ((0, 1), (0, 0)), constant_values=-1)  # the tree returns this row if distances overflow
 
 
 def _rank_gaussians(

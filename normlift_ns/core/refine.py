@@ -21,7 +21,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
-"""Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The first fits into CPU caches."""
+"""Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
 """Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
 MAX_VOTERS = 256
@@ -199,7 +199,7 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
         return config
     if n < 2:
         warnings.warn(
-            f"a scene of {n} Gaussian{'s' * (n != 1)} has no neighbors; no direction is refined", stacklevel=2
+            f"a scene of {n} Gaussian{'s' * (n != 1)} has no neighbors, so no direction is refined", stacklevel=2
         )
         return replace(config, k=k)
     reason = (
@@ -250,7 +250,7 @@ def voting_weights(
 ) -> Float64[Tensor, "m k_plus_1"]:
     """Return R_k d_ik of the given Gaussians, i itself first, or 0 for a missing neighbor.
 
-    The squared distance of the nearest reliable member of N+ is subtracted, which is i itself unless R_i = 0. This
+    Squared distances are relative to that of the nearest reliable member of N+, which is i itself unless R_i = 0. This
     multiplies all weights of i by one factor, so the winner stays the same, and the weights do not underflow. `_margin`
     multiplies Delta by the same factor.
     """
@@ -268,7 +268,8 @@ def posterior_weights(
 ) -> Float64[Tensor, "m k_plus_1"]:
     """Return own_i and P R_k d_ik / sum_k R_k d_ik of every neighbor, or 0 if it is missing or none is reliable.
 
-    The squared distance of the nearest reliable neighbor is subtracted. This cancels in the ratio and avoids underflow.
+    Squared distances are relative to that of the nearest reliable neighbor. This factor cancels in the ratio and avoids
+    underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
@@ -291,7 +292,7 @@ def _nearest(r: Tensor, square: Tensor) -> Tensor:
 
 
 def _decay(r: Tensor, square: Tensor) -> Tensor:
-    """Return d after subtracting the squared distance of the nearest reliable member."""
+    """Return d for squared distances relative to that of the nearest reliable member."""
     return torch.exp(-0.5 * (square - _nearest(r, square)).nan_to_num(0).clamp(min=0))
 
 

@@ -74,7 +74,7 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
             raise InputError("its header has no vertices")
         names = [item.name for item in vertex.properties]
         if "label" not in names:
-            raise InputError(f"its vertices have the properties {', '.join(names)}, but no label")
+            raise InputError(f"its vertices have no property label, only {', '.join(names)}")
         column = np.asarray(vertex["label"])
         labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
         if (labels != column).any():

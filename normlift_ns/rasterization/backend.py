@@ -89,7 +89,7 @@ class TileBackend:
         """Accept every job on any device."""
 
     def in_flight(self, job: RasterJob, camera: Camera) -> int:
-        """Return 1, because larger batches are not faster."""
+        """Return 1, because views are processed one at a time."""
         return 1
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)

@@ -405,7 +405,7 @@ def sum_tiles(  # pragma: no cover (compiled)
     slots,
     threads,
 ):
-    """Write a slot (Gaussian, label, sum of A_ij ** power) for every Gaussian of every tile and label with weight.
+    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile, Gaussian and label with a positive sum.
 
     The slots of a tile start at first_slot[tile], and their number is written to used[tile].
     """

@@ -43,8 +43,8 @@ class RasterSettings:
     min_compensation: float = 0.0
     """Lower bound of the factor by which antialiasing scales opacities."""
     per_axis: bool = False
-    """Shape that selects the tiles of a Gaussian. With False, it is a square as large as the longer axis. With True
-    (gsplat 1.5 and later), it is a rectangle around the pixels in which alpha can reach `min_alpha`."""
+    """Shape that selects the tiles of a Gaussian. False selects a square with the extent of the longer axis. True, as
+    in gsplat 1.5 and later, selects a rectangle around the pixels in which alpha can reach `min_alpha`."""
     radius_sigmas: float = 3.0
     """Half side of the square, or largest half side of the rectangle, in standard deviations."""
     tile_size: int = 16
