@@ -77,10 +77,10 @@ class LerfOptions(CheckedOptions):
 
 @dataclass(frozen=True)
 class MaskOptions(CheckedOptions):
-    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks with the images' names."""
+    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks, named like the images."""
 
     names: Path | None = None
-    """JSON file with the name of every mask value. None reads labels.json next to the mask folder."""
+    """JSON file with the name of every mask value (default: labels.json next to the mask folder)."""
     purity: float = 0.75
     """Smallest share of a Gaussian's weight in masks of one class for which it is scored, in 0..1. Larger values score
     fewer Gaussians."""
