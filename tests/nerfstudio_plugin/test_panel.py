@@ -315,7 +315,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     means = np.stack([vertices[axis] for axis in "xyz"], axis=1)
     assert np.array_equal(means, pipeline.model.means.detach()[rows].cpu().numpy())
     faint[:] = -9.0
-    for prompts, message in (("left", "ever drawn"), ("up", "Nothing is selected")):
+    for prompts, message in (("left", "cannot be drawn"), ("up", "Nothing is selected")):
         ask(panel, prompts)
         panel.act(Action("Download selection"), client=browser)
         assert message in said(panel) and len(browser.files) == 1
