@@ -113,12 +113,12 @@ class SparseRows(TensorRecord):
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
         if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
             raise InputError(
-                f"row offsets must increase from 0 to the number of entries, found {ends} for {size} columns and "
+                f"row offsets must rise from 0 to the number of entries, found {ends} for {size} columns and "
                 f"{self.weight.numel()} weights"
             )
         low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
         if low < 0:
-            raise InputError(f"columns must be >= 0, found {low}")
+            raise InputError(f"columns must be 0 or more, found {low}")
         return high + 1
 
     def row_index(self) -> Int64[Tensor, " nnz"]:
