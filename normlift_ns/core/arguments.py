@@ -304,11 +304,7 @@ def _layout(value: Any) -> str | None:
 
 
 def as_tensor(name: str, value: Any, expected: str) -> Any:
-    """Convert a NumPy array or nested lists of numbers to a tensor, and return tensors unchanged.
-
-    Raises:
-        ArgumentError: if the value cannot be converted. The message shows `expected`.
-    """
+    """Convert a NumPy array or nested lists to a tensor, or raise ArgumentError with `expected` in the message."""
     if not isinstance(value, np.ndarray | list | tuple):
         if (layout := _layout(value)) is None:
             raise _error(name, expected, value)

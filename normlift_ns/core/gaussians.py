@@ -82,8 +82,7 @@ class GaussianScene(TensorRecord):
     def drawable(self) -> Bool[Tensor, " n"]:
         """Mask of the Gaussians that are drawn.
 
-        Their parameters are finite and small enough for float32, and their quaternions have a valid length. The limits
-        do not depend on the precision, so every backend draws the same Gaussians. A scale of 0 is valid.
+        Their parameters are finite and within limits for float32, which do not depend on the precision or the backend.
         """
         length = self.quats.float().abs().amax(dim=1)  # the length up to a factor of 2
         low, high = QUATERNION_RANGE

@@ -198,9 +198,7 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     if k == config.k:
         return config
     if n < 2:
-        warnings.warn(
-            f"a scene of {n} Gaussian{'s' * (n != 1)} has no neighbors, so no direction is refined", stacklevel=2
-        )
+        warnings.warn(f"{n} Gaussian{'s' * (n != 1)} cannot have neighbors, so no direction is refined", stacklevel=2)
         return replace(config, k=k)
     reason = (
         f"only {n - 1:,} other Gaussian{'s' * (n != 2)} can vote"
@@ -268,8 +266,7 @@ def posterior_weights(
 ) -> Float64[Tensor, "m k_plus_1"]:
     """Return own_i and P R_k d_ik / sum_k R_k d_ik of every neighbor, or 0 if it is missing or none is reliable.
 
-    Squared distances are relative to that of the nearest reliable neighbor. This factor cancels in the ratio and avoids
-    underflow.
+    Squared distances are relative to that of the nearest reliable neighbor, which cancels and avoids underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])

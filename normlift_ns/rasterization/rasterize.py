@@ -281,9 +281,7 @@ def _job(
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
-        raise InputError(
-            f"dtype must be torch.float32 or torch.float64, got {dtype}; pass dtype for a scene in {dtype}"
-        )
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; pass one for a {dtype} scene")
     return RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
 
 
