@@ -1,1 +1,1 @@
-"""The method on plain tensors, built on torch, numpy, scipy and safetensors; nerfstudio is not needed."""
+"""The method on plain tensors. It needs torch, numpy, scipy and safetensors, but not nerfstudio."""

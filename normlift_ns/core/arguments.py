@@ -1,7 +1,7 @@
-"""Checks of the arguments of public functions, against their annotations.
+"""Runtime checks of public functions' arguments against their annotations.
 
-`check_arguments` decorates every public function and record. Its annotations are the kinds that it accepts. If they
-say Tensor, a NumPy array and nested lists of numbers are accepted too and converted. This module does not need torch.
+`check_arguments` decorates every public function and record. Arguments that are annotated as tensors may also be NumPy
+arrays or nested lists of numbers, which are converted. This module imports torch only to convert an array.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from normlift_ns.options import check_path, short_repr
 
 _T = TypeVar("_T")
 _Sizes = dict[str, Any]
-"""Lengths of the named axes of the arguments so far."""
+"""Length of each named axis in the arguments that were checked so far."""
 _Check = Callable[[str, Any, _Sizes], Any]
-"""Function of name, value and sizes; it returns the converted value."""
+"""Function that checks an argument, given its name, value and axis lengths, and returns the converted value."""
 
 
 def check_arguments(target: _T) -> _T:
-    """Decorate a function, a dataclass or a NamedTuple, whose arguments are then checked against their annotations.
+    """Decorate a function, dataclass or NamedTuple to check its arguments against their annotations at every call.
 
     >>> @check_arguments
     ... def double(number: int, word: Literal["twice"] = "twice") -> int:
@@ -64,11 +64,11 @@ def check_arguments(target: _T) -> _T:
 
 
 def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[str, _Check]]], dict[str, _Check]]:
-    """Return an iterable of the names and checks of positional arguments, and the checks of keywords."""
+    """Return a function that lists (name, check) pairs of positional arguments, and the checks of keywords."""
     hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
     named, ordered, more = dict[str, _Check](), list[tuple[str, _Check]](), ("", _anything)
     for p in inspect.signature(function).parameters.values():
-        if p.kind == p.VAR_KEYWORD and p.name in hints:  # Unpack[a TypedDict]
+        if p.kind == p.VAR_KEYWORD and p.name in hints:  # **kwargs: Unpack[TypedDict]
             named |= {key: _check_of(hint) for key, hint in get_type_hints(get_args(hints[p.name])[0]).items()}
             continue
         named[p.name] = _check_of(hints.get(p.name, Any))
@@ -80,11 +80,11 @@ def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[s
 
 
 def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
-    """Raise InputError if an array of whole numbers names a row that does not exist.
+    """Raise InputError unless all row indices are in low..size - 1.
 
     Args:
         size: number of rows.
-        low: smallest number; -1 if it stands for no row.
+        low: smallest valid index, -1 if -1 marks a missing row.
     """
     first, last = map(int, rows.aminmax()) if rows.numel() > 0 else (low, low)
     if first < low or max(last, 0) >= max(size, 1):
@@ -92,7 +92,7 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
 
 
 class _Names(dict[str, Any]):
-    """Names that annotations may use; those imported for type checkers only stand for anything."""
+    """Namespace for evaluating annotations. Names that are imported only for type checkers resolve to Any."""
 
     def __missing__(self, name: str) -> Any:
         if hasattr(builtins, name):
@@ -110,7 +110,7 @@ def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
 
 
 def _check_of(hint: Any) -> _Check:
-    """Return the check of an annotation; annotations without a rule here accept anything."""
+    """Return the check for an annotation. Annotations without a rule accept any value."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is None:
         return _ArrayCheck(hint) if hasattr(hint, "dim_str") else _plain_check(hint)
@@ -157,7 +157,7 @@ def _number_check(kind: type) -> _Check:
     def check(name: str, value: Any, _: _Sizes) -> Any:
         if type(value) is kind and (kind is int or not math.isnan(value)):
             return value
-        with suppress(OverflowError):  # an integer with hundreds of digits
+        with suppress(OverflowError):  # raised if an integer is too large for a float
             if isinstance(value, accepted) and not isinstance(value, bool) and not math.isnan(value):
                 return cast(Any, kind)(value)
         raise _error(name, expected, value)
@@ -181,14 +181,14 @@ def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, 
         try:
             return check(name, value, sizes)
         except InputError as error:
-            if len(checks) == 1 or not str(error).startswith(start):  # of an item
+            if len(checks) == 1 or not str(error).startswith(start):  # an error about one item of the value
                 raise
             expected.append(str(error).removeprefix(start).rpartition(", got ")[0])
     raise _error(name, " or ".join(expected), value)
 
 
 def _list_check(origin: type, hint: Any) -> _Check:
-    """Return the check of a sequence or an iterable, whose items are converted as they come."""
+    """Return the check for a sequence or an iterable. Items of an iterable are checked and converted lazily."""
     item = _check_of(hint)
 
     def check(name: str, value: Any, _: _Sizes) -> Any:
@@ -211,7 +211,7 @@ def _tuple_check(parts: Sequence[Any]) -> _Check:
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
         if not isinstance(value, list | tuple) or len(value) != len(checks):
-            raise _error(name, f"a tuple of {len(checks)}", value)
+            raise _error(name, f"a tuple of {len(checks)} items", value)
         return tuple(one(f"{name}[{i}]", item, sizes) for i, (one, item) in enumerate(zip(checks, value)))
 
     return check
@@ -227,15 +227,15 @@ def _mapping_check(item: _Check) -> _Check:
 
 
 def _function_check(parts: Sequence[Any]) -> _Check:
-    """Return the check of a function and of the arrays that it returns."""
+    """Return the check for a function argument. Arrays that the function returns are checked too."""
     arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
         try:
             inspect.signature(value if callable(value) else lambda: 0).bind(*arguments)
         except TypeError:
-            raise _error(name, f"a function of {len(arguments)} values", value) from None
-        except ValueError:  # from some built-in functions, which have no signature
+            raise _error(name, f"a function of {len(arguments)} arguments", value) from None
+        except ValueError:  # some built-in functions have no signature
             pass
 
         def call(*args: Any) -> Any:
@@ -250,17 +250,17 @@ def _function_check(parts: Sequence[Any]) -> _Check:
 
 
 class _ArrayCheck:
-    """Check of a jaxtyping annotation: kind of numbers, number of axes, and their lengths."""
+    """Check for a jaxtyping annotation: number type, number of axes, and their lengths."""
 
     def __init__(self, hint: Any) -> None:
         self.kind, axes = hint.__name__.partition("[")[0].rstrip("0123456789"), hint.dim_str.split()
         self.kinds = {self.kind, "Int"} if self.kind == "UInt" and "8" not in hint.__name__ else {self.kind}
         self.expected = f"an array of {_KINDS.get(self.kind, self.kind)} of shape [{', '.join(axes)}]"
-        self.axes, self.wide = axes, axes[:1] != [] and axes[0].startswith("*")  # a first axis *n is any number of axes
+        self.axes, self.wide = axes, axes[:1] != [] and axes[0].startswith("*")  # *n stands for any number of axes
         self.to_numpy, self.numpy = hint.array_type is np.ndarray, hint.array_type in (np.ndarray, Any)
 
     def __call__(self, name: str, value: Any, sizes: _Sizes) -> Any:
-        """Return the array as a tensor, or as NumPy's if the annotation says so."""
+        """Return the value as a tensor, or as a NumPy array if the annotation requires one."""
         value = value if self.numpy and isinstance(value, np.ndarray) else self._convert(name, value)
         shape, more = tuple(value.shape), len(value.shape) - len(self.axes)
         if _kind_of(value.dtype) not in self.kinds or (more < -1 if self.wide else more != 0):
@@ -289,13 +289,13 @@ _KINDS = {"Float": "floating-point numbers", "Int": "whole numbers", "UInt": "by
 
 @cache
 def _kind_of(dtype: Any) -> str:
-    """Return Float, Int, UInt or Bool; other dtypes have names of their own."""
+    """Return "Float", "Int", "UInt" or "Bool", or the name of any other dtype."""
     name = str(dtype).removeprefix("torch.").replace("bfloat", "float").replace("float8", "8-bit float")
     return next((kind for kind in _KINDS if name.startswith(kind.lower())), name)
 
 
 def _layout(value: Any) -> str | None:
-    """Return what keeps an array from being used, such as sparse_coo or meta; "": nothing, None: not an array."""
+    """Return the unsupported layout of a tensor, such as "meta", "" for a usable array, or None for other values."""
     torch = sys.modules.get("torch")
     if torch is None or not isinstance(value, torch.Tensor):
         return "" if isinstance(value, np.ndarray) else None
@@ -304,12 +304,12 @@ def _layout(value: Any) -> str | None:
 
 
 def as_tensor(name: str, value: Any, expected: str) -> Any:
-    """Return a tensor, a NumPy array or nested lists of numbers as a tensor."""
+    """Convert a NumPy array or nested lists to a tensor, or raise ArgumentError with `expected` in the message."""
     if not isinstance(value, np.ndarray | list | tuple):
         if (layout := _layout(value)) is None:
             raise _error(name, expected, value)
         if layout != "":
-            raise ArgumentError(f"{name} must be {expected}, dense and with its values, got a {layout} tensor")
+            raise ArgumentError(f"{name} must be {expected}, got a {layout} tensor; pass a dense tensor with data")
         return value.resolve_neg()
     import torch  # noqa: PLC0415 (a command-line query does not need it)
 

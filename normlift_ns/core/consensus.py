@@ -1,9 +1,9 @@
 """Consensus of regions across views, computed before the lift.
 
-An error in a 2D feature affects its whole region in one view, so neighbors in space repeat it. Regions of other views
-that cover the same Gaussians do not. Each region therefore takes the feature that these regions agree on. Let E be the
-evidence, and W_jv(s) the weight of Gaussian j in the view of region s, including pixels without a region. Sums run
-over the Gaussians that both views see::
+An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
+that cover the same Gaussians do not. The consensus therefore moves each feature toward those of overlapping regions in
+other views. Let E be the evidence, and W_jv(s) the weight of Gaussian j in the view of region s, including pixels
+without a region. Sums run over the Gaussians that are visible in both views::
 
     p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 if below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
@@ -11,16 +11,16 @@ over the Gaussians that both views see::
     B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           weighted mean of the best overlaps
     F'_s = normalize(F_s + b(B) sum_t J_st c_ts ** q F_t)        b: 0 up to B = 0.4, then linear, 1 from B = 0.5
 
-Pixels without a region count as well. Otherwise, an object without a mask in some view would seem to lie in the masks
-of its neighbors, because their frayed borders reach it. The part of s that lies in regions of view v is
+W_jv(s) includes pixels without a region, because masks have inaccurate borders. Otherwise, an object without a mask in
+some view would appear to lie in the masks of adjacent objects. The part of s that lies in regions of view v is
 a_sv = sum_j p_js sum_{t in v} p_jt.
 
-The factor c_ts limits the influence of a region t that covers several objects. B distinguishes regions of objects from
-cells of an arbitrary partition, whose overlaps only average neighboring cells. For example, a square of one grid and
-the best match in a randomly shifted copy of that grid share 9/16 of their area on average, which is J = 0.39.
+The factor c_ts limits the influence of a region t that covers several objects. B distinguishes masks of objects from
+cells of an arbitrary partition, for which the consensus would only average neighboring cells. For example, a square of
+a grid and its best match in a randomly shifted grid share 9/16 of their area on average. This corresponds to J = 0.39.
 
-Directions come from the lift of F'. R stays that of the lift of F (see `with_original_reliability`): it measures
-how far the regions disagreed before the consensus. It ranks the answers of F' better than the R of F' does.
+Directions come from the lift of F', but R comes from the lift of F (see `with_original_reliability`). This R measures
+how much the regions disagreed before the consensus. It predicts the accuracy of F' better than the R of F' does.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ from normlift_ns.core.sparse import SparseRows, row_offsets, run_starts, segment
 from normlift_ns.errors import InputError
 
 MIN_OVERLAP = 0.1
-"""Smaller overlaps, both one-sided (c) and symmetric (J), count as 0."""
+"""Smallest overlap that counts, both one-sided (c) and symmetric (J). Smaller overlaps are set to 0."""
 MIN_VISIBILITY = 0.5
-"""Smallest weight with which a view sees a Gaussian, as a share of the median over the Gaussians in its regions."""
+"""Smallest weight of a visible Gaussian, as a share of the median weight of the Gaussians in the same view."""
 CHANCE_AGREEMENT, AGREEMENT_RAMP = 0.4, 0.1
-"""Largest B of regions that overlap by chance, and the rise of B above it at which all regions count as objects."""
+"""Largest B of regions that overlap by chance, and the further increase of B at which b(B) reaches 1."""
 MIN_SHARE = 0.02
-"""Smallest share of a Gaussian's weight in a view for which a region of that view counts."""
+"""Smallest p_js that counts. Smaller shares are set to 0."""
 SAMPLING_SEED = 0
-"""Seed of the order in which Gaussians are sampled."""
+"""Seed of the pseudo-random order in which Gaussians are sampled."""
 _MEDIAN_SAMPLE = 2**16
-"""Approximate number of weights from which medians are computed."""
+"""Approximate number of weights in the sample for medians."""
 _MAX_PRODUCTS, _MAX_DENSE = 2**25, 2**26
-"""Products of entries (CPU) and elements of a dense block (GPU) that are held in memory at a time."""
+"""Largest number of products of entries (CPU) and of elements of a dense block (GPU) in memory at a time."""
 
 
 class Overlaps(NamedTuple):
-    """Overlaps of regions of different views, at one level."""
+    """Overlaps between regions of different views at one level."""
 
     iou: SparseRows
     """J, a symmetric [S, S] matrix without its diagonal."""
     inside: Float[Tensor, " nnz"]
-    """c_ts of every entry (s, t): the share of t that lies in s."""
+    """c_ts of every entry (s, t), the share of t that lies in s."""
     agreement: float
     """B, in 0..1."""
 
 
 @check_arguments
 class Consensus(NamedTuple):
-    """Feature table that the views agree on, with statistics of the consensus.
+    """Feature table after the consensus, with statistics.
 
     >>> import torch
     >>> from normlift_ns import Evidence, consensus
@@ -100,17 +100,17 @@ def consensus(
     sample: int = 50,
     least: float = CHANCE_AGREEMENT,
 ) -> Consensus:
-    """Compute F' of every region with the formulas at the top of this file.
+    """Compute F' of every region with the formulas at the top of this module.
 
     Args:
         features: unit rows or 0, one per column of the evidence.
-        level: level of every region; regions of different levels are not compared. None: all have the same level.
+        level: level of every region (default: the same for all). Regions of different levels are not compared.
         power: q, the exponent of c_ts, >= 0.
-        sample: smallest number of Gaussians to sample in a region, >= 1; regions with fewer use all of them.
+        sample: smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
         least: largest B at which regions overlap by chance and keep their features, in 0..1.
     Raises:
-        ValueError: if the table or the levels have another length, a row is neither a unit vector nor 0, a level is
-            negative, or `power`, `sample` or `least` is out of range.
+        ValueError: if `features` or `level` has another length, a feature is neither a unit vector nor 0, or another
+            argument is out of range.
 
     >>> import torch
     >>> from normlift_ns import Evidence, consensus
@@ -132,9 +132,9 @@ def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) ->
     """Raise ValueError if the features or levels do not fit evidence of `size` regions."""
     for name, length in (("features", len(features)), ("level", size if level is None else len(level))):
         if length != size:
-            raise InputError(f"{name} must have one row per region of the evidence, {size:,}; got {length:,}")
+            raise InputError(f"{name} must have one row per region of the evidence ({size:,}), got {length:,}")
     if level is not None and bool((level < 0).any()):
-        raise InputError(f"level must be whole numbers >= 0, got {int(level.min())}")
+        raise InputError(f"level must contain whole numbers >= 0, got {int(level.min())}")
     check_unit_rows(features, "feature rows", "normalize them, or set those without a feature to 0", allow_zeros=True)
 
 
@@ -160,7 +160,7 @@ def sampled_consensus(
 
     Args:
         sampled: evidence of the Gaussians from `sample_gaussians`.
-        probability: sampling probability of each.
+        probability: sampling probability of each row.
         features, level, power, least: as in `consensus`.
     """
     rows, size, device = sampled.rows, sampled.num_regions, sampled.rows.weight.device
@@ -190,7 +190,7 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
 def apply_consensus(
     features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
-    """Return F' of the regions of one level. Regions without overlaps keep their rows unchanged."""
+    """Return F' of the regions of one level. Regions without overlaps keep their rows of F."""
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features
@@ -206,15 +206,15 @@ def apply_consensus(
 def sample_gaussians(
     rows: SparseRows, num_columns: int, least: int, portion: Partition | None = None
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
-    """Sample Gaussians until every region has at least `least` of them, or all that it contains.
+    """Sample Gaussians until every region has at least `least` of them, or all of its Gaussians.
 
-    Each Gaussian gets a pseudo-random number from its index alone. A region takes the Gaussians whose number is below
-    its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
+    Each Gaussian has a pseudo-random number that depends only on its index. A region samples the Gaussians whose
+    number is below its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
 
     Args:
-        portion: Gaussians of the rows; None: all Gaussians. Regions count the Gaussians of all processes.
+        portion: part of the Gaussians that `rows` covers (default: all). Counts include all processes.
     Returns:
-        The sampled rows, and the sampling probability of each.
+        Indices of the sampled rows, and the sampling probability of each.
     """
 
     def count_entries(entries: SparseRows) -> Int64[Tensor, " columns"]:
@@ -239,7 +239,7 @@ def total_view_weights(evidence: Evidence, levels: int = 1) -> SparseRows:
     """Return W_jv of all Gaussians, [M, views], including pixels without a region.
 
     Args:
-        levels: number of levels, by which weights are divided because the evidence counts a pixel once per level.
+        levels: number of levels. Weights are divided by it, because the evidence counts every pixel once per level.
     """
     total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
     return replace(total, weight=total.weight / levels)
@@ -256,8 +256,8 @@ def region_overlaps(
     Args:
         rows: E, [M, S].
         region_view: view of every column, non-decreasing.
-        probability: sampling probability of every row; None: the rows are those of all Gaussians.
-        total: W_jv, [M, views], including pixels without a region; None: every pixel lies in a region.
+        probability: sampling probability of every row (default: 1, if the rows are not a sample).
+        total: W_jv, [M, views], including pixels without a region (default: all pixels have a region).
     """
     size, view = len(region_view), region_view.long()
     last = [x.max() for x in (view, *(() if total is None else (total.column,))) if len(x) > 0]
@@ -286,7 +286,7 @@ def region_overlaps(
 
 
 def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-    """Return a well-mixed number in [0, 1) for every index, computed by the last step of MurmurHash3."""
+    """Return a pseudo-random number in [0, 1) for every index, computed by the finalizer of MurmurHash3."""
     x = index + SAMPLING_SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
@@ -294,7 +294,7 @@ def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
 
 
 def _largest_share(rows: SparseRows, share: Float64[Tensor, " s"]) -> Float64[Tensor, " n"]:
-    """Return the largest share among the columns of every row, 0 for an empty row."""
+    """Return the largest share among the columns of every row, or 0 for an empty row."""
     if can_use_triton(share):
         from normlift_ns.kernels.sparse import row_max  # noqa: PLC0415 (needs triton)
 
@@ -309,13 +309,13 @@ def _shares(
     probability: Float64[Tensor, " m"] | None,
     total: SparseRows | None,
 ) -> tuple[SparseRows, SparseRows, SparseRows]:
-    """Return the shares of Gaussians in regions, and the views that see them.
+    """Return the shares of Gaussians in regions, and the views in which they are visible.
 
     All values are divided by the square root of the Gaussian's sampling probability. Sums of their products therefore
     estimate the sums over all Gaussians.
 
     Returns:
-        p in the views that see a Gaussian [M, S], 1 for each of these views [M, views], and the sums of p by view.
+        The matrices p of visible Gaussians [M, S], 1 for visible Gaussians [M, views], and sums of p [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)
     if total is None:
@@ -352,7 +352,7 @@ def _group_by_view(
 
 
 def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: int) -> Float64[Tensor, " groups"]:
-    """Return the lower median of every group, 0 for empty groups."""
+    """Return the lower median of every group, or 0 for an empty group."""
     order = values.argsort(stable=True)
     order = order[group[order].argsort(stable=True)]
     offsets = row_offsets(group, groups)
@@ -364,14 +364,14 @@ def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: 
 
 
 _Block = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Sums for a block of regions s. The first two are sum_j p_js over all that a view sees and over its regions only, both
-[regions, views]. The others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `MIN_OVERLAP`."""
+"""Sums for a block of regions s. The first two, [regions, views], are sum_j p_js over visible Gaussians and a_sv. The
+others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `MIN_OVERLAP`."""
 
 
 def _inner_products(
     shares: SparseRows, visible: SparseRows, labeled: SparseRows, view: Int64[Tensor, " s"], views: int
 ) -> Iterator[_Block]:
-    """Yield the products of all regions, block by block."""
+    """Yield the sums for all regions, block by block."""
     order = shares.column.argsort(stable=True)
     row, weight = shares.row_index()[order].int(), shares.weight[order]
     by_region = SparseRows(row_offsets(shares.column, len(view)), row, weight)  # the transpose

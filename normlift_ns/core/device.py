@@ -1,4 +1,4 @@
-"""Choice of the device, availability of the Triton kernels, batches that fit GPU memory, and a prefetching `map`."""
+"""Device selection, availability of Triton, batches that fit into GPU memory, and a prefetching `map`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Record = TypeVar("Record")
 
 
 class TensorRecord:
-    """Base of dataclasses whose fields are tensors, other such dataclasses, or values without a device."""
+    """Base class of dataclasses whose fields are tensors, other such dataclasses, or values without a device."""
 
     def to(self: Record, device: torch.device | str) -> Record:
         """Return a copy on another device."""
@@ -39,34 +39,34 @@ class TensorRecord:
 
 @cache
 def has_triton() -> bool:
-    """Return whether Triton 3 or newer is installed, as with torch 2.4 and later on Linux.
+    """Return True if Triton 3 or newer is installed.
 
-    Without it, stock gsplat rasterizes on the GPU.
+    torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat.
     """
     if find_spec("triton") is None:
         return False
     try:
         return int(version("triton").partition(".")[0]) >= MIN_TRITON_VERSION
-    except (PackageNotFoundError, ValueError):  # from another distribution, whose version is not comparable
+    except (PackageNotFoundError, ValueError):  # Triton of another distribution, with another version scheme
         return True
 
 
 def can_use_triton(tensor: Tensor) -> bool:
-    """Return whether the Triton kernels can process a tensor: it is on a GPU, and Triton is installed."""
+    """Return True if the tensor is on a GPU and Triton is installed."""
     return tensor.is_cuda and has_triton()
 
 
 def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -> list[Result]:
-    """Run a function on all items; if the GPU runs out of memory, split them into halves recursively.
+    """Run a function on all items. If the GPU runs out of memory, split the items into halves recursively.
 
     Args:
         run: function of a part of the items.
         items: sequence, or tensor that is split along its first dimension.
-        advice: remedy that the message of the MemoryError suggests.
+        advice: suggestion for the user in the message of the MemoryError.
     Returns:
         The results of all parts, in order.
     Raises:
-        MemoryError: if a single item is too large.
+        MemoryError: if a single item does not fit into GPU memory.
     """
     try:
         return [run(items)]
@@ -79,9 +79,9 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 
 
 def init_cuda(device: str) -> None:
-    """Initialize CUDA in the background, which takes a second.
+    """Initialize CUDA in a background thread, because it takes about a second.
 
-    Errors are ignored here, because they recur and are reported when the GPU is used.
+    Errors are ignored here. They occur again at the first use of the GPU.
     """
 
     def start() -> None:
@@ -93,7 +93,7 @@ def init_cuda(device: str) -> None:
 
 
 def choose_device(device: str) -> str:
-    """Return the device to use; "auto" is cuda if available, else cpu.
+    """Return the device to use. "auto" selects cuda if available, else cpu.
 
     Raises:
         ValueError: if the device is unknown or this machine does not have it.
@@ -102,22 +102,22 @@ def choose_device(device: str) -> str:
     if device.startswith("cuda"):
         count = torch.cuda.device_count()
         if count == 0:
-            raise InputError(f"--device {device}: this machine has no CUDA device; use --device cpu")
+            raise InputError(f"--device {device} needs a CUDA device, but this machine has none; use --device cpu")
         if int(device[5:] or 0) >= count:
-            raise InputError(f"--device {device}: no such device; the last one is cuda:{count - 1}")
+            raise InputError(f"--device {device} does not exist; choose one of cuda:0 to cuda:{count - 1}")
     if device != "auto":
         return device
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-# Batched computation that adapts to the available GPU memory, and prefetching `map`.
+# Prefetching `map`, and batches that adapt to the available GPU memory.
 
 
 def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Yield `map(function, items)`, and compute up to `threads` of the next results while the caller uses one.
+    """Yield the results of `map(function, items)`, and compute up to `threads` of the next ones in the background.
 
-    Items are requested in the caller's thread. An exception of the items or the function is raised when its turn comes.
-    With one thread, nothing is prefetched.
+    The caller's thread iterates over `items`. Exceptions are raised in the order of the items. With one thread, nothing
+    is prefetched.
 
     >>> list(prefetch_map(abs, [-1, 2, -3], 2))
     [1, 2, 3]
@@ -130,7 +130,7 @@ def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], thre
     def submit(count: int) -> None:
         try:
             pending.extend(pool.submit(function, item) for item in islice(iterator, count))
-        except Exception as error:  # raised by the items
+        except Exception as error:  # raised by the iterator of items
             pending.append(Future())
             pending[-1].set_exception(error)
 
@@ -153,7 +153,7 @@ _ADVICE = (
 
 @dataclass
 class AdaptiveBatches:
-    """Splits work into batches. If GPU memory cannot hold a batch, it is split, and all later batches are smaller."""
+    """Batched computation that reduces the batch size if a batch does not fit into GPU memory."""
 
     batch_size: int
     """Number of items per batch."""
@@ -162,7 +162,7 @@ class AdaptiveBatches:
         """Yield the results of the function on consecutive batches of items.
 
         Raises:
-            MemoryError: If not even one item fits.
+            MemoryError: if a single item does not fit into GPU memory.
         """
         start = 0
         while start < len(items):
@@ -176,16 +176,15 @@ class AdaptiveBatches:
     def map_across(
         self, function: Callable[[Sequence[Item]], Tensor], parts: Iterable[Sequence[Item]]
     ) -> Iterator[list[Tensor]]:
-        """Yield the rows of each part, one per item; one batch may hold items of several parts.
+        """Yield the result rows of each part, one row per item. A batch may contain items of several parts.
 
-        Every batch has the same shape: the last one is padded with copies of its last item. A row therefore depends on
-        the rest of its batch by rounding only.
+        All batches have the same shape, because the last one is padded with copies of its last item. The other items
+        of a batch therefore change a row only by rounding.
 
-        A part is requested when the earlier parts leave room in a batch, and its rows are yielded as soon as they are
-        computed.
+        The next part is requested when a batch has room for more items. Rows are yielded as soon as they are computed.
 
         Raises:
-            MemoryError: If not even one item fits.
+            MemoryError: if a single item does not fit into GPU memory.
         """
         counts, queue, rows = deque[int](), list[Item](), deque[Tensor]()
         for part in parts:

@@ -1,6 +1,6 @@
 """Evidence E_js: the weight of Gaussian j in image region s.
 
-Evidence is all that a lift needs from rasterization, and does not depend on features.
+A lift needs nothing else from the rasterizer. Evidence does not depend on features.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from normlift_ns.options import short_repr
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""
 WEIGHT_POWERS = (0, 1, 2)
-"""Exponents of the weights A_ij in evidence; 0 counts pixels."""
+"""Valid exponents of the weights A_ij in evidence. With 0, evidence counts pixels."""
 
 
 @check_arguments
 class Entries(NamedTuple):
-    """Nonzero weights that a rasterizer returns for one or more views: distinct and sorted by (gaussian, column)."""
+    """Nonzero weights from a rasterizer for one or more views, distinct and sorted by (gaussian, column)."""
 
     gaussian: Int[Tensor, " nnz"]
     column: Int[Tensor, " nnz"]
@@ -45,7 +45,7 @@ class Entries(NamedTuple):
 @check_arguments
 @dataclass(frozen=True)
 class Evidence(TensorRecord):
-    """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
+    """Sparse matrix E_js, the sum of A_ij over the pixels i of region s, and the weights in unlabeled pixels per view.
 
     Columns s number the regions of all views consecutively, like the rows of the feature table. They ascend within a
     row, so the order is the same in every run. The constructor raises ValueError if the arrays are inconsistent.
@@ -71,7 +71,7 @@ class Evidence(TensorRecord):
     num_views: int
     """Number of views, including those without regions."""
     weight_power: int = 1
-    """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code). 0: E counts pixels."""
+    """Exponent of A_ij in E. The paper uses 1, and SFS's code uses 2. With 0, E counts pixels."""
     num_excluded: int = 0
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
@@ -80,12 +80,12 @@ class Evidence(TensorRecord):
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
             raise InputError(
-                f"Evidence arrays disagree: offsets end at {offsets[-1:].tolist()}, {column.numel()} columns, "
-                f"{weight.numel()} weights"
+                f"Evidence.rows is inconsistent: offsets end at {offsets[-1:].tolist()}, but there are "
+                f"{column.numel()} columns and {weight.numel()} weights"
             )
         if len(self.unlabeled) != self.num_gaussians:
             raise InputError(
-                f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian: {self.num_gaussians}"
+                f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian ({self.num_gaussians})"
             )
         if column.numel() > 0 and not (int(column.min()) >= 0 and int(column.max()) < self.num_regions):
             raise InputError(
@@ -96,7 +96,7 @@ class Evidence(TensorRecord):
             bool((self.region_view.diff() < 0).any())
             or not 0 <= int(self.region_view[0]) <= int(self.region_view[-1]) < self.num_views
         ):
-            raise InputError(f"Evidence.region_view must be non-decreasing in 0..{self.num_views - 1}")
+            raise InputError(f"Evidence.region_view must be non-decreasing, with values in 0..{self.num_views - 1}")
 
     @property
     def num_gaussians(self) -> int:
@@ -105,7 +105,7 @@ class Evidence(TensorRecord):
 
     @property
     def num_regions(self) -> int:
-        """S, the number of regions of all views, including regions that show no Gaussian."""
+        """S, the number of regions of all views, including regions without Gaussians."""
         return self.region_view.numel()
 
     @property
@@ -118,11 +118,11 @@ class Evidence(TensorRecord):
     def from_entries(
         parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
-        """Join the entries of all views, in their order.
+        """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: the number of Gaussians is negative, or does not fit into 31 bits; or the entries of a part are
-                not sorted, refer to other Gaussians or columns, or have weights that are negative or not finite.
+            ValueError: if `num_gaussians` is not in 0..2**31 - 1, or entries are not sorted, have invalid indices, or
+                have negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
             raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
@@ -132,7 +132,7 @@ class Evidence(TensorRecord):
 
     @staticmethod
     def join(parts: Sequence[Entries], num_gaussians: int, *, weight_power: int, num_excluded: int) -> Evidence:
-        """Run `from_entries` for entries of a rasterizer, which are not checked."""
+        """Build evidence as `from_entries` does, but without checking the entries."""
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
         rows, unlabeled = (_join_by_sorting if device.type == "cuda" else _join)(parts, num_gaussians, device)
@@ -141,7 +141,7 @@ class Evidence(TensorRecord):
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
-        """Entry offsets of the (Gaussian, view) groups; entries of a row that share a view are adjacent."""
+        """Offsets of the groups of entries that share a Gaussian and a view. Entries of a group are adjacent."""
         offsets, view = self.rows.offsets, self.region_view[self.rows.column.long()]
         starts = torch.ones(self.nnz, dtype=torch.bool, device=view.device)
         if self.nnz > 0:
@@ -165,7 +165,7 @@ class Evidence(TensorRecord):
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
 
         Raises:
-            ValueError: if a view does not exist or is given twice.
+            ValueError: if a view does not exist or occurs twice.
         """
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
@@ -179,7 +179,7 @@ class Evidence(TensorRecord):
         """Return the evidence of some views, renumbered in the given order.
 
         Raises:
-            ValueError: as `columns_of`.
+            ValueError: if a view does not exist or occurs twice.
         """
         columns = self.columns_of(views)
         chosen = torch.as_tensor(views, dtype=torch.int64, device=columns.device)
@@ -195,7 +195,7 @@ class Evidence(TensorRecord):
         """Return the evidence of some Gaussians, in the given order.
 
         Raises:
-            ValueError: a number is not one of a Gaussian.
+            ValueError: if a Gaussian does not exist.
         """
         check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
@@ -205,18 +205,19 @@ class Evidence(TensorRecord):
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """Return the evidence of coarser regions without rasterizing again.
 
-        E'_jt is the sum of E_js over all levels and over the columns s that become part of t. Evidence on the cells of
-        a partition yields that of any regions made of whole cells. It is exact up to rounding, because sums of
-        A_ij ** weight_power add up for any power. Columns that map to -1 join the unlabeled weight of their view.
+        E'_jt is the sum of E_js over all levels and over the columns s that are merged into t. From the cells of a
+        partition, this gives the evidence of any regions that consist of whole cells. The result is exact up to
+        rounding, because sums of A_ij ** weight_power are additive for any power. Columns that map to -1 are added to
+        the unlabeled weight of their view.
 
-        With several levels, every pixel is observed once per level, and W_jv counts it that many times, including
-        unlabeled weight. N_eff and R do not depend on the scale of W.
+        With several levels, W_jv and the unlabeled weight count every pixel once per level. N_eff and R do not depend
+        on the scale of W.
 
         Args:
-            columns: the new column of every column, one row per level; -1: none.
+            columns: new column of every old column, or -1 for none, with one row per level.
             region_view: view of every new column, non-decreasing.
         Raises:
-            ValueError: if a new column does not exist, or belongs to a different view than the columns that it joins.
+            ValueError: if a new column does not exist, or belongs to another view than its old columns.
         """
         if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
             raise InputError(
@@ -226,7 +227,7 @@ class Evidence(TensorRecord):
         columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
         level, column = (columns >= 0).nonzero(as_tuple=True)
         if not torch.equal(region_view[columns[level, column]], self.region_view[column]):
-            raise InputError("a new column must belong to the same view as the columns that it joins")
+            raise InputError("a new column must be in the same view as its old columns; check columns and region_view")
         if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
             return self
         old = self.rows.column.long()
@@ -246,17 +247,19 @@ class Evidence(TensorRecord):
     @staticmethod
     @check_arguments
     def merge(*parts: Evidence) -> Evidence:
-        """Append the views and columns of all parts in argument order; concatenate feature tables in the same order.
+        """Concatenate the views and columns of all parts in argument order.
+
+        The feature tables must be concatenated in the same order.
 
         Raises:
-            ValueError: if there is no part, or the parts differ in scene or weight power.
+            ValueError: if there are no parts, or they differ in the number of Gaussians or in the weight power.
         """
         if not parts:
-            raise InputError("Evidence.merge needs at least one part")
+            raise InputError("Evidence.merge needs at least one part, got none")
         for name in ("num_gaussians", "weight_power", "num_excluded"):
             values = [getattr(part, name) for part in parts]
             if len(set(values)) > 1:
-                raise InputError(f"Evidence.merge: parts must agree in {name}, found {values}")
+                raise InputError(f"parts of Evidence.merge must have the same {name}, found {values}")
         views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
         regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
         rows = SparseRows.append_columns([part.rows for part in parts], regions)
@@ -273,9 +276,9 @@ class Evidence(TensorRecord):
         Args:
             key: cache key, which is part of the digest.
             remarks: additional metadata for the file header, by name.
-            own: the file is part of a run or a cache that belongs to this package.
+            own: skip the checks of `io.guard`, for files in a run or cache of this package.
         Raises:
-            ValueError: as in `io.guard.refuse_inputs`, or the file at `path` is of another kind.
+            ValueError: if this would replace an input, a file of a run or data set, or a file of another type.
             OSError: if the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
@@ -295,10 +298,10 @@ class Evidence(TensorRecord):
         """Read a file that `save` wrote.
 
         Args:
-            key: the key that was given to `save`. With a key, files without a digest (of version 0.1) are rejected.
+            key: the key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
         Raises:
             FileNotFoundError: if the file does not exist.
-            ValueError: if it is not an evidence file, or is damaged.
+            ValueError: if the file is damaged or is not an evidence file.
         """
         remedy = "rasterize again"
         arrays = read_evidence(Path(path), key=key, remedy=remedy)
@@ -309,16 +312,13 @@ class Evidence(TensorRecord):
 
     @staticmethod
     def of_arrays(arrays: EvidenceArrays) -> Evidence:
-        """Wrap the arrays of a file without copying them."""
+        """Wrap the arrays of a file as tensors without copying them."""
         rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (arrays.rows, arrays.unlabeled))
         return Evidence(rows, torch.from_numpy(arrays.region_view), unlabeled, *arrays.counts)
 
 
 def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise if a value is negative or not finite.
-
-    Raises:
-        ValueError: if there are such values; the message counts them and shows the first.
+    """Raise ValueError if a value is negative or not finite. The message counts such values and shows the first.
 
     >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
     """
@@ -326,8 +326,8 @@ def check_not_negative(name: str, values: Tensor) -> None:
     if len(bad) > 0:
         first = int(bad[0, 0])
         raise InputError(
-            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite: {name}[{first}] is "
-            f"{float(values[first]):g}"
+            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite, for example "
+            f"{name}[{first}] = {float(values[first]):g}"
         )
 
 
@@ -341,17 +341,17 @@ def _check_counts(evidence: Evidence) -> None:
 def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:
     counts = part.num_regions
     if not all(0 <= count < 2**31 for count in counts) or sum(counts) + len(counts) >= 2**31:
-        raise InputError(f"{name}.num_regions must be counts that fit into 31 bits, got {short_repr(counts)}")
+        raise InputError(f"{name}.num_regions must contain counts >= 0 that fit into 31 bits, got {short_repr(counts)}")
     check_rows(f"{name}.gaussian", part.gaussian, num_gaussians)
     check_rows(f"{name}.column", part.column, sum(counts) + len(counts))
     order = part.gaussian.long() * 2**31 + part.column
     if bool((order.diff() <= 0).any()):
-        raise InputError(f"{name} must be distinct entries, sorted by gaussian and column")
+        raise InputError(f"{name} must have distinct entries, sorted by gaussian and column")
     check_not_negative(f"{name}.weight", part.weight)
 
 
 def _join(parts: Sequence[Entries], num_gaussians: int, device: torch.device) -> tuple[SparseRows, SparseRows]:
-    """Join regions and unlabeled pixels of all parts, writing every entry directly to its position."""
+    """Join the entries of all parts without sorting, separately for regions and unlabeled pixels."""
     labeled, blank = [], []
     first, view = 0, 0
     for part in parts:
@@ -367,9 +367,9 @@ def _join(parts: Sequence[Entries], num_gaussians: int, device: torch.device) ->
 def _join_by_sorting(
     parts: Sequence[Entries], num_gaussians: int, device: torch.device
 ) -> tuple[SparseRows, SparseRows]:
-    """Join the same entries by one stable sort, which is faster on a GPU.
+    """Compute the result of `_join` with one stable sort, which is faster on a GPU.
 
-    The rows of the unlabeled pixels follow those of the regions.
+    Entries of unlabeled pixels are sorted behind all entries of regions.
     """
     is_region, new = _column_table([count for part in parts for count in part.num_regions], 0, 0)
     code = torch.where(is_region, new, -1 - new).to(device)  # index of the region, or -1 - view
@@ -391,7 +391,7 @@ def _join_by_sorting(
 def _column_table(
     num_regions: Sequence[int], first_region: int, first_view: int
 ) -> tuple[Bool[Tensor, " columns"], Int32[Tensor, " columns"]]:
-    """Return which columns of `Entries` are regions, and the index of each region or, for the others, of the view."""
+    """Return a mask of the columns of `Entries` that are regions, and the region or view index of every column."""
     start = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
     is_region = torch.ones(int(start[-1]), dtype=torch.bool)
     is_region[start[:-1]] = False

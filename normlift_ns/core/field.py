@@ -57,7 +57,7 @@ class SemanticField(TensorRecord):
 
     scalars: Scalars
     source: Int32[Tensor, " n"]
-    """The refined direction of Gaussian i is that of source[i]; source[i] = i if the vote left i unchanged."""
+    """Gaussian whose direction Gaussian i takes in the refinement; source[i] = i if i keeps its own."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
     """JSON-ready metadata: storage (key `form`), sizes and bounds of all storage forms (key `forms`), fingerprint of
@@ -65,7 +65,7 @@ class SemanticField(TensorRecord):
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
-    """Null level of every Gaussian's own direction, see `core.null_level`; None without a null vocabulary."""
+    """Null level of every Gaussian's own direction (see `core.null_level`), or None without a null vocabulary."""
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -86,16 +86,16 @@ class SemanticField(TensorRecord):
         storage: Storage | Literal["auto"] = "auto",
         provenance: Mapping[str, Any] | None = None,
     ) -> SemanticField:
-        """Build a field, and record size and error bound of all three storage forms in its manifest.
+        """Build a field, and record the size and error bound of all three storage forms in its manifest.
 
         Args:
-            source: result of `refine`; None: unrefined.
-            tolerance: largest error of the cosine of any Gaussian to any unit vector, > 0.
+            source: result of `refine` (default: no refinement).
+            tolerance: largest error of the cosine between any Gaussian and any unit vector, > 0.
             storage: "auto" chooses the smallest storage whose bound is within the tolerance.
-            provenance: JSON-ready metadata for the manifest: source config and step, encoder, regions, hyperparameters.
+            provenance: JSON-ready metadata for the manifest, such as source config, step, encoder and hyperparameters.
         Raises:
-            ValueError: if `means` or `source` has another length, `tolerance` is not positive, `storage` is unknown,
-                or `storage` is "low_rank" and no rank meets the tolerance.
+            ValueError: if `means` or `source` has another length, an option is invalid, or no rank meets the tolerance
+                for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
         if len(means) != n or (source is not None and len(source) != n):
@@ -122,11 +122,11 @@ class SemanticField(TensorRecord):
         provenance: Mapping[str, Any],
         facts: Mapping[str, Any],
     ) -> SemanticField:
-        """Return a field with float32 scalars, and a manifest that identifies the Gaussians.
+        """Return a field with float32 scalars and a manifest that identifies the Gaussians.
 
         Args:
             provenance: as in `build`.
-            facts: choice of the storage form, for the manifest.
+            facts: metadata of the storage form for the manifest, from `choose_form`.
         """
         dimension = store.features.shape[1] if isinstance(store, StoredEvidence) else store.dimension
         manifest = {
@@ -142,7 +142,7 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
+        """Return a mask of the Gaussians with a direction, before or after the refinement."""
         mask = self.scalars.norm > 0
         return mask[self.source.long()] if refined else mask
 
@@ -150,7 +150,7 @@ class SemanticField(TensorRecord):
     def query(
         self, text_vectors: Float[Tensor, "q d"] | Float[np.ndarray, "q d"], *, refined: bool = True
     ) -> Float[Tensor, "n q"]:
-        """Return the cosine of every Gaussian's direction to Q vectors of any length > 0.
+        """Return the cosine between every Gaussian's direction and each of Q vectors of any length > 0.
 
         The cosine is 0 for Gaussians without a direction.
 
@@ -159,8 +159,8 @@ class SemanticField(TensorRecord):
         """
         if text_vectors.shape[1] != self.dimension:
             raise InputError(
-                f"text vectors must be [Q, {self.dimension}] like the field's features, got "
-                f"{tuple(text_vectors.shape)}; use the encoder that made them"
+                f"text vectors must have shape [Q, {self.dimension}], like the features of the field, got "
+                f"{tuple(text_vectors.shape)}; use the encoder of the lift"
             )
         vectors = torch.as_tensor(text_vectors).to(self.scalars.norm.device, torch.float64)
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
@@ -171,7 +171,7 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
-        """Return the null level of every Gaussian as one column; no column if the field has no null vocabulary."""
+        """Return the null level of every Gaussian as one column, or no column without a null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
@@ -185,7 +185,7 @@ class SemanticField(TensorRecord):
         rule: RelevancyRule = "cosine",
         refined: bool = True,
     ) -> Float[Tensor, "n q"]:
-        """Return the relevancy of every Gaussian to Q text vectors: `query` followed by `relevancy`.
+        """Return the relevancy of every Gaussian to Q text vectors, from the cosines of `query`.
 
         A Gaussian without a direction gets the smallest value of the rule, 0 or -2 ("margin"), and is never selected.
 
@@ -216,23 +216,23 @@ class SemanticField(TensorRecord):
         beside: Mapping[str, str] = MappingProxyType({}),
         own: bool = False,
     ) -> None:
-        """Write field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
+        """Write field.safetensors, evidence.safetensors (only for storage "evidence") and finally manifest.json.
 
-        A folder with a manifest is complete. The manifest holds the digests of the files.
+        A folder with a manifest is complete. The manifest contains the digests of the files.
 
         Args:
             beside: digests of other files that belong to the field, by their paths relative to the folder.
-            own: the folder is part of a run that belongs to this package.
+            own: skip the checks of `io.guard`, for folders in a run of this package.
         Raises:
-            ValueError: as in `io.guard.refuse_inputs`, or a file would replace one of another kind.
-            FileExistsError: if the folder holds a field and `overwrite` is False.
+            ValueError: if this would replace an input, a file of a run or data set, or a file of another type.
+            FileExistsError: if the folder contains a field and `overwrite` is False.
             OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
         _check_target(folder, {**self.manifest, "digests": dict(beside)})
         if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
-                f"{folder} already holds a semantic field; choose another folder or allow overwriting"
+                f"{folder} already holds a semantic field; choose another folder or pass overwrite=True"
             )
         if not own:
             files = [folder / name for name in (FIELD_FILE, EVIDENCE_FILE, MANIFEST_FILE)]
@@ -264,10 +264,10 @@ class SemanticField(TensorRecord):
         """Read a field that `save` wrote.
 
         Args:
-            means: centers of the Gaussians that the field must belong to; None: any.
-            checkpoint: source of the means, for the message.
+            means: centers of the Gaussians that the field must belong to (default: no check).
+            checkpoint: source of the means, for error messages.
         Raises:
-            FileNotFoundError: if the folder holds no complete field.
+            FileNotFoundError: if the folder does not contain a complete field.
             ValueError: if the schema is not supported, a file is damaged, or the field belongs to other Gaussians. The
                 message names the file or folder.
         """
@@ -289,19 +289,19 @@ class SemanticField(TensorRecord):
 def choose_form(
     lifted: Lifted, storage: str, tolerance: float, portion: Partition | None = None
 ) -> tuple[dict[str, Any], Float64[Tensor, "r d"] | None]:
-    """Choose the storage form: the requested one, or for "auto" the smallest whose bound is within the tolerance.
+    """Choose the storage form. "auto" selects the smallest form whose bound is within the tolerance.
 
     Args:
-        portion: Gaussians of the lift, if several processes share them.
+        portion: part of the Gaussians that the lift covers (default: all).
     Returns:
-        The choice and all forms, for the manifest, and the basis of "low_rank".
+        Metadata of the chosen form and of all forms for the manifest, and the basis if the form is "low_rank".
     Raises:
         ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """
     if not tolerance > 0:
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
-        raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
+        raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}, got {storage!r}")
     basis = smallest_basis(lifted, tolerance, None if portion is None else portion.communicator)
     forms = sizes_and_bounds(lifted, basis, portion)
     if storage == "auto":
@@ -309,7 +309,7 @@ def choose_form(
         storage = min(allowed, key=lambda name: forms[name]["bytes"])
     elif storage not in forms:
         raise InputError(
-            f"no basis keeps every Gaussian within tolerance {tolerance}; raise the tolerance, or use storage "
+            f"no low-rank basis meets tolerance {tolerance} for every Gaussian; increase the tolerance, or use storage "
             "float16 or evidence"
         )
     rows = basis.rows if storage == "low_rank" and basis is not None else None
@@ -324,7 +324,7 @@ def fingerprint(means: Float[Tensor, "n 3"]) -> str:
 def _check_belongs(
     manifest: Mapping[str, Any], stored: Tensor | None, means: Tensor, folder: Path, checkpoint: str | Path
 ) -> None:
-    """Raise if a field does not belong to these means, bit for bit."""
+    """Raise InputError unless the field was lifted from exactly these means."""
     if manifest["num_gaussians"] != len(means):
         raise InputError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
@@ -337,15 +337,15 @@ def _check_belongs(
     if not same:
         raise InputError(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
-            f"number, other means); {LIFT_AGAIN}"
+            f"number, different means); {LIFT_AGAIN}"
         )
 
 
 def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Raise InputError if a field cannot be written, before anything is."""
+    """Raise InputError if the metadata or the folder is not valid for a field."""
     try:
         json.dumps(facts).encode("utf8")
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"provenance or beside cannot be encoded as JSON: {error}") from None
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; give another one")
+        raise InputError(f"{folder} is not a folder; choose another path")

@@ -15,7 +15,7 @@ from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
 
 MIN_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is never drawn."""
+"""Opacity below which Gaussians are never drawn."""
 SH_C0 = 0.28209479177387814
 """sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 MAX_SCALE = 4.8517e8
@@ -24,22 +24,21 @@ overflow float32."""
 MAX_MEAN = 1e18
 """Largest coordinate of a mean in world units; squared distances must fit into float32."""
 QUATERNION_RANGE = (1e-18, 1e18)
-"""Range of a quaternion's largest component. If its squared length is not a normal float32 number, the rotation is NaN
-or silently the identity."""
+"""Valid range of a quaternion's largest component. Outside it, the squared length is not a normal float32 number, and
+the rotation becomes NaN or the identity."""
 
 
 @check_arguments
 @dataclass(frozen=True)
 class GaussianScene(TensorRecord):
-    """N Gaussians with activated parameters, as the rasterizer sees them.
+    """N Gaussians with activated parameters, the input of the rasterizer.
 
-    Parameters may be NaN or infinite, as training can leave them. Such a Gaussian, or one whose parameters are out of
-    range, keeps its row but is never drawn (see `drawable`); `Evidence.num_excluded` counts it. So it has no evidence,
-    no direction and a reliability of 0, and exports leave it out.
+    Parameters may be NaN, infinite or too large, because training can produce such values. These Gaussians keep their
+    rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have no evidence, no
+    direction and a reliability of 0, and exports omit them.
 
     Raises:
-        ValueError: if a shape is wrong, a tensor is not floating-point, devices differ, a scale is negative, or an
-            opacity is outside 0..1, such as infinity.
+        ValueError: if a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.
 
     >>> import torch
     >>> from normlift_ns import GaussianScene
@@ -53,7 +52,7 @@ class GaussianScene(TensorRecord):
     means: Float[Tensor, "n 3"]
     """Centers in world units."""
     quats: Float[Tensor, "n 4"]
-    """Rotations as (w, x, y, z); any non-zero length."""
+    """Rotations as quaternions (w, x, y, z) of any non-zero length."""
     scales: Float[Tensor, "n 3"]
     """Standard deviations along the three axes in world units, >= 0; linear, not logarithms."""
     opacities: Float[Tensor, " n"]
@@ -62,16 +61,18 @@ class GaussianScene(TensorRecord):
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities"):
             if (device := getattr(self, name).device) != self.means.device:
-                raise InputError(f"GaussianScene.{name} is on {device}, expected {self.means.device}, as the means")
+                raise InputError(
+                    f"GaussianScene.{name} is on {device}, but means are on {self.means.device}; use one device"
+                )
         if bool((self.scales < 0).any()):
             raise InputError(
-                "GaussianScene.scales has negative values; pass linear scales: exp() of a splatfacto "
-                "checkpoint's `scales`"
+                "GaussianScene.scales has negative values, expected linear scales; apply exp() to `scales` of a "
+                "splatfacto checkpoint"
             )
         if bool(((self.opacities < 0) | (self.opacities > 1)).any()):
             raise InputError(
-                "GaussianScene.opacities has values outside 0..1; pass activated opacities: sigmoid() of a splatfacto "
-                "checkpoint's `opacities`"
+                "GaussianScene.opacities has values outside 0..1, expected activated opacities; apply sigmoid() to "
+                "`opacities` of a splatfacto checkpoint"
             )
 
     def __len__(self) -> int:
@@ -79,19 +80,18 @@ class GaussianScene(TensorRecord):
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
-        """Mask of the Gaussians that are drawn: finite, small enough for float32, with a quaternion of valid length.
+        """Mask of the Gaussians that are drawn.
 
-        The limits are those of float32 for any precision, so every backend draws the same Gaussians. Gaussians with a
-        scale of 0 are drawn as dots.
+        Their parameters are finite and within limits for float32, which do not depend on the precision or the backend.
         """
-        length = self.quats.float().abs().amax(dim=1)  # up to a factor of 2
+        length = self.quats.float().abs().amax(dim=1)  # the length up to a factor of 2
         low, high = QUATERNION_RANGE
         small = (self.means.float().abs() <= MAX_MEAN).all(dim=1) & (self.scales.float() <= MAX_SCALE).all(dim=1)
         return small & (length >= low) & (length <= high) & self.opacities.isfinite()
 
 
 def facing_pose(eye: Float[Tensor, " 3"], target: Float[Tensor, " 3"], up: Float[Tensor, " 3"]) -> Float[Tensor, "4 4"]:
-    """Return the `world_to_camera` of a camera at `eye` that faces `target`, in float64 as these."""
+    """Return the `world_to_camera` of a camera at `eye` that faces `target`. All tensors are float64."""
     forward = normalize(target - eye, dim=0)
     right = torch.linalg.cross(forward, up)
     if float(right.norm()) < 1e-6:  # straight up or down: choose any roll
@@ -110,7 +110,7 @@ class Camera:
 
     Raises:
         ValueError: if a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the size
-            is below one pixel.
+            is out of range.
 
     >>> import torch
     >>> from normlift_ns import Camera
@@ -145,20 +145,20 @@ class Camera:
         deviation = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=pose.device)).abs().max().item()
         if deviation > 1e-3 or torch.linalg.det(rotation).item() < 0 or pose[3].tolist() != [0, 0, 0, 1]:
             raise InputError(
-                "Camera.world_to_camera must be a rotation and a translation (no scale, no mirror), got "
+                "Camera.world_to_camera must be a rotation and a translation without scale or reflection, got "
                 f"{self.world_to_camera.tolist()}"
             )
         if not (1 <= self.width <= 2**20 and 1 <= self.height <= 2**20):
             size = f"width {self.width}, height {self.height}"
-            raise InputError(f"Camera size must be at least 1x1 pixel and at most 1048576x1048576, got {size}")
+            raise InputError(f"Camera size must be 1x1 to 1048576x1048576 pixels, got {size}")
 
     def camera_to_world(self) -> Float64[Tensor, "4 4"]:
-        """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
+        """Return the camera-to-world matrix in nerfstudio's OpenGL convention: x right, y up, z backward."""
         return self.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
 
     @check_arguments
     def downscaled(self, factor: float) -> Camera:
-        """Return the camera with its size multiplied by at most 1.
+        """Return the camera with its image size multiplied by `factor`, > 0; factors above 1 count as 1.
 
         >>> K = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
         >>> camera = Camera(K, torch.eye(4), width=160, height=120)
@@ -176,9 +176,9 @@ class Camera:
     def project(
         self, points: Float[Tensor, "n 3"]
     ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Return row and column of the pixel of every point, its depth, and whether it lies in the image.
+        """Return the pixel row, pixel column and depth of every point, and a mask of the points in the image.
 
-        Points outside the image have a pixel at its border.
+        Pixels of points outside the image are clamped to its border.
         """
         pose = self.world_to_camera.to(points)
         seen = points @ pose[:3, :3].T + pose[:3, 3]

@@ -1,4 +1,4 @@
-"""The lift: direction and reliability of every Gaussian, from evidence and one table of unit features.
+"""The lift, which computes direction and reliability of every Gaussian from evidence and unit features.
 
 Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equation numbers are those of the paper::
 
@@ -29,18 +29,18 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import UnlabeledMode
 
 _MIN_WEIGHT, _MAX_WEIGHT = 1e-15, 1e15
-"""Smallest W_j that counts as evidence, and largest valid E_js; squares of sums then fit into float32. Weights of a
-rasterizer are in 1e-13..1e9."""
+"""Smallest W_j that counts as evidence, and largest valid E_js. Within these limits, squared sums fit into float32.
+Rasterizers return weights in 1e-13..1e9."""
 _LENGTH_TOLERANCE = 1e-2
-"""Accepted deviation of the length of a unit row from 1, which half precision and files need."""
+"""Accepted deviation of the length of a unit row from 1. Rows in half precision deviate from 1 by rounding."""
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Scalars(TensorRecord):
-    """Scalars of every Gaussian.
+    """Norm, consistency, reliability and weight of every Gaussian.
 
-    Without evidence (W_j < 1e-15 or f_j = 0), all but `view_count` and `weight` are 0.
+    If W_j < 1e-15 or f_j = 0, all fields except `view_count` and `weight` are 0.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
@@ -71,18 +71,18 @@ class Scalars(TensorRecord):
 
     @property
     def own_evidence(self) -> Float[Tensor, " n"]:
-        """||f_j|| N_eff, the number of views that agree on the direction of a Gaussian, for `refine`."""
+        """||f_j|| N_eff, the effective number of views that agree on the direction of each Gaussian."""
         return self.norm * self.n_eff
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Scalars:
-        """Apply a function to every array."""
+        """Return scalars with the function applied to every array."""
         return Scalars(**{f.name: function(getattr(self, f.name)) for f in fields(Scalars)})
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Lifted:
-    """Result of a lift: the scalars of every Gaussian, and the evidence and features that its direction follows from.
+    """Result of a lift, with the scalars of every Gaussian, and the evidence and features that determine directions.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
@@ -96,18 +96,18 @@ class Lifted:
     scalars: Scalars
     evidence: Evidence
     features: Float[Tensor, "s d"]
-    """The feature table, normalized, in the precision of the lift."""
+    """Feature table with normalized rows, in the precision of the lift."""
 
     @check_arguments
     def directions(
         self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
     ) -> Float[Tensor, "m d"]:
-        """Return u_j of all or some Gaussians: unit rows, 0 without evidence.
+        """Return u_j of all or some Gaussians as unit rows, or 0 without evidence.
 
         The row of a Gaussian does not depend on which others are requested.
 
         Args:
-            dtype: type of the result; half precision also halves the peak memory.
+            dtype: type of the result (default: that of the features). Half precision also halves the peak memory.
         """
         dtype = dtype or self.features.dtype
         if not dtype.is_floating_point:
@@ -140,21 +140,21 @@ class Lifted:
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:
-    """Compute directions u_j and reliability R_j of all Gaussians.
+    """Compute directions u_j and reliability R_j of all Gaussians with equations 3 to 8 of the paper.
 
-    These are equations 3 to 8 of the paper, with the formulas at the top of this file.
+    The formulas are at the top of this module.
 
     Args:
         evidence: E, from `rasterize_evidence`.
-        features: one unit row per column of the evidence; half-precision rows are normalized again.
-        beta: prior strength of the shrinkage of R, in virtual views, >= 0.
-        unlabeled: "ignore" leaves unlabeled pixels out. "dilute" counts them as observations of the zero vector, in
-            every W_jv.
+        features: one unit row per column of the evidence. Deviations of the lengths up to 0.01 are corrected.
+        beta: prior strength of the shrinkage of R, as a number of views, >= 0.
+        unlabeled: "ignore" omits unlabeled pixels. "dilute" counts them in every W_jv, as observations of the zero
+            vector.
     Returns:
-        `Lifted`, in float64 if the evidence or the features are, else in float32.
+        `Lifted`, in float64 if the evidence or the features are float64, else in float32.
     Raises:
-        ValueError: if the table has another length, a row is not a finite unit vector, a weight is outside 0..1e15,
-            `beta` is negative, or `unlabeled` is unknown.
+        ValueError: if `features` has another length, a row is not a unit vector, a weight is outside 0..1e15, or an
+            option is invalid.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, lift, rasterize_evidence
@@ -163,7 +163,7 @@ def lift(
     >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
     >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[0]])])
     >>> lifted = lift(evidence, torch.tensor([[0.6, 0.8], [0.6, -0.8]]))
-    >>> lifted.directions(), lifted.scalars.norm, lifted.scalars.reliability  # of 2 views: 0.6 * 2 / (2 + 1)
+    >>> lifted.directions(), lifted.scalars.norm, lifted.scalars.reliability  # R = 0.6 * 2 / (2 + 1)
     (tensor([[1., 0.]]), tensor([0.6000]), tensor([0.4000]))
     """
     if not 0 <= beta < math.inf:
@@ -193,12 +193,12 @@ def lift(
 
 
 def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float) -> Float[Tensor, "*n"]:
-    """Return R_j, equation 8 of the paper; 0 without evidence.
+    """Return R_j, equation 8 of the paper, or 0 without evidence.
 
     Args:
-        norm: ||f_j||. It is 1 if all views agree, so that the result is the factor N_eff / (N_eff + beta) alone.
-        n_eff: N_eff, 0 without evidence.
-        beta: prior strength in virtual views, >= 0.
+        norm: ||f_j||. With 1, the result is the factor N_eff / (N_eff + beta).
+        n_eff: N_eff, or 0 without evidence.
+        beta: prior strength as a number of views, >= 0.
 
     >>> reliability(0.6, torch.tensor([0.0, 2.0]), beta=1.0)
     tensor([0.0000, 0.4000])
@@ -209,11 +209,11 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     if features.shape[0] != evidence.num_regions:
         raise InputError(
-            f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
+            f"features must have shape [{evidence.num_regions}, D], one row per region of the evidence, got "
             f"{features.dtype} {tuple(features.shape)}"
         )
     exact = features.to(evidence.rows.weight.device, torch.float64)
-    length = check_unit_rows(exact, "feature rows", "normalize them, and label regions without a feature -1")
+    length = check_unit_rows(exact, "feature rows", "normalize them, and set labels of regions without a feature to -1")
     double = torch.float64 in (evidence.rows.weight.dtype, features.dtype)
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
@@ -247,7 +247,7 @@ def _row_norms(rows: SparseRows, table: Tensor) -> Tensor:
 def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     """Return sum_v ||S_jv|| of every Gaussian.
 
-    If a view shows a Gaussian in one region only, the common case, ||S_jv|| = E_js and no vector is needed.
+    Most Gaussians are in only one region of a view. Then ||S_jv|| = E_js, and no vector sum is needed.
     """
     groups = evidence.view_group_offsets
     rows = evidence.rows
@@ -271,14 +271,14 @@ def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
 def check_unit_rows(
     rows: Float[Tensor, "m d"], name: str, advice: str, *, allow_zeros: bool = False
 ) -> Float64[Tensor, " m"]:
-    """Return the lengths of rows, and raise unless all are unit vectors.
+    """Return the lengths of rows, and raise ValueError unless all are unit vectors.
 
     Args:
         name: name of the rows in the message, for example "feature rows".
-        advice: remedy that the message suggests.
+        advice: suggestion for the user in the message.
         allow_zeros: accept rows of zeros too.
     Raises:
-        ValueError: if rows have another length or are not finite; the message counts them and shows three.
+        ValueError: if a row has another length or is not finite. The message counts such rows and shows three.
 
     >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize them").round(decimals=6)
     tensor([1.], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Low-rank bases of a scene's feature table, with a bound on the query error of every Gaussian."""
+"""Storage forms of directions, and low-rank bases of the feature table with a query error bound per Gaussian."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _ROUNDING = 1e-6
 
 
 def half_precision_error(dimension: int) -> float:
-    """Return a bound on the length of the error of a unit vector rounded to float16.
+    """Return a bound on the Euclidean error of a unit vector with D components that is rounded to float16.
 
-    It is 2**-11 relative, plus 2**-25 for every component near zero.
+    The bound is 2**-11, plus 2**-25 sqrt(D) for components near zero.
     """
     return 2.0**-11 + dimension**0.5 * 2.0**-25
 
 
 class Basis(NamedTuple):
-    """Orthonormal basis of rank r, and the error bound of every Gaussian."""
+    """Orthonormal basis of rank r, with the error bound of every Gaussian."""
 
     rows: Float64[Tensor, "r d"]
     bound: Float64[Tensor, " n"]
-    """Bound on |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalized direction; 0 without
-    evidence."""
+    """Bound on |<u_j, t> - <u'_j, t>| for all unit vectors t, or 0 without evidence. u'_j is the projected and
+    renormalized direction."""
 
 
 class SpectralTable(NamedTuple):
@@ -42,11 +42,11 @@ class SpectralTable(NamedTuple):
 
     vectors: Float64[Tensor, "d d"]
     residual: Float64[Tensor, "s ranks"]
-    """|F_s - F_s B B^T| in column r, with B the first r eigenvectors, r = 0 ... D."""
+    """Column r is |F_s - F_s B B^T|, with the first r eigenvectors as the columns of B, for r in 0..D."""
 
 
 def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = None) -> SpectralTable:
-    """Compute the eigenvectors of the feature table in float64; all processes use those of process 0."""
+    """Compute the eigenvectors of the feature table in float64. All processes use those of process 0."""
     exact = features.double()
     vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
     vectors = vectors if team is None else team.broadcast(vectors)
@@ -58,8 +58,8 @@ def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = N
 def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
     """Return the first `rank` eigenvectors with their bound.
 
-    Let r_s be the residual of row s and x_j = sum_s E_js r_s / (W_j ||f_j||). The part of u_j outside the basis then
-    has at most the length x_j. Projecting and renormalizing moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if
+    Let r_s be the residual of row s, and x_j = sum_s E_js r_s / (W_j ||f_j||). Then the component of u_j outside the
+    basis has a length of at most x_j. Projecting and renormalizing moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if
     x_j <= 1, else by at most 2.
     """
     residual = table.residual[:, rank : rank + 1].contiguous()
@@ -71,13 +71,13 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
 
 
 def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None = None) -> Basis | None:
-    """Return the basis of lowest rank for which the bound of every Gaussian is within `tolerance`, or None.
+    """Return the basis of lowest rank that keeps the bound of every Gaussian within `tolerance`, or None.
 
-    The bound includes the rounding of coordinates to float16. Processes with different Gaussians get the same basis.
+    The bound includes the rounding of coordinates to float16. All processes get the same basis.
     """
     table = spectral_table(lifted.features, team)
     low, high, best = 1, lifted.features.shape[1] + 1, None
-    while low < high:  # the bound falls with the rank
+    while low < high:  # the bound decreases with increasing rank
         rank = (low + high) // 2
         basis = basis_of_rank(lifted, table, rank)
         worst = torch.cat([basis.bound.new_zeros(1), basis.bound]).max()
@@ -101,13 +101,13 @@ fast."""
 
 @dataclass(frozen=True)
 class StoredEvidence(TensorRecord):
-    """E and F themselves: exact, and E can be reused with another encoder."""
+    """E and F themselves, which give exact directions. E can be reused with another encoder."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors, 0 without evidence: E (F t) / (W_j ||f_j||), computed in float64."""
+        """Return cosines to unit vectors t as E (F t) / (W_j ||f_j||), computed in float64, or 0 without evidence."""
         transposed = vectors.double().T  # block by block, because each block of float64 fits into the CPU cache
         table = torch.cat([block.double() @ transposed for block in self.features.split(_BLOCK_ROWS)])
         length = scalars.weight.double() * scalars.norm.double()
@@ -115,7 +115,7 @@ class StoredEvidence(TensorRecord):
         return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        """Return the unit directions of some Gaussians, 0 without evidence."""
+        """Return the unit directions of some Gaussians, or 0 without evidence."""
         sums = self.evidence.rows.select_rows(gaussians).sums_of_unit_rows(self.features)
         mask = (scalars.norm[gaussians] > 0)[:, None]
         return torch.where(mask, sums / torch.linalg.vector_norm(sums, dim=1, keepdim=True), 0.0).float()
@@ -123,7 +123,7 @@ class StoredEvidence(TensorRecord):
 
 @dataclass(frozen=True)
 class StoredDirections(TensorRecord):
-    """Directions of the M Gaussians with evidence, in float16, either directly or as coordinates in a basis."""
+    """Directions of the M Gaussians with evidence, as float16 vectors or as float16 coordinates in a basis."""
 
     coordinates: Float16[Tensor, "m r"]
     basis: Float[Tensor, "r d"] | None
@@ -134,7 +134,7 @@ class StoredDirections(TensorRecord):
         return (self.coordinates if self.basis is None else self.basis).shape[1]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors, 0 without evidence."""
+        """Return cosines to unit vectors, or 0 without evidence."""
         projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
         step = max(1, (_GPU_BLOCK if self.coordinates.is_cuda else _CPU_BLOCK) // projected.shape[1])
@@ -142,7 +142,7 @@ class StoredDirections(TensorRecord):
         return out.clamp_(-1, 1)
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        """Return the unit directions of some Gaussians, 0 without evidence."""
+        """Return the unit directions of some Gaussians, or 0 without evidence."""
         mask = scalars.norm > 0
         row = (mask.cumsum(0) - 1)[gaussians].clamp(min=0)
         rows = self.coordinates[row].float() if self.basis is None else self.coordinates[row].float() @ self.basis
@@ -153,7 +153,7 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
     """Return the directions of all Gaussians with evidence.
 
     Args:
-        basis: rows of the basis for coordinates; None: directions are stored directly.
+        basis: rows of the basis for coordinates, or None to store full directions.
         order: indices of all Gaussians from `spatial_order`.
     """
     coordinates, gaussians = encode_directions(lifted, basis, order.split(PARTITION_BLOCK))
@@ -163,9 +163,9 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
 def encode_directions(
     lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " _"]]
 ) -> tuple[Float16[Tensor, "m r"], Int64[Tensor, " m"]]:
-    """Return float16 coordinates and the row of the lift for every Gaussian with evidence, block by block.
+    """Return the float16 coordinates of every Gaussian with evidence, and its row in the lift, block by block.
 
-    Rounding may depend on which rows are multiplied together. Blocks are therefore the same for any number of
+    Rounding may depend on which rows are multiplied together. The blocks are therefore the same for any number of
     processes.
 
     Args:
@@ -185,7 +185,7 @@ def encode_directions(
 def arrange_directions(
     parts: Sequence[Float16[Tensor, "_ r"]], gaussians: Sequence[Int64[Tensor, " _"]], basis: Tensor | None, n: int
 ) -> StoredDirections:
-    """Return the directions of n Gaussians by index, from parts and the index of each of their rows."""
+    """Join parts of the directions of n Gaussians in index order; `gaussians` are the indices of the rows of each."""
     row_of = torch.zeros(n + 1, dtype=torch.int64, device=parts[0].device)
     for index in gaussians:
         row_of[index + 1] = 1
@@ -202,7 +202,7 @@ def sizes_and_bounds(
     """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
 
     Args:
-        portion: Gaussians of the lift, if other processes have the rest; None: all Gaussians.
+        portion: part of the Gaussians that the lift covers (default: all).
     """
     mask, evidence = lifted.scalars.norm > 0, lifted.evidence
     sizes = torch.stack([mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]])

@@ -13,16 +13,16 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import WithoutDirection
 
 NO_CLASS = -1
-"""True class of a point that does not count, and predicted class of a Gaussian without a direction."""
+"""True class of points to ignore, and predicted class of Gaussians without a direction."""
 
 
 class ClassScores(NamedTuple):
-    """Scores per class, and their means over the classes that the ground truth contains."""
+    """Scores per class, with their means over the classes in the ground truth."""
 
     iou: Float64[Tensor, " c"]
-    """|truth and predicted| / |truth or predicted| over the points that count; NaN if the truth lacks the class."""
+    """|truth and predicted| / |truth or predicted| over points with a true class; NaN if the truth lacks the class."""
     accuracy: Float64[Tensor, " c"]
-    """Recall |truth and predicted| / |truth|; NaN if the ground truth lacks the class."""
+    """Recall |truth and predicted| / |truth|; NaN if the truth lacks the class."""
 
     @property
     def miou(self) -> float:
@@ -36,23 +36,23 @@ class ClassScores(NamedTuple):
 
 
 def confusion(truth: Int[Tensor, "*m"], predicted: Int[Tensor, "*m"], classes: int) -> Int64[Tensor, "c c_plus_1"]:
-    """Count the points of each true class (row) by predicted class (column); the last column is for no class.
+    """Return the confusion matrix, with one row per true class and one column per predicted class.
 
-    Points with a negative true class do not count.
+    The last column counts points without a predicted class. Points with a negative true class are ignored.
 
     Args:
         truth: true classes.
-        predicted: predicted classes, negative for none.
+        predicted: predicted classes, or a negative number for none.
         classes: number of classes.
     Raises:
-        ValueError: if a class is not below `classes`.
+        ValueError: if a class is `classes` or larger.
 
     >>> confusion(torch.tensor([0, 0, 1, -1]), torch.tensor([0, 1, -1, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
     """
     for name, values in (("truth", truth), ("predicted", predicted)):
         if values.numel() > 0 and int(values.max()) >= classes:
-            raise InputError(f"{name} holds class {int(values.max())}, expected 0..{classes - 1}, or -1 for none")
+            raise InputError(f"{name} contains class {int(values.max())}, expected 0..{classes - 1}, or -1 for none")
     counts = truth >= 0
     row, column = truth[counts].long(), predicted[counts].long()
     column = torch.where(column < 0, classes, column)
@@ -62,7 +62,7 @@ def confusion(truth: Int[Tensor, "*m"], predicted: Int[Tensor, "*m"], classes: i
 def class_scores(counts: Int64[Tensor, "c c_plus_1"]) -> ClassScores:
     """Return IoU and accuracy from the result of `confusion`.
 
-    To score several scenes, add up their confusions first, or average their scores.
+    For several scenes, add their confusion matrices first or average their scores.
     """
     hits, of_truth = counts.diagonal().double(), counts.sum(1).double()
     union = of_truth + counts[:, : len(counts)].sum(0) - hits
@@ -77,9 +77,9 @@ def classify(
 
     Args:
         valid: mask of the Gaussians with a direction, from `SemanticField.valid`.
-        without_direction: class of the others. "none" is `NO_CLASS`, a miss in the recall of the true class that
-            enlarges no other union. "first" is class 0, the arg-max of a zero feature in published scripts; it adds
-            false positives to the first class, ScanNet's wall.
+        without_direction: class of the other Gaussians. "none" is `NO_CLASS`, which only lowers scores of the true
+            class. "first" is class 0, the arg-max of a zero feature in published scripts. It adds false positives to
+            this class, which is wall in ScanNet.
     """
     best = scores.argmax(dim=1)
     return torch.where(valid, best, NO_CLASS if without_direction == "none" else 0)
@@ -89,7 +89,7 @@ def mask_iou(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empt
     """Return |predicted and truth| / |predicted or truth|, in 0..1.
 
     Args:
-        empty: result for two empty masks, for which the formula is undefined; 0 in SFS's code.
+        empty: result for two empty masks (default: NaN). SFS's code uses 0.
     """
     union = int((predicted | truth).sum())
     return int((predicted & truth).sum()) / union if union > 0 else empty
@@ -102,10 +102,10 @@ def mask_recall(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"]) -> f
 
 
 def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_peak: bool = False) -> bool:
-    """Return whether the pixel with the largest score is in the mask.
+    """Return True if the pixel with the largest score is in the mask.
 
     Args:
-        any_peak: accept any of several pixels with the largest score; otherwise, only the first in row-major order.
+        any_peak: accept any of several pixels with the largest score (default: only the first in row-major order).
     """
     peak = score == score.max()
     if any_peak:
@@ -114,16 +114,16 @@ def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_pe
 
 
 class Correlation(NamedTuple):
-    """A rank correlation."""
+    """Rank correlation of two arrays."""
 
     value: float
-    """Coefficient in -1..1; NaN if one side is constant."""
+    """Coefficient in -1..1; NaN if one array is constant."""
     p: float
-    """Two-sided p-value: the probability of a correlation at least as strong among independent points; NaN likewise."""
+    """Two-sided p-value in 0..1; NaN if one array is constant."""
 
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
-    """Compute Spearman's rank correlation, with ties at their mean rank."""
+    """Compute Spearman's rank correlation. Ties have their mean rank."""
     return _correlation("spearmanr", a, b)
 
 
@@ -133,9 +133,9 @@ def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
-    """Return the Jaccard index of the two sets with the lowest `share` of values; equal values count by index.
+    """Return the Jaccard index of the two sets of points with the lowest `share` of values in each array.
 
-    Two independent orders give about share / (2 - share), for example 0.111 for 0.2.
+    Ties are ordered by index. Independent arrays give about share / (2 - share), for example 0.111 for 0.2.
     """
     count = round(share * len(a))
     lowest = [set(x.argsort(stable=True)[:count].tolist()) for x in (a, b)]
@@ -145,13 +145,13 @@ def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float 
 def bin_means(
     key: Float[Tensor, " n"], values: Float[Tensor, " n"], bins: int = 10
 ) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
-    """Return the means of keys and values in bins of equal count, by ascending key; equal keys are split by index.
+    """Return the means of keys and values in bins of equal count, by ascending key. Ties are ordered by index.
 
     Raises:
         ValueError: if there are fewer points than bins.
     """
     if len(key) < bins:
-        raise InputError(f"{bins} bins need at least as many points, got {len(key)}")
+        raise InputError(f"{bins} bins need at least one point each, got {len(key)} points")
     parts = key.argsort(stable=True).tensor_split(bins)
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 

@@ -19,14 +19,14 @@ from normlift_ns.options import check_number
 MAX_NEIGHBORS = 1024
 """Largest K. Memory grows with K times the number of Gaussians, and a vote compares all pairs of neighbors."""
 _MAX_UNCERTAIN = 1000
-"""Largest number of Gaussians for which the GPU compares all distances; for more, the CPU's k-d tree is faster."""
+"""Largest number of uncertain rows for which the GPU computes all distances. Above it, the CPU is faster."""
 _BLOCK = 2**14
 """Number of positions per query of the k-d tree."""
 _MAX_RANKED = 2**22
 """Number of candidates that are ranked at a time."""
 
 Progress = Callable[[int, int], None]
-"""Called after every block of Gaussians with (Gaussians done, Gaussians)."""
+"""Callback after every block of Gaussians, with the number of Gaussians that are done and their total."""
 
 
 @check_arguments
@@ -43,11 +43,11 @@ class Neighbors(NamedTuple):
     """
 
     index: Int32[Tensor, "m k"]  # pyright: ignore[reportIncompatibleMethodOverride]
-    """Indices of the neighbors; -1 if there are fewer than K others with finite means."""
+    """Indices of the neighbors, padded with -1 if fewer than K other Gaussians have finite means."""
     distance: Float[Tensor, "m k"]
-    """Euclidean distances in the units of the means; inf where index is -1. Float64, or rounded to float32 on a GPU."""
+    """Euclidean distances in the units of the means, padded with inf. Float64, or rounded to float32 on a GPU."""
     spacing: Float64[Tensor, " m"]
-    """Distance to the nearest Gaussian at another position; inf if there is none."""
+    """Distance to the nearest Gaussian at another position, or inf if there is none."""
 
 
 @check_arguments
@@ -61,15 +61,16 @@ def nearest_neighbors(
 ) -> Neighbors:
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
-    The CPU uses a k-d tree over the distinct positions, which any number of Gaussians may share. A tree over all
-    Gaussians would need all pairs to resolve ties in a fixed order. A GPU uses `kernels.nearest`, which certifies its
-    result. If it cannot, because there are more ties than it keeps candidates, all distances are compared or the CPU
-    takes over. A Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
+    The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
+    uses `kernels.nearest`, which certifies every row of its result. It cannot certify rows with more ties than it keeps
+    candidates. For such rows, the GPU computes all distances. If there are many, the CPU repeats the search. A Gaussian
+    whose mean is not finite has no neighbors and is not a neighbor of others.
 
     Args:
-        of: Gaussians to find neighbors for, one row of the result each; None: all n.
-        progress: called after every block of Gaussians with (Gaussians done, Gaussians).
-        team: processes that call this function together, each for a part of the same Gaussians; None: this one only.
+        of: Gaussians to find neighbors for, one per row of the result (default: all n).
+        progress: callback after every block of Gaussians, with the number that are done and their total.
+        team: processes that call this function together, each for a part of the same Gaussians (default: only this
+            process).
     Raises:
         ValueError: if `k` is less than 1 or more than `MAX_NEIGHBORS`.
 
@@ -80,7 +81,7 @@ def nearest_neighbors(
     ([[1], [0], [1]], [[1.0], [1.0], [2.0]])
     """
     if check_number("k", k, int) > MAX_NEIGHBORS:
-        raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}: all neighbors are held in memory")
+        raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}, because all neighbors are kept in memory")
     if of is not None:
         check_rows("of", of, len(means))
     neighbors = _on_gpu(means.detach(), k, of, progress, team) if can_use_triton(means) else None
@@ -164,7 +165,7 @@ def _on_cpu(
         tree, member = KDTree(positions), _members(position_of, k + 1)
         self_index = np.searchsorted(finite, of_rows[rows])  # among the finite Gaussians
         queries, query_of = np.unique(position_of[self_index], return_inverse=True)
-        ranks: Any = range(1, min(k + 2, len(positions)) + 1)  # a sequence, so one neighbor is still a column
+        ranks: Any = range(1, min(k + 2, len(positions)) + 1)  # a sequence, so one neighbor also gives a column
         blocks = []
         for first in range(0, len(queries), _BLOCK):
             block = queries[first : first + _BLOCK]
@@ -174,7 +175,7 @@ def _on_cpu(
             if progress is not None and first + _BLOCK < len(queries):
                 progress((first + _BLOCK) * m // len(queries), m)
         ranked, ranked_distance, nearest = (np.concatenate(parts)[query_of.reshape(-1)] for parts in zip(*blocks))
-        # Leave out self, which is missing from the list only if k + 1 others share its position.
+        # Exclude the Gaussian itself, which is missing from the list only if k + 1 others share its position.
         after_self = np.cumsum(ranked == self_index[:, None], axis=1)[:, :k] > 0
         chosen = np.where(after_self, ranked[:, 1:], ranked[:, :k])
         index[rows] = np.where(chosen < 0, -1, finite[chosen])
@@ -184,13 +185,13 @@ def _on_cpu(
 
 
 def _members(position_of: np.ndarray, limit: int) -> np.ndarray:
-    """Return the Gaussians at every position, [positions, slots]: the first `limit` by index, padded with -1."""
+    """Return the first `limit` Gaussians by index at every position, [positions + 1, slots], padded with -1."""
     by_position = np.argsort(position_of, kind="stable")
     count = np.bincount(position_of)
     first = np.cumsum(count) - count
     slot = np.arange(min(limit, count.max()))
     member = np.where(slot < count[:, None], by_position[np.minimum(first[:, None] + slot, len(position_of) - 1)], -1)
-    return np.pad(member, ((0, 1), (0, 0)), constant_values=-1)  # the tree returns one more if distances overflow
+    return np.pad(member, ((0, 1), (0, 0)), constant_values=-1)  # the tree returns this row if distances overflow
 
 
 def _rank_gaussians(
@@ -203,7 +204,7 @@ def _rank_gaussians(
         queries: indices of the positions to search from.
         near: indices of the nearest positions of every query, nearest first.
         reach: distances to `near`.
-        count: number of Gaussians per query; rows with fewer are padded with -1.
+        count: number of Gaussians per query. Shorter rows are padded with -1.
     """
     slots = member.shape[1]
 
@@ -221,7 +222,7 @@ def _rank_gaussians(
     step = max(1, _MAX_RANKED // (near.shape[1] * slots))
     blocks = [rank(near[i : i + step], reach[i : i + step]) for i in range(0, len(near), step)]
     ranked, distance = (np.concatenate(parts) for parts in zip(*blocks))
-    if near.shape[1] > count:  # the tree returns arbitrary ones of the positions that tie at the end
+    if near.shape[1] > count:  # the tree returns an arbitrary selection of ties for the last rank
         for row in np.flatnonzero((reach[:, count - 1] == reach[:, count]) & np.isfinite(reach[:, count])):
             position = tree.data[queries[row]]
             around = np.array(tree.query_ball_point(position, reach[row, count] * (1 + 1e-12)))

@@ -1,9 +1,9 @@
-"""Null level of every Gaussian: the cosine that a text must exceed there to be more than one of many unrelated texts.
+"""Null level of every Gaussian, the cosine that a prompt must exceed to differ from unrelated text.
 
-The texts of the null vocabulary are compared with every Gaussian. The level is their k-th largest cosine, k = 3 % of
-the texts, at least 2. So a text that is above the level is nearer than 97 % of the unrelated ones; and where the null
-vocabulary is the list of all texts of a scene, the nearest text alone is above it. docs/honest_answers.md compares
-shares.
+The level is the k-th largest cosine between a Gaussian and the texts of the null vocabulary. k is 3 % of their number,
+and at least 2. A prompt above the level is therefore more similar than 97 % of unrelated texts. If the null vocabulary
+is the list of all texts of a scene, only the most similar text is above the level. docs/honest_answers.md compares
+other shares.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.relevancy import top_values
 
 NULL_SHARE = 0.03
-"""Share of the null vocabulary that may be nearer to a Gaussian than a text that is found there."""
+"""Share of the null vocabulary that may be more similar to a Gaussian than a matching prompt."""
 _BLOCK = 32
 
 
 def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> SemanticField:
-    """Return a field with its null level, and the best cosine of every null text in its manifest.
+    """Return a field with null levels, and with the top cosine of every null text in its manifest.
 
     Args:
-        vectors: vectors of the null vocabulary, M >= 2, of any length > 0.
+        vectors: one vector per text of the null vocabulary, M >= 2, of any length > 0.
     """
     count = max(2, round(NULL_SHARE * len(vectors)))
     own, source = field.valid(refined=False), field.source.long()

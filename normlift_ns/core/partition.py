@@ -14,12 +14,12 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 PARTITION_BLOCK = 2**13
-"""Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks, so the shapes of
-products do not depend on the number of processes; their rounding may depend on shapes."""
+"""Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks. Matrix products then
+have the same shapes, and therefore the same rounding, for any number of processes."""
 
 
 class Communicator(ABC):
-    """Communication between processes. All of them must call the same methods in the same order."""
+    """Interface for communication between processes. All processes must call the same methods in the same order."""
 
     rank: int
     """Rank of this process, in 0..size-1."""
@@ -45,7 +45,7 @@ class Communicator(ABC):
 
     @abstractmethod
     def broadcast(self, values: Tensor) -> Tensor:
-        """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
+        """Return the values of process 0 in every process. Other processes pass arrays of the same shape and type."""
 
     def broadcast_object(self, value: Any) -> Any:
         """Return the JSON-ready object of process 0 in every process."""
@@ -58,9 +58,10 @@ class Communicator(ABC):
 
 @dataclass(frozen=True)
 class Partition:
-    """Partition of the Gaussians by segments of a curve through space, so most neighbors are in the same process.
+    """Partition of the Gaussians among processes, by segments of a space-filling curve.
 
-    Arrays of a portion have one row for each Gaussian of this process, in index order.
+    Most neighbors in space are in the same process. The arrays of a process have one row for each of its Gaussians, in
+    index order.
     """
 
     communicator: Communicator
@@ -69,7 +70,7 @@ class Partition:
 
     @staticmethod
     def from_means(team: Communicator, means: Float[Tensor, "n 3"]) -> Partition:
-        """Partition the Gaussians with these means."""
+        """Partition the Gaussians by their means among the processes of `team`."""
         return Partition(team, spatial_order(means))
 
     def __len__(self) -> int:
@@ -77,7 +78,7 @@ class Partition:
 
     @cached_property
     def indices_by_rank(self) -> list[Int64[Tensor, " m"]]:
-        """Indices of the Gaussians of every process, ascending; each process has whole blocks of the curve."""
+        """Ascending indices of the Gaussians of every process. Each process has whole blocks of the curve."""
         n, size = len(self.order), self.communicator.world_size
         blocks = -(-n // PARTITION_BLOCK)
         bounds = [min(n, blocks * rank // size * PARTITION_BLOCK) for rank in range(size + 1)]
@@ -85,12 +86,12 @@ class Partition:
 
     @property
     def indices(self) -> Int64[Tensor, " m"]:
-        """Indices of the Gaussians of this process, ascending."""
+        """Ascending indices of the Gaussians of this process."""
         return self.indices_by_rank[self.communicator.rank]
 
     @cached_property
     def place(self) -> tuple[Int32[Tensor, " n"], Int32[Tensor, " n"]]:
-        """Rank that owns each Gaussian, and row of the Gaussian in that process."""
+        """Rank of the process that owns each Gaussian, and row of the Gaussian in that process."""
         owner, row = (torch.empty_like(self.order, dtype=torch.int32) for _ in range(2))
         for rank, gaussians in enumerate(self.indices_by_rank):
             owner[gaussians] = rank
@@ -99,25 +100,25 @@ class Partition:
 
     @cached_property
     def curve_rows(self) -> Int64[Tensor, " m"]:
-        """Rows of the portion in curve order."""
+        """Rows of this process in curve order."""
         first = sum(map(len, self.indices_by_rank[: self.communicator.rank]))
         return self.place[1][self.order[first : first + len(self)]].long()
 
     def blocks(self) -> Iterator[Int64[Tensor, " b"]]:
-        """Yield the rows of the portion in curve order, one block at a time."""
+        """Yield the rows of this process in curve order, one block at a time."""
         return iter(self.curve_rows.split(PARTITION_BLOCK))
 
     def all_gather(self, rows: Tensor) -> Tensor:
-        """Combine the arrays of all portions into one, in index order, in every process."""
+        """Return the joined arrays of all processes in index order, in every process."""
         joined = self.communicator.all_gather(rows)
         return torch.empty_like(joined).index_copy_(0, torch.cat(self.indices_by_rank), joined)
 
 
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
-    """Return the indices of all Gaussians along a Morton curve, on which neighbors in space are near each other.
+    """Return the indices of all Gaussians along a Morton curve, which keeps neighbors in space close to each other.
 
-    The curve has 1,024 steps per side. Its sides end at the 1st and 99th percentile, because far outliers would
-    otherwise put all other Gaussians into one cell.
+    The curve has 1,024 steps per side, from the 1st to the 99th percentile of the means. With the full range, distant
+    outliers would put all other Gaussians into one cell.
 
     >>> spatial_order(torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])).tolist()
     [1, 2, 0]

@@ -1,4 +1,4 @@
-"""Reliability-guided mode voting: a Gaussian copies the direction that reliable Gaussians near it agree on."""
+"""Reliability-guided mode voting, in which a Gaussian copies the direction that reliable neighbors agree on."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
-"""Elements of the largest tensor of a vote in torch, on the CPU (bounded by its caches) and on the GPU."""
+"""Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
-"""Number of Gaussians whose directions and neighbors' directions are in memory at a time, on CPU and GPU."""
+"""Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
 MAX_VOTERS = 256
-"""Largest K of a vote. Its time grows with the square of K, because it compares all pairs of neighbors."""
+"""Largest K of a vote. Time grows with the square of K, because a vote compares all pairs of neighbors."""
 _MAX_KERNEL_NEIGHBORS = 63
 """Largest K that `kernels.vote` supports."""
 
@@ -41,9 +41,9 @@ def refine(
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Vote for a direction among neighbors; the refined direction of i is directions[source[i]].
+    """Select the refined direction of every Gaussian i by a vote of its neighbors, as directions[source[i]].
 
-    Let N be the K nearest neighbors of i, and N+ these and i itself::
+    Let N be the K nearest neighbors of i, and N+ these neighbors and i itself::
 
         d_ik = exp(-|mu_i - mu_k|^2 / (2 sigma_d^2)),   g_jk = sigmoid((<u_k, u_j> - tau) / gamma)
         paper:      S_ij = R_j sum_{k in N+} R_k d_ik g_jk                                    (equation 9)
@@ -51,25 +51,25 @@ def refine(
         source_i = argmax_{j in N} S_ij   if that S_ij > S_ii + Delta,   else i               (equation 10)
 
     In the paper's vote, i is one of up to K + 1 voters, with a weight R_i <= 1 for any number of views. The posterior
-    vote counts views instead. The first term is the support of i itself for a direction u_j, where own_i =
-    ||f_i|| N_eff_i is the number of views that agree on u_i. The second term is the support among its neighbors, a
-    mean in 0..1 that counts like a prior of P views. The more views see i, the less its neighbors count.
+    vote counts views instead. Its first term is the support of i itself for the direction u_j. Here, own_i =
+    ||f_i|| N_eff_i is the effective number of views that agree on u_i. The second term is the support of the neighbors,
+    a mean in 0..1 that counts as much as P views. Neighbors therefore have less influence if i has more views.
 
-    All votes read the unrefined directions. Ties go to the nearer neighbor. If no neighbor is reliable, nothing
-    changes (see `unsupported`). If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
+    All votes use the unrefined directions. In a tie, the nearer neighbor wins. If no neighbor is reliable, i keeps its
+    direction (see `unsupported`). If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
-        config: options of the vote; by default, the posterior vote if `own` is given, else the paper's.
-        directions: u, unit rows or 0 of any floating-point type, used in float32 (or float64 if they are). A function
-            that returns the rows of some Gaussians, such as `Lifted.directions`, keeps one block in memory at a time.
+        config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
+        directions: u, unit rows or 0 of any floating-point type. Float64 rows are used in float64, others in float32.
+            If it is a function of indices, such as `Lifted.directions`, only one block is in memory at a time.
         reliability: R in 0..1.
-        own: `Lifted.scalars.own_evidence`; the posterior vote needs it, the paper's ignores it.
-        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default,
-            neighbors are searched with the K of `possible(config, n)`.
-        progress: called after every block of Gaussians with (Gaussians done, Gaussians).
+        own: `Lifted.scalars.own_evidence`, required by the posterior vote and ignored by the paper's vote.
+        neighbors: result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
+            search for the K of `clamp_k(config, n)`).
+        progress: callback after every block of Gaussians, with the number that are done and their total.
     Raises:
-        ValueError: if shapes disagree, a direction is neither a unit vector nor 0, R or `own` is negative or not
-            finite, the neighbors are of another K, or a posterior vote lacks `own`.
+        ValueError: if shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
+            or `own` is missing.
 
     >>> import torch
     >>> from normlift_ns import RefineConfig, refine
@@ -88,11 +88,14 @@ def refine(
     config = config if neighbors is not None else clamp_k(config, len(means))
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (len(means), config.k):
-        raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(len(means), config.k)}")
+        raise InputError(
+            f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(len(means), config.k)}; pass the "
+            "result of nearest_neighbors(means, config.k)"
+        )
     check_rows("neighbors.index", neighbors.index, len(means), low=-1)
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
     if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
-        directions = directions.__getitem__  # in blocks, because the kernel needs as much memory again
+        directions = directions.__getitem__  # in blocks, because the kernel copies its rows
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
     return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
 
@@ -102,7 +105,7 @@ def _check_inputs(
 ) -> None:
     """Raise ValueError if the inputs of a vote are inconsistent."""
     if posterior and own is None:
-        raise InputError("a posterior vote needs own, the scalars.own_evidence of a lift; got none")
+        raise InputError("a posterior vote needs own, got None; pass scalars.own_evidence of the lift")
     check_not_negative("reliability", reliability)
     if posterior and own is not None:
         check_not_negative("own", own)
@@ -118,7 +121,7 @@ class _VoteInputs:
     neighbors: Neighbors
     reliability: Float[Tensor, " n"]
     own: Float[Tensor, " n"] | None
-    """None: the paper's vote."""
+    """Own evidence of every Gaussian, or None for the paper's vote."""
     config: RefineConfig
     width: Float64[Tensor, ""]
     """sigma_d, in the units of the distances."""
@@ -135,13 +138,13 @@ def refine_subset(
     width: Float64[Tensor, ""],
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Run `refine` for some of the first m Gaussians, which have neighbors; the others only serve as neighbors.
+    """Run `refine` for some of the first m Gaussians. The other Gaussians only serve as neighbors.
 
     Args:
-        voters: Gaussians to refine, block by block in this order; neighbors in space should be near each other.
+        voters: Gaussians to refine, block by block in this order. Neighbors in space should be close in this order.
         neighbors: neighbors of the first m Gaussians, which include all voters.
         directions, reliability: as in `refine`, for all n Gaussians.
-        own: as in `refine`, read for voters only; None: the paper's vote.
+        own: as in `refine`, used for voters only, or None for the paper's vote.
         width: sigma_d, in the units of the distances.
         progress: as in `refine`.
     """
@@ -149,7 +152,7 @@ def refine_subset(
     inputs = _VoteInputs(neighbors, reliability, own, config, width)
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
-    can_change = _any_reliable(neighbors, reliability)[voters]  # without a reliable neighbor, none can win
+    can_change = _any_reliable(neighbors, reliability)[voters]  # a neighbor that is not reliable cannot win
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
@@ -173,7 +176,7 @@ def refine_subset(
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
     for block in voters[can_change].tensor_split(ends):
         if len(block) > 0:
-            retry_in_halves(vote, block, "refine on the CPU")
+            retry_in_halves(vote, block, "run the vote on the CPU")
         done = min(done + size, len(voters))
         if progress is not None:
             progress(done, len(voters))
@@ -183,29 +186,31 @@ def refine_subset(
 def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MAX_VOTERS`.
 
-    A warning reports a smaller K.
+    Warn if K is reduced.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as caught:
     ...     clamp_k(RefineConfig(k=100), 5).k, str(caught[0].message)
-    (4, 'k is 100, but a Gaussian has only 4 others; the vote uses 4 neighbors')
+    (4, 'k is 100, but only 4 other Gaussians can vote; the vote uses 4 neighbors')
     """
     config = replace(config, **config.numbers._asdict())
     k = min(config.k, max(1, n - 1), MAX_VOTERS)
     if k == config.k:
         return config
     if n < 2:
-        warnings.warn(f"with {n} Gaussian{'s' * (n != 1)}, there are no neighbors and nothing to vote on", stacklevel=2)
+        warnings.warn(f"{n} Gaussian{'s' * (n != 1)} cannot have neighbors, so no direction is refined", stacklevel=2)
         return replace(config, k=k)
     reason = (
-        f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}" if k < MAX_VOTERS else f"at most {MAX_VOTERS:,} can vote"
+        f"only {n - 1:,} other Gaussian{'s' * (n != 2)} can vote"
+        if k < MAX_VOTERS
+        else f"at most {MAX_VOTERS:,} neighbors can vote"
     )
     warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbor{'s' * (k != 1)}", stacklevel=2)
     return replace(config, k=k)
 
 
 def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tensor, source: Tensor) -> None:
-    """Write source[voters]; row_of[j] is the row of u_j in `directions`."""
+    """Write source[voters]. row_of[j] is the row of u_j in `directions`."""
     neighbors, config, own, width = inputs.neighbors, inputs.config, inputs.own, inputs.width
     dtype, numbers = torch.promote_types(directions.dtype, torch.float32), config.numbers
     reliability = inputs.reliability.to(dtype)
@@ -228,12 +233,12 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
-    """Return sigma_d times the median spacing, in the units of the means; sigma_d if all Gaussians share a position."""
+    """Return sigma_d times the median spacing, in the units of the means, or sigma_d if there is no finite spacing."""
     finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:
         return sigma * spacing.new_ones(())
-    # torch.median uses a single block of a GPU
+    # torch.median is slow on a GPU, because it uses a single block
     median = finite.sort().values[(finite.numel() - 1) // 2] if finite.is_cuda else finite.median()
     return sigma * median
 
@@ -241,11 +246,11 @@ def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64
 def voting_weights(
     neighbors: Neighbors, width: Float64[Tensor, ""], rows: Int[Tensor, " m"], reliability: Float[Tensor, " n"]
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """Return R_k d_ik of the given Gaussians, self first; 0 if a neighbor is missing.
+    """Return R_k d_ik of the given Gaussians, i itself first, or 0 for a missing neighbor.
 
-    Distances are relative to the nearest reliable member of N+, which is i itself unless R_i = 0. This is a factor per
-    Gaussian, so the winner stays the same, and weights of an isolated Gaussian do not underflow. The margin takes the
-    same factor (see `_margin`).
+    Squared distances are relative to that of the nearest reliable member of N+, which is i itself unless R_i = 0. This
+    multiplies all weights of i by one factor, so the winner stays the same, and the weights do not underflow. `_margin`
+    multiplies Delta by the same factor.
     """
     r, square = _within(neighbors, width, rows, reliability)
     return r * _decay(r, square)
@@ -259,9 +264,9 @@ def posterior_weights(
     own: Float[Tensor, " n"],
     prior: float,
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """Return own_i, then P R_k d_ik / sum_k R_k d_ik of the neighbors; 0 if one is missing or none is reliable.
+    """Return own_i and P R_k d_ik / sum_k R_k d_ik of every neighbor, or 0 if it is missing or none is reliable.
 
-    Distances are relative to the nearest reliable neighbor. This factor cancels in the ratio and avoids underflow.
+    Squared distances are relative to that of the nearest reliable neighbor, which cancels and avoids underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
@@ -273,25 +278,25 @@ def posterior_weights(
 def _within(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor
 ) -> tuple[Float[Tensor, "m k_plus_1"], Float64[Tensor, "m k_plus_1"]]:
-    """Return R and squared distances in units of sigma_d for N+, self first."""
+    """Return R and squared distances in units of sigma_d for N+, i itself first."""
     r = _gather(reliability, torch.cat([rows[:, None], neighbors.index[rows]], dim=1))
     return r, torch.nn.functional.pad(neighbors.distance[rows].double() / width, (1, 0)) ** 2
 
 
 def _nearest(r: Tensor, square: Tensor) -> Tensor:
-    """Return the squared distance of the nearest reliable member, [M, 1]; infinite if there is none."""
+    """Return the squared distance of the nearest reliable member, [M, 1], or infinity if there is none."""
     return torch.where(r > 0, square, torch.inf).amin(dim=1, keepdim=True)
 
 
 def _decay(r: Tensor, square: Tensor) -> Tensor:
-    """Return d with distances relative to the nearest reliable member."""
+    """Return d for squared distances relative to that of the nearest reliable member."""
     return torch.exp(-0.5 * (square - _nearest(r, square)).nan_to_num(0).clamp(min=0))
 
 
 def _margin(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
 ) -> Float64[Tensor, " m"] | float:
-    """Return Delta scaled by the factor that `voting_weights` omits; infinite if no support can exceed it."""
+    """Return Delta times the factor of `voting_weights`, or infinity if no member is reliable."""
     if delta == 0:
         return 0.0
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))

@@ -1,6 +1,6 @@
-"""Relevancy of Gaussians or pixels to text: a table of rules, for torch tensors and NumPy arrays.
+"""Rules for the relevancy of Gaussians or pixels to prompts, for torch tensors and NumPy arrays.
 
-This module does not need torch.
+This module imports torch only if it is called with tensors.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 TEMPERATURE = 10.0
 """Factor of the cosines inside LERF's softmax."""
 TOP_QUANTILE = 0.999
-"""Quantile over Gaussians that is the best match of a text; a single stray Gaussian does not affect it."""
+"""Quantile over Gaussians that is the top relevancy of a prompt. Single outliers do not affect it."""
 _PRESENT = 0.62
-"""Relevancy of rule lerf that objects in a scene usually reach."""
+"""Relevancy by the rule "lerf" that objects in a scene usually reach."""
 
 
 class RuleSettings(NamedTuple):
@@ -34,13 +34,13 @@ class RuleSettings(NamedTuple):
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     needs_negatives: bool
-    """True if the rule needs negative prompts. Rule contrast needs a null level instead, see `core.null_level`."""
+    """True if the rule needs negative prompts. "contrast" needs null levels instead (see `core.null_level`)."""
     no_direction: float
     """Relevancy of a Gaussian without a direction, which no threshold selects."""
     display_min: float
-    """Lower end of the color scale: renders do not distinguish smaller relevancies."""
+    """Lower end of the color scale. Renders show smaller relevancies in the same color."""
     presence_limit: float | None
-    """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
+    """Top relevancy below which a prompt is probably not in the scene; None if the limit depends on the encoder."""
 
 
 def _sigmoid(values: Any) -> Any:
@@ -52,7 +52,7 @@ def _margin(positive: Any, negative: Any) -> Any:
 
 
 def _namespace(array: Any) -> Any:
-    """Return the library of an array: numpy or torch. Both have the functions that this module calls."""
+    """Return the module of an array, numpy or torch. Both have the functions that are called here."""
     if isinstance(array, np.ndarray):
         return np
     import torch  # noqa: PLC0415 (a command-line query does not need it)
@@ -74,12 +74,12 @@ _LERF = RuleSettings(
 RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
     # The null level of the Gaussian is the only negative.
     "contrast": _LERF._replace(needs_negatives=False),
-    # The threshold suits the color encoder, and queries without further information: see `query.question.make_query`.
+    # The threshold suits the color encoder, and queries of unknown encoders; see `query.question.make_query`.
     "cosine": RuleSettings(
         lambda positive, _, __: positive, 0.5, False, no_direction=0.0, display_min=0.0, presence_limit=None
     ),
     "lerf": _LERF,
-    # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
+    # The threshold is that of the paper. The presence limit is the same lead over the negatives as for "lerf".
     "margin": RuleSettings(
         lambda positive, negative, _: _margin(positive, negative),
         0.02,
@@ -102,13 +102,13 @@ def relevancy(
     """Compute the relevancy of Q prompts from cosines.
 
     Args:
-        positive: cosine to each prompt, as tensor or NumPy array.
+        positive: cosine to each prompt, as a tensor or NumPy array.
         negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
         rule: "contrast" is "lerf" with a null level [..., 1] as the only negative. "cosine" is the cosine itself, in
-            -1..1. "lerf" is the softmax of the prompt against one negative, in
-            0..1, at its minimum over the negatives; 0.5 is a draw (LERF, section 3.4). "margin" is the cosine minus
-            the largest background cosine, in -2..2.
-        temperature: factor of the cosines inside the softmax.
+            -1..1. "lerf" is the smallest softmax of the prompt against one negative, in 0..1 (LERF, section 3.4). At
+            0.5, prompt and negative are equally similar. "margin" is the cosine minus the largest background cosine,
+            in -2..2.
+        temperature: factor of the cosines inside the softmax, > 0.
     Raises:
         ValueError: if the rule is unknown, or needs negatives and there are none.
 
@@ -119,14 +119,14 @@ def relevancy(
     """
     if not 0 < temperature < math.inf:
         raise InputError(f"temperature must be positive and finite, got {temperature}")
-    if negative is not None and type(negative) is not type(positive):  # lists, or NumPy beside torch
+    if negative is not None and type(negative) is not type(positive):  # lists, or an array of the other module
         convert = np.asarray if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor
         negative = cast(Any, convert(negative))
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
-        raise InputError('rule "contrast" compares with the null level, which the field does not have; choose "cosine"')
+        raise InputError('rule "contrast" needs a null level, but this field has none; choose rule "cosine"')
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(
-            f'rule "{rule}" compares with negative prompts; '
+            f'rule "{rule}" needs negative prompts, got none; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
         )
     return RELEVANCY_RULES[rule].formula(positive, negative, temperature)
@@ -135,19 +135,19 @@ def relevancy(
 def gaussian_relevancy(
     positive: Float[ArrayT, "n q"], negative: Float[ArrayT, "n b"], valid: Bool[ArrayT, " n"], rule: RelevancyRule
 ) -> Float[ArrayT, "n q"]:
-    """Compute the relevancy of Gaussians; those without a direction (not `valid`) get the smallest value of the rule.
+    """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get the smallest value of the rule.
 
     Raises:
-        ValueError: for the same reasons as `relevancy`.
+        ValueError: if the rule is unknown, or needs negatives and there are none.
     """
     values = relevancy(positive, negative, rule=rule)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)
 
 
 def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
-    """Return the value of each column that one row in a thousand exceeds, interpolated; N >= 1.
+    """Return the interpolated 99.9 % quantile of each column, N >= 1.
 
-    On a GPU only these numbers are copied to the CPU.
+    On a GPU, only these numbers are copied to the CPU.
 
     >>> top_values(np.arange(2001.0)[:, None])
     [1998.0]
@@ -155,6 +155,6 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
     if isinstance(values, np.ndarray):
         return np.quantile(values, TOP_QUANTILE, axis=0).tolist()
     place = TOP_QUANTILE * (len(values) - 1)
-    largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile takes 16 million values
+    largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile allows 16 million values
     low, high = largest[-1].double(), largest[max(len(largest) - 2, 0)].double()
     return (low + (high - low) * (place - math.floor(place))).tolist()

@@ -15,7 +15,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
 _TOLERANCE = 1e-5
-"""Relative tolerance of camera parameters, with a tenth of it as absolute tolerance for values near zero."""
+"""Relative tolerance of camera parameters. The absolute tolerance for values near zero is a tenth of it."""
 
 
 @check_arguments
@@ -33,16 +33,16 @@ class View(NamedTuple):
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
-    mask: Bool[Tensor, "mask_h mask_w"] | None  # readers compare the size, and name the file
-    """True at pixels that count; None: all pixels count."""
+    mask: Bool[Tensor, "mask_h mask_w"] | None  # readers check its size, to name the file in the error
+    """True at pixels to use, or None to use all pixels."""
     name: str
     """Path of the image file relative to the dataset, with forward slashes."""
     original: tuple[int, int] | None = None
-    """Width and height of the image before it was undistorted; None: it was not undistorted."""
+    """Width and height of the image before undistortion, or None if it was not undistorted."""
 
     @check_arguments
     def downscaled(self, height: int, width: int) -> View:
-        """Downscale by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
+        """Downscale the image by averaging pixels. A mask is True only if it is True for all averaged pixels."""
         camera = self.camera
         scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
 
@@ -57,7 +57,7 @@ class View(NamedTuple):
 
 @runtime_checkable
 class Views(Protocol):
-    """Undistorted images, as the scene was trained on them; each is read on access."""
+    """Undistorted images of a scene with their cameras. Each image is read on access."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -66,7 +66,7 @@ class Views(Protocol):
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Cameras of the images, in the same order; no image is read."""
+        """Cameras of the images, in the same order. No image is read."""
         ...
 
     def __len__(self) -> int: ...
@@ -75,7 +75,7 @@ class Views(Protocol):
         """Read one image.
 
         Raises:
-            FileNotFoundError, ValueError: if the file is missing or cannot be read; the message names it.
+            FileNotFoundError, ValueError: if the file is missing or cannot be read. The message names the file.
         """
         ...
 
@@ -104,7 +104,7 @@ class Scene(Protocol):
 
     @property
     def runs_dir(self) -> Path:
-        """Default directory of its lifted runs."""
+        """Default directory for lifted runs of the scene."""
         ...
 
     @property
@@ -119,7 +119,7 @@ class Scene(Protocol):
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """Rasterization mode of the training, which lifts must use too."""
+        """Rasterization mode of the training. A lift must use the same mode."""
         ...
 
     @property
@@ -144,7 +144,7 @@ class Scene(Protocol):
 
     @property
     def renderer(self) -> Callable[[Camera], UInt8[Tensor, "h w 3"]] | None:
-        """Renderer of the scene; None: normlift_ns renders `colors` on `background`."""
+        """Renderer of the scene, or None if normlift_ns renders `colors` on `background`."""
         ...
 
     def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
@@ -153,8 +153,8 @@ class Scene(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Tensor]:
-        """Trained parameters as in a checkpoint: means [N, 3], quats [N, 4], scales [N, 3] (logarithms), opacities
-        [N, 1] (logits), features_dc [N, 3] and features_rest [N, K, 3]."""
+        """Trained parameters by name, as in a checkpoint. They are means [N, 3], quats [N, 4], scales [N, 3]
+        (logarithms), opacities [N, 1] (logits), features_dc [N, 3] and features_rest [N, K, 3]."""
         ...
 
     @property
@@ -164,9 +164,9 @@ class Scene(Protocol):
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """Summarize cameras for a manifest, in a few numbers that depend on every camera and on their order.
+    """Return a summary of cameras for a manifest, which depends on every camera and on their order.
 
-    These are their number and weighted means of size, intrinsics and pose, with weights that rise from 1 to 2.
+    It consists of the number of cameras and weighted means of size, intrinsics and pose. Weights increase from 1 to 2.
 
     >>> import torch
     >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
@@ -185,7 +185,7 @@ def camera_summary(cameras: Sequence[Camera]) -> list[float]:
 
 
 def cameras_differ(first: Sequence[float], second: Sequence[float]) -> bool:
-    """Return whether two camera summaries differ by more than rounding.
+    """Return True if two camera summaries differ by more than rounding.
 
     >>> cameras_differ([2.0, 16.0], [2.0, 16.00001]), cameras_differ([2.0, 16.0], [2.0, 16.01])
     (False, True)

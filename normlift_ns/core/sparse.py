@@ -15,19 +15,19 @@ from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
 
 CANCELLATION_RATIO = 1e-3
-"""A vector sum shorter than this share of its weight is recomputed in float64, because its float32 digits cancel."""
+"""Vector sums shorter than this share of their weight are recomputed in float64, because float32 digits cancel."""
 MANY_ENTRIES = 4096
 """Sums of more vectors than this are computed in float64, because rounding errors of float32 would add up."""
 CHUNK_ELEMENTS = 2**24
 """Number of elements per block of a dense array that is computed in blocks."""
 _MAX_NARROW_COLUMNS = 32
-"""Largest number of columns of a table for which other products are faster than an embedding bag."""
+"""Largest number of table columns for which SciPy or a Triton kernel is faster than an embedding bag."""
 _MAX_SORTED = 2**27
 """Largest number of entries that a GPU sorts in one call."""
 
 
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
-    """Return the sums of consecutive segments values[offsets[i]:offsets[i + 1]] in float64, 0 for empty segments.
+    """Return the sums of the segments values[offsets[i]:offsets[i + 1]] in float64, or 0 for empty segments.
 
     Each segment is summed separately, so a value of 1e-12 in one row survives 1e6 in another.
 
@@ -58,16 +58,16 @@ class SparseRows(TensorRecord):
     def from_coo(
         row: Int[Tensor, " m"], column: Int[Tensor, " m"], weight: Float[Tensor, " m"], num_rows: int
     ) -> SparseRows:
-        """Build a matrix from entries in any order; duplicates are summed as in `sum_duplicates`."""
+        """Build a matrix from entries in any order. Duplicates are summed as in `sum_duplicates`."""
         row, column, weight = sum_duplicates(row, column, weight)
         return SparseRows(row_offsets(row, num_rows), column.int(), weight)
 
     @staticmethod
     def stack(parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device) -> SparseRows:
-        """Join (row, column, weight) lists that are sorted by row and whose columns ascend from list to list.
+        """Join lists of (row, column, weight), each sorted by row. Columns must ascend from list to list.
 
-        Nothing is sorted on a CPU: every entry is written directly behind those of its row in earlier lists. On a GPU,
-        a single stable sort is faster, as long as it fits into memory.
+        The CPU does not sort, but writes every entry directly behind those of its row in earlier lists. On a GPU, a
+        single stable sort is faster if it fits into memory.
         """
         dtype = parts[0][2].dtype if parts else torch.float32
         parts = [part for part in parts if part[0].numel() > 0]
@@ -85,7 +85,7 @@ class SparseRows(TensorRecord):
         weights = torch.empty(size, dtype=dtype, device=device)
         for row, column, weight in parts:
             count = torch.bincount(row, minlength=num_rows)
-            shift = position - (count.cumsum(0) - count)  # from the index in this list to the index in the matrix
+            shift = position - (count.cumsum(0) - count)  # index in the matrix minus index in this list
             target = torch.arange(row.numel(), device=device) + shift[row]
             columns[target], weights[target] = column, weight
             position += count
@@ -113,7 +113,7 @@ class SparseRows(TensorRecord):
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
         if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
             raise InputError(
-                f"offsets of rows must rise from 0 to the number of entries, found {ends} for {size} columns and "
+                f"row offsets must rise from 0 to the number of entries, found {ends} for {size} columns and "
                 f"{self.weight.numel()} weights"
             )
         low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
@@ -137,7 +137,7 @@ class SparseRows(TensorRecord):
         return SparseRows(offsets, self.column[entry], self.weight[entry])
 
     def select_columns(self, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
-        """Return distinct columns out of `num_columns`, renumbered in the given order."""
+        """Return some distinct columns of a matrix with `num_columns` columns, renumbered in the given order."""
         new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
         new[columns] = torch.arange(columns.numel(), device=columns.device)
         column = new[self.column.long()]
@@ -146,12 +146,12 @@ class SparseRows(TensorRecord):
 
     @staticmethod
     def append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
-        """Place matrices with the same rows side by side; the columns of each start at its `first_column`."""
+        """Join matrices with the same rows along their columns. Columns of parts[i] start at first_column[i]."""
         entries = [(part.row_index(), part.column + first, part.weight) for part, first in zip(parts, first_column)]
         return SparseRows.stack(entries, len(parts[0]), parts[0].weight.device)
 
     def matmul(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """Return the dense product with a table for all rows, in the table's precision."""
+        """Return the dense product of the matrix and a table, in the precision of the table."""
         if self.weight.numel() == 0:
             return table.new_zeros(len(self), table.shape[1])
         if can_use_triton(table) and table.shape[1] <= _MAX_NARROW_COLUMNS:
@@ -168,8 +168,8 @@ class SparseRows(TensorRecord):
 
             product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.detach().numpy()
             return torch.from_numpy(product).to(table.dtype)
-        # An embedding bag computes exactly this product: it gathers rows, scales and adds them. It is threaded on the
-        # CPU, deterministic on the GPU, and does not need MKL.
+        # An embedding bag gathers, scales and adds rows, which is this product. It is threaded on the CPU,
+        # deterministic on the GPU, and does not need MKL.
         return embedding_bag(
             self.column.long(),
             table,
@@ -191,9 +191,9 @@ class SparseRows(TensorRecord):
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """Return the product with a table of unit rows, whose sums have accurate directions.
+        """Return the product with a table of unit rows, with accurate directions of all sums.
 
-        Sums that nearly cancel, and those of very many rows, are recomputed in float64.
+        Sums that nearly cancel and sums of more than `MANY_ENTRIES` rows are recomputed in float64.
         """
         sums = self.matmul(table)
         if table.dtype == torch.float64:
@@ -211,7 +211,7 @@ class SparseRows(TensorRecord):
 def sum_duplicates(
     row: Int[Tensor, " m"], column: Int[Tensor, " m"], weight: Float[Tensor, " m"]
 ) -> tuple[Int[Tensor, " nnz"], Int[Tensor, " nnz"], Float[Tensor, " nnz"]]:
-    """Sort entries by (row, column) and sum duplicates in float64; the result is the same in every run.
+    """Sort entries by (row, column) and sum duplicates in float64. The result is the same in every run.
 
     >>> sum_duplicates(torch.tensor([1, 0, 1]), torch.tensor([5, 7, 5]), torch.tensor([1.0, 2.0, 4.0]))
     (tensor([0, 1]), tensor([7, 5]), tensor([2., 5.]))

@@ -1,2 +1,1 @@
-"""Evaluation protocols of ns-normlift-eval: ScanNet, LERF-OVS and captures with instance masks. See
-docs/evaluation.md."""
+"""Evaluation protocols and studies of ns-normlift-eval, described in docs/evaluation.md."""

@@ -1,6 +1,6 @@
-"""Ideas of other methods applied to a lifted run: the same scene, regions and features, lifted in their way.
+"""Baselines that lift the scene, regions and features of a run with the ideas of other methods.
 
-Each is our own implementation of the idea that distinguishes the method from a plain lift, not its authors' code.
+Each baseline implements only the idea that distinguishes the method from a plain lift. It is not the authors' code.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
-    "sfs": "our A^2 weights, after SFS",
-    "occam": "our center pixels, after Occam's LGS",
-    "vala": "our gated median, after VALA",
-    "drsplat": "our 10 heaviest per ray, after Dr.Splat",
+    "sfs": "A^2 weights, idea of SFS",
+    "occam": "center pixels, idea of Occam's LGS",
+    "vala": "gated median, idea of VALA",
+    "drsplat": "10 largest weights per ray, idea of Dr.Splat",
 }
-"""Description of each baseline."""
+"""Description of every baseline in the table."""
 TOP = 10
-"""Number of Gaussians per ray that count in the baseline of Dr.Splat."""
+"""Number of Gaussians per ray that the baseline "drsplat" uses."""
 VISIBLE = 0.1
-"""Minimum weight of a view, relative to a Gaussian's heaviest view, for the baseline of VALA to use it."""
+"""Smallest weight of a view that the baseline "vala" uses, relative to the largest weight of the Gaussian in a view."""
 _RAYS = 2**17
-"""Number of rays that are processed together."""
+"""Number of rays to process at a time."""
 _BLOCK = 2**12
-"""Number of Gaussians whose medians are computed together."""
+"""Number of Gaussians whose medians are computed at a time."""
 
 
 def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> SemanticField:
-    """Lift a run again with another method; return its field on the CPU, unrefined.
+    """Lift a run again with a baseline, and return the field on the CPU without refinement.
 
     Raises:
-        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
+        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
     """
     evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
@@ -77,12 +77,12 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
 
 
 def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> EvaluatedRun:
-    """Return the run with or without consensus, unrefined.
+    """Return the run with or without consensus.
 
-    If it was lifted otherwise, it is lifted again from its regions and features.
+    A run with the other setting is lifted again from its regions and features, without refinement.
 
     Raises:
-        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
+        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
     """
     manifest = lifted.field.manifest
     options = manifest.get("options", {})
@@ -104,7 +104,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
 def _observe_again(
     lifted: EvaluatedRun, device: str, cells: Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]
 ) -> ViewObservations:
-    """Return evidence, features and levels of the regions of the lift, from the evidence of the cells."""
+    """Return evidence, features and levels of the regions of the lift, given a function for the evidence of cells."""
     gaussians = lifted.scene.gaussians.to(device)
     rasterize = rasterizer(lifted.scene, lifted.settings, gaussians)
     views = ViewObservations.merge(
@@ -119,10 +119,10 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
 
     Args:
         device: device of the networks.
-        max_views: maximum number of views, evenly spaced. If None, use all views of the lift.
+        max_views: largest number of views, evenly spaced (default: all views of the lift).
     Raises:
-        ValueError: the run does not record its features, they were the user's own, or they have changed.
-        FileNotFoundError: files of the features are missing.
+        ValueError: if the run does not record its features, or they came from a Python object or have changed.
+        FileNotFoundError: if files of the features are missing.
     """
     manifest, scene = lifted.field.manifest, lifted.scene
     source = restore_source(manifest, device)
@@ -148,11 +148,11 @@ _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], E
     "vala": _plain,
     "drsplat": lambda r, g, block: top_evidence(r, block.cameras, _columns(block), _plain(r, g, block)),
 }
-"""Functions that compute the evidence of the cells in some views."""
+"""Function of every baseline that computes the evidence of the cells in some views."""
 
 
 def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
-    """Return the column of every pixel in the evidence of the block's cells, -1 for none."""
+    """Return the column of every pixel in the evidence of the block's cells, or -1 for none."""
     first = torch.tensor([0, *(regions.shape[1] for regions in block.regions)]).cumsum(0).tolist()
     return [torch.where(labels >= 0, labels + start, -1) for labels, start in zip(block.labels, first)]
 
@@ -160,10 +160,12 @@ def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
 def center_evidence(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], columns: Sequence[Int[Tensor, "h w"]], evidence: Evidence
 ) -> Evidence:
-    """Occam's LGS: in every view, a Gaussian takes the feature at its projected center, with its weight in that view.
+    """Return evidence as in Occam's LGS, which uses the pixel at the projected center of a Gaussian in every view.
+
+    The weight is that of the Gaussian in the view.
 
     Args:
-        columns: column of every pixel in the evidence, for each view; negative for none.
+        columns: column of every pixel in the evidence, for each view, or a negative number for none.
     """
     weights = evidence.view_weights()
     row, view = weights.row_index(), weights.column.long()
@@ -186,12 +188,12 @@ def top_evidence(
     evidence: Evidence,
     top: int = TOP,
 ) -> Evidence:
-    """Dr.Splat: only the `top` Gaussians with the largest weights count for a ray.
+    """Return evidence as in Dr.Splat, which uses only the `top` Gaussians with the largest weights of every ray.
 
     Args:
-        rasterize: computes evidence from cameras and labels.
+        rasterize: function that computes evidence from cameras and labels.
         columns: as in `center_evidence`.
-        evidence: evidence of those columns; only its rows are replaced.
+        evidence: evidence whose rows are replaced.
     """
     device, size = evidence.rows.weight.device, evidence.num_gaussians
     parts = []
@@ -211,7 +213,7 @@ def top_evidence(
 
 
 def _heaviest_of_rays(weights: SparseRows, pixels: int, top: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Gaussian, pixel and weight of the `top` largest entries in every column."""
+    """Return Gaussian, pixel and weight of the `top` largest entries of every pixel."""
     by_pixel = SparseRows.from_coo(weights.column.long(), weights.row_index(), weights.weight, pixels)
     order = by_pixel.weight.argsort(descending=True)
     order = order[by_pixel.row_index()[order].argsort(stable=True)]
@@ -223,13 +225,13 @@ def _heaviest_of_rays(weights: SparseRows, pixels: int, top: int) -> tuple[Tenso
 def iter_medians(
     evidence: Evidence, features: Float[Tensor, "s d"], gaussians: Int[Tensor, " m"] | None = None, *, steps: int = 10
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
-    """VALA: leave out views that hardly see a Gaussian, and take the geometric median of the others by cosine distance.
+    """Yield (Gaussians, unit directions) as in VALA, block by block, with direction 0 without evidence.
 
-    The median uses Weiszfeld iterations with weights E / (1 - cosine), renormalized to the sphere. Yield blocks of
-    Gaussians with their unit directions, 0 without evidence.
+    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the other features
+    by cosine distance. It is computed by Weiszfeld iterations with weights E / (1 - cosine), renormalized to length 1.
 
     Args:
-        gaussians: Gaussians to compute, all if None.
+        gaussians: Gaussians to compute (default: all).
     """
     rows = evidence.rows
     chosen = torch.arange(len(rows), device=features.device) if gaussians is None else gaussians
@@ -246,7 +248,7 @@ def iter_medians(
 
 
 def _visible(row: Tensor, view: Tensor, weight: Tensor, count: int, views: int) -> Bool[Tensor, " nnz"]:
-    """Select the entries whose view has at least `VISIBLE` of the weight of the Gaussian's heaviest view."""
+    """Select the entries of views with at least `VISIBLE` times the largest weight of the Gaussian in a view."""
     keys, group = (row * views + view).unique(return_inverse=True)
     view_weight = weight.new_zeros(len(keys)).index_add_(0, group, weight)
     heaviest = weight.new_zeros(count).scatter_reduce_(0, keys // views, view_weight, "amax")
@@ -263,7 +265,7 @@ def _weighted_sum(row: Tensor, weight: Tensor, values: Tensor, count: int) -> Te
 
 
 _TIMED_VIEWS = 6
-"""Number of views that are timed; each of the others would take as long."""
+"""Number of views to time. The time of all views is proportional."""
 _CHANNELS = 32
 _ROUNDS = 3
 
@@ -273,12 +275,12 @@ def dense_sums(
 ) -> Float[Tensor, "n d"]:
     """Return sum_i A_ij B_i of every Gaussian over the pixels i of all views.
 
-    It is the gradient of gsplat's render with respect to colors: one forward pass per view, and one backward pass per
-    32 channels.
+    The sum is the gradient of gsplat's render with respect to colors. It needs one forward pass per view, and one
+    backward pass per 32 channels.
 
     Args:
         maps: feature B_i of every pixel, for each view.
-        dimension: D.
+        dimension: number of feature channels D.
     """
     forward, backward = compiled_rasterizer()
     total = torch.zeros(len(job.scene), dimension, device=job.scene.means.device)
@@ -300,9 +302,9 @@ def dense_sums(
 
 
 def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
-    """Return why SFS's method cannot be timed; None if it can."""
+    """Return the reason that prevents the timing of SFS's method, or None if it can be timed."""
     if not device.startswith("cuda"):
-        return f"it needs a GPU, because gsplat is compiled for GPUs only; this is --device {device}"
+        return f"gsplat needs a GPU, got --device {device}; use --device cuda"
     try:
         check(_job(lifted, device))
     except InputError as error:
@@ -311,13 +313,13 @@ def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
 
 
 def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
-    """Time SFS's method and this package's, from labels and features to sums per Gaussian.
+    """Time SFS's method and that of this package, from labels and features to sums per Gaussian.
 
-    Both process the same few views of the lift. Each time is the median of three rounds after a warm-up round. The time
-    of SFS's method is also extrapolated to all views of the lift.
+    Both process the same few views of the lift. Times are medians of three rounds after a warm-up round, in seconds.
+    The time of SFS's method is also extrapolated to all views of the lift.
 
     Raises:
-        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
+        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)
@@ -351,9 +353,9 @@ def _job(lifted: EvaluatedRun, device: str) -> RasterJob:
 
 
 def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float[Tensor, "h w d"]]:
-    """Yield the feature of every pixel for each view, summed over levels; 0 without a region."""
+    """Yield the feature of every pixel for each view, summed over levels, or 0 without a region."""
     for labels, regions, features in zip(block.labels, block.regions, block.features):
-        table = torch.nn.functional.pad(features.to(device), (0, 0, 1, 0))  # row 0: none
+        table = torch.nn.functional.pad(features.to(device), (0, 0, 1, 0))  # row 0 for pixels without a region
         cells = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)
         rows = torch.nn.functional.pad(cells, (0, 0, 1, 0))
         yield rows[labels.to(device).long().clamp(min=-1) + 1]

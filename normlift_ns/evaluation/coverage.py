@@ -1,4 +1,4 @@
-"""Coverage study: regions without reliable evidence, unused images that would help, and new poses."""
+"""Coverage study, which finds regions without reliable evidence, helpful unused images, and new poses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 LeftOutReason = Literal["max_views", "no features", "held out"]
 MAX_IMAGES = 256
-"""Maximum number of lifted images, and of other images, that are examined."""
+"""Largest number of lifted images, and of other images, that the study examines."""
 
 
 class _Counts(msgspec.Struct):
@@ -54,7 +54,7 @@ class _Options(msgspec.Struct):
 
 
 class _LiftRecord(msgspec.Struct):
-    """Record of the images of a lift in a manifest."""
+    """Record of the lifted images in a manifest."""
 
     views_lifted: list[str] | None = None
     views_without_features: list[str] = []
@@ -63,49 +63,49 @@ class _LiftRecord(msgspec.Struct):
 
 
 class StudyImages(NamedTuple):
-    """Images to examine, the lifted ones first."""
+    """Images to examine, with the lifted images first."""
 
     lifted: int
     names: list[str]
     cameras: list[Camera]
     reasons: list[LeftOutReason]
-    """Reasons for the images that were not lifted."""
+    """Reason of every image that was not lifted."""
     left_out: dict[LeftOutReason, int]
 
 
 def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], set[str]]:
-    """Return the names of the images that were lifted, and of those without features.
+    """Return the names of the lifted images, and of the images without features.
 
     Raises:
-        ValueError: the manifest does not record them, or the scene no longer has some of them.
+        ValueError: if the manifest does not record them, or the scene no longer has some of the lifted images.
     """
     names = list(scene.train.names)
     try:
         record = msgspec.convert(dict(manifest), _LiftRecord)
     except msgspec.ValidationError as error:
-        raise InputError(f"the run's record of its images is damaged ({error}); lift again") from None
+        raise InputError(f"the run's record of lifted images is damaged ({error}); lift the scene again") from None
     used, counts = record.views_lifted, record.statistics
     if used is None and counts.left_out == 0:  # version 0.1 has only counts
         indices = sample_evenly(len(names), record.options.max_views)
         used = [names[i] for i in indices] if len(indices) == counts.views else None
     if used is None:
         raise InputError(
-            "the run does not record which images were lifted: it is from an older version, and some images had no "
-            "features; lift again with: ns-normlift --load-config ..."
+            "the run is from an older version and does not record which images had no features; lift the scene again "
+            "with ns-normlift --load-config ..."
         )
     if not set(used) <= set(names):
         raise InputError(
             f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
-            "--data, or lift again"
+            "--data, or lift the scene again"
         )
     return set(used), set(record.views_without_features)
 
 
 def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
-    """Return the images of a scene according to the manifest of the lift; of very many, an evenly spaced selection.
+    """Return at most `MAX_IMAGES` lifted and `MAX_IMAGES` other images of a scene, evenly spaced.
 
     Raises:
-        ValueError: for the same reasons as `lifted_names`.
+        ValueError: if the manifest does not record the lifted images, or the scene no longer has some of them.
     """
     used, unusable = lifted_names(scene, manifest)
     train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
@@ -119,59 +119,57 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
     return StudyImages(len(chosen), names, cameras, [reasons[i] for i in left], dict(Counter(reasons)))
 
 
-# Regions without reliable evidence: spatially connected parts of what the images show.
+# Regions without reliable evidence, which are connected parts of the surfaces in the images.
 
 
 _HIDDEN_SHARE = 0.01
-"""Total share of the surface of all Gaussians that are too small or too transparent to matter."""
+"""Share of the surface of all Gaussians that are ignored because they are too small or too transparent."""
 _MIN_SHARE = 0.001
-"""Minimum share of the surface in a listed region."""
+"""Smallest share of the surface in a listed region."""
 _MAX_REGIONS = 20
-"""Maximum number of listed regions."""
+"""Largest number of listed regions."""
 
 
 @dataclass(frozen=True)
 class WeakRegion:
-    """Connected Gaussians that images show, but with little reliable evidence. Means are weighted by surface."""
+    """Connected visible Gaussians with little reliable evidence. Means are weighted by surface."""
 
     size: int
     """Number of Gaussians."""
     centre: list[float]
-    """Center in the scene's own units."""
+    """Center in scene units."""
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the box around the centers."""
+    """Corners "min" and "max" of the bounding box of the centers, in scene units."""
     share: float
-    """Share of the surface that the images show, in 0..1."""
+    """Share of the surface in all images, in 0..1."""
     reliability: float
-    """Mean R. A view that hardly shows a Gaussian does not count as a whole one (R_j(S) of `gain`)."""
+    """Mean R_j(S) of `evaluation.coverage`, in 0..1, which gives little weight to views that hardly show a Gaussian."""
     lifted_reliability: float
-    """Mean R of the lift, in which every view with any weight counts."""
+    """Mean R of the lift, in 0..1, which uses every view with any weight."""
     norm: float
-    """Mean ||f|| of Gaussians with evidence. It is low if views disagree, which more views of the same kind do not
-    fix."""
+    """Mean ||f|| of Gaussians with evidence, in 0..1. It is low if views disagree, and similar views do not help."""
     views: float
-    """Mean number of lifted views that show a Gaussian with at least a tenth of its weight in the best image."""
+    """Mean number of lifted views that show a Gaussian with at least a tenth of its largest weight in an image."""
     unsupported: float
-    """Share of Gaussians that no vote can repair, because neither they nor their neighbors have evidence."""
+    """Share of Gaussians that voting cannot repair, because neither they nor their neighbors have evidence."""
 
 
 class GaussianEvidence(NamedTuple):
-    """Evidence for every Gaussian."""
+    """Evidence of every Gaussian."""
 
     means: Float[Tensor, "n 3"]
     scalars: Scalars
     surface: Float64[Tensor, " n"]
-    """s_j"""
+    """s_j, the largest weight of the Gaussian in an image."""
     reliability: Float64[Tensor, " n"]
-    """R_j(S)"""
+    """R_j(S), the expected reliability with the lifted views."""
     views: Int[Tensor, " n"]
-    """Lifted views that show it."""
+    """Number of lifted views that show the Gaussian."""
     unsupported: Bool[Tensor, " n"]
 
 
 def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Return the Gaussians that are large and opaque enough to matter, without the smallest that make up `HIDDEN` of
-    the surface.
+    """Return a mask of the Gaussians without the smallest ones, which have `_HIDDEN_SHARE` of the surface.
 
     >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
     [True, False, True, False]
@@ -185,10 +183,9 @@ def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
 def weak_regions(
     evidence: GaussianEvidence, min_reliability: float
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
-    """Return regions of visible Gaussians with R_j(S) below a bound, and their Gaussians, sorted by their lack of
-    evidence.
+    """Return regions of visible Gaussians with R_j(S) below a bound, and the Gaussians of each region.
 
-    The lack of a region is sum_j s_j (min_reliability - R_j(S)).
+    Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)
@@ -223,32 +220,33 @@ def _region(evidence: GaussianEvidence, rows: Int64[Tensor, " m"]) -> WeakRegion
     )
 
 
-# Benefit of one more view for a lift, from rendering weights alone: no image is read and no feature is computed.
+# Benefit of one more view for a lift, computed from rendering weights without images or features.
 #
 # W_jv is the weight of Gaussian j in view v, as a share of the image, and S is the set of lifted views. Equation
-# numbers are those of the paper::
+# numbers are those of the paper.
 #
-# s_j = max_v W_jv over all images, lifted or not: the surface that a Gaussian shows N_j(S) = (sum_v W_jv) ** 2 /
-# (sum_v W_jv ** 2 + (FAINT s_j) ** 2), the effective views of eq. 8; a view that hardly shows a Gaussian does not
-# count as a whole one R_j(S) = ||f_j|| N_j(S) / (N_j(S) + beta) eq. 8; for a Gaussian without evidence, ||f_j|| is
-# the mean of the others, weighted by surface gain(v) = sum_j s_j max(0, R_j(S + v) - R_j(S)) / sum_j s_j
+#     s_j     = max_v W_jv over all images                                        surface of a Gaussian
+#     N_j(S)  = (sum_v W_jv) ** 2 / (sum_v W_jv ** 2 + (FAINT s_j) ** 2)          effective views of eq. 8
+#     R_j(S)  = ||f_j|| N_j(S) / (N_j(S) + beta)                                  eq. 8
+#     gain(v) = sum_j s_j max(0, R_j(S + v) - R_j(S)) / sum_j s_j
 #
-# The gain is the expected increase of the mean reliability of everything that the images show. It assumes that the
-# new view agrees with the others as well as they agree with each other. Views are chosen one after the other, each by
-# its gain in addition to those chosen before. The second of two similar views thus gains little.
+# The term with FAINT reduces N_j(S) for views that hardly show a Gaussian. Without evidence, ||f_j|| is the mean of the
+# other Gaussians, weighted by surface. The gain is the expected increase of the mean reliability of all surfaces. It
+# assumes that a new view agrees with the others as well as they agree with each other. Views are chosen greedily, by
+# their gain in addition to the views before. The second of two similar views therefore has a small gain.
 
 
 PIXELS = 20_000
-"""Resolution at which weights are rasterized, in pixels per image."""
+"""Number of pixels per image for the rasterization of weights."""
 FAINT = 0.1
-"""Share of a Gaussian's largest weight below which a view hardly shows it."""
+"""Smallest weight of a view that shows a Gaussian, as a share of the largest weight of the Gaussian."""
 
 _CHUNK = 2**24
-"""Number of entries that are processed together."""
+"""Number of entries to process at a time."""
 
 
 class RasterInputs(NamedTuple):
-    """Settings to rasterize weights as in the lift."""
+    """Gaussians and settings for rasterizing weights as in the lift."""
 
     gaussians: GaussianScene
     rasterize_mode: RasterizeMode
@@ -258,27 +256,27 @@ class RasterInputs(NamedTuple):
 
 @dataclass(frozen=True)
 class ReliabilityModel:
-    """Evidence of the lifted views for every Gaussian, in float64."""
+    """Evidence of the lifted views for every Gaussian in float64, from which reliability is computed."""
 
     norm: Float64[Tensor, " n"]
-    """|f_j||, or its expected value."""
+    """||f_j||, or its expected value without evidence."""
     weight: Float64[Tensor, " n"]
-    """sum_v W_jv of the lifted views."""
+    """sum_v W_jv over the lifted views."""
     squared: Float64[Tensor, " n"]
-    """sum_v W_jv ** 2 of the lifted views."""
+    """sum_v W_jv ** 2 over the lifted views."""
     surface: Float64[Tensor, " n"]
-    """s_j"""
+    """s_j, the largest weight of the Gaussian in an image."""
     beta: float
 
     def reliability(
         self, weight: Float64[Tensor, " m"], squared: Float64[Tensor, " m"], rows: Tensor | slice = slice(None)
     ) -> Float64[Tensor, " m"]:
-        """Return R_j of some Gaussians with these sums of weights."""
+        """Return R_j of some Gaussians for the given sums of weights and of squared weights."""
         n_eff = _ratio(weight**2, squared + (FAINT * self.surface[rows]) ** 2)
         return self.norm[rows] * reliability(1.0, n_eff, self.beta)
 
     def with_view(self, views: SparseRows, view: int) -> ReliabilityModel:
-        """Return the evidence after lifting one of the views, too."""
+        """Return the evidence after the lift of one more view."""
         entries = views.column == view
         rows, weight = views.row_index()[entries], views.weight[entries].double()
         return replace(
@@ -289,14 +287,14 @@ class ReliabilityModel:
 
 
 def _with_pixels(camera: Camera, pixels: int) -> Camera:
-    """Return the camera with about `pixels` pixels, but never more than it has."""
+    """Return the camera with its image downscaled to about `pixels` pixels."""
     return camera.downscaled((pixels / (camera.width * camera.height)) ** 0.5)
 
 
 def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int = PIXELS) -> SparseRows:
-    """Return W_jv, [N, views]: the weight of Gaussian j in view v, as a share of the image."""
+    """Return W_jv, [N, views], the weight of Gaussian j in view v as a share of the image."""
     small = [_with_pixels(camera, pixels) for camera in cameras]
-    with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
+    with warnings.catch_warnings():  # the lift has already warned about Gaussians that are not drawn
         warnings.filterwarnings("ignore", message=".*are not drawn")
         labels = (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small)
         mode, power = drawn.rasterize_mode, drawn.weight_power
@@ -307,13 +305,13 @@ def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int 
 
 
 def max_weights(weights: SparseRows) -> Float64[Tensor, " n"]:
-    """Return s_j, the largest weight of every Gaussian in any view, 0 if no view shows it."""
+    """Return s_j, the largest weight of every Gaussian in any view, or 0 if it is not visible."""
     maxima = weights.weight.new_zeros(len(weights))
     return maxima.scatter_reduce_(0, weights.row_index(), weights.weight, "amax").double()
 
 
 def count_views(weights: SparseRows, surface: Float64[Tensor, " n"]) -> Int64[Tensor, " n"]:
-    """Count the views that show each Gaussian with at least `FAINT` of its largest weight."""
+    """Count the views in which each Gaussian has at least `FAINT` times its largest weight."""
     row = weights.row_index()
     return torch.bincount(row[weights.weight >= FAINT * surface[row]], minlength=len(weights))
 
@@ -323,11 +321,11 @@ def model_of_lift(
 ) -> ReliabilityModel:
     """Return the evidence of a lift.
 
-    N_eff and ||f_j|| are those of the lift. So is W_j, except for its scale, because a lift counts pixels at another
-    resolution, and several levels of regions.
+    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used another
+    resolution and several levels of regions.
 
     Args:
-        lifted: weights of the lifted views.
+        lifted: weights of the lifted views, [N, views].
     """
     sums, norm = lifted.row_sums(), scalars.norm.double()
     valid = (norm > 0) & (sums > 0) & (scalars.n_eff > 0)
@@ -339,7 +337,7 @@ def model_of_lift(
 
 
 def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
-    """Return gain(v) of every view, in addition to the lifted ones."""
+    """Return gain(v) of every view in addition to the lifted views."""
     before = model.reliability(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
@@ -353,13 +351,13 @@ def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Ten
 def choose_views(
     model: ReliabilityModel, views: SparseRows, count: int, max_views: int, accept: Callable[[int], bool] | None = None
 ) -> list[tuple[int, float]]:
-    """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
+    """Choose views greedily by their gain in addition to the views before, and return (view, gain) pairs.
 
-    Views without any gain are not returned.
+    Views without gain are not chosen.
 
     Args:
         views: W_jv of the candidates, [N, count].
-        accept: whether a view may be chosen; None: any view.
+        accept: function that returns True if a view may be chosen (default: all views).
     """
     chosen: list[tuple[int, float]] = []
     for _ in range(min(max_views, count)):
@@ -375,9 +373,9 @@ def choose_views(
 
 
 def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequence[Tensor]) -> Float64[Tensor, "p v"]:
-    """Return how much of each part a view shows, [parts, views]: sum_j min(W_jv, s_j) / sum_j s_j.
+    """Return the share of each part that a view shows, [parts, views], as sum_j min(W_jv, s_j) / sum_j s_j.
 
-    It is 1 if the view shows everything as well as the image that shows it best.
+    The share is 1 if every Gaussian of the part has its largest weight in the view.
     """
     shares = torch.zeros(len(parts), count, dtype=torch.float64)
     for i, rows in enumerate(parts):
@@ -389,29 +387,29 @@ def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequen
 
 
 def _ratio(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Divide; 0 if the denominator is 0."""
+    """Divide two arrays, with 0 for a denominator of 0."""
     return torch.where(denominator > 0, numerator / denominator, 0.0)
 
 
-# New poses that would show regions without evidence, at positions that cameras have or could have reached.
+# New poses that show regions without evidence from free positions.
 #
-# A position is free if a camera was near it, or if rays of an image pass through it to something behind it.
-# Candidates look at a region from free positions of the images, and from a ring around the region at the height of
-# the cameras. Poses are chosen from them by their gain in the regions (`gain`), each in addition to those before it.
+# A position is free if a camera is near it, or if a ray of an image passes through it to a surface behind it.
+# Candidates face a region from positions of the images, and from two rings around the region at the height of the
+# cameras. Poses are chosen greedily by their gain in the regions.
 
 
 _TARGET_REGIONS = 4
-"""Number of regions that candidates look at, those with the largest lack of evidence."""
+"""Number of regions for which candidates are computed, starting with the largest lack of evidence."""
 _CAMERA_POSITIONS, _RING_POSITIONS = 12, 12
-"""Number of camera positions, and of azimuths on the ring, for candidates of one region."""
+"""Number of camera positions, and of azimuths on each ring, for candidates of one region."""
 _MAX_CANDIDATES = 10
-"""Maximum number of candidates per region whose weights are rasterized."""
+"""Largest number of candidates per region whose weights are rasterized."""
 MIN_SHOWN_SHARE = 0.3
-"""A view shows a region if it shows at least this share of it, compared with the best image."""
+"""Smallest value of `visible_shares` for which a view is said to show a region."""
 _MIN_DEPTH = 0.15
-"""Minimum depth in front of a new camera, as a share of the median depth of the images."""
+"""Smallest depth in front of a new camera, as a share of the median depth of the images."""
 _NEAR_SHARE = 0.05
-"""Share of the pixels that may be nearer."""
+"""Share of the pixels of a new camera that may have a smaller depth."""
 _DEPTH_PIXELS = 5_000
 _DEPTH_VIEWS = 16
 
@@ -422,11 +420,11 @@ class Pose:
 
     camera: Camera
     gain: float
-    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the poses before it."""
+    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous poses."""
     regions: list[int]
-    """Numbers of the regions that it shows, from 1."""
+    """Numbers of the regions in the image, from 1."""
     shown: float
-    """Coverage of the region that it shows best; 1 is as good as the best image."""
+    """Largest value of `visible_shares` over the regions, in 0..1."""
 
     @property
     def field_of_view(self) -> float:
@@ -442,30 +440,30 @@ class Pose:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free space according to the images."""
+    """Space in which a camera can be placed, derived from the images."""
 
     camera_positions: Float64[Tensor, "v 3"]
     up: Float64[Tensor, " 3"]
     cameras: Sequence[Camera]
     depths: Sequence[Float64[Tensor, "h w"]]
-    """Depths of the cameras; infinite for empty pixels."""
+    """Depth of every pixel of `cameras`, infinite for empty pixels."""
 
     @property
     def depth(self) -> float:
-        """Median depth of everything that the images show."""
+        """Median depth of all pixels that are not empty, in scene units."""
         finite = torch.cat([depth[depth.isfinite()] for depth in self.depths])
         return float(finite.median()) if len(finite) > 0 else 1.0
 
     @property
     def spacing(self) -> float:
-        """Median distance between a camera and its nearest neighbor; 0 for a single camera."""
+        """Median distance between a camera and its nearest neighbor, or 0 for a single camera."""
         if len(self.camera_positions) < 2:
             return 0.0
         distance = torch.cdist(self.camera_positions, self.camera_positions).fill_diagonal_(torch.inf)
         return float(distance.amin(1).median())
 
     def is_free(self, positions: Float64[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
-        """Return whether a camera could be at each position."""
+        """Return a mask of the positions at which a camera could be placed."""
         free = (torch.cdist(positions, self.camera_positions) <= self.spacing + 1e-9).any(1)
         for camera, depth in zip(self.cameras, self.depths):
             row, column, z, inside = camera.project(positions)
@@ -474,17 +472,17 @@ class FreeSpace:
 
 
 def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
-    """Compute the depths of some of the images."""
+    """Compute the free space from the depths of some of the images."""
     chosen = [_with_pixels(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
     to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
     up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
-    if not bool(up.norm() > 0):  # cameras with all kinds of roll
+    if not bool(up.norm() > 0):  # the roll of the cameras varies
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return FreeSpace(to_world[:, :3, 3], up, chosen, [mean_depth(drawn, camera) for camera in chosen])
 
 
 def mean_depth(drawn: RasterInputs, camera: Camera) -> Float64[Tensor, "h w"]:
-    """Return the mean depth at each pixel of a camera; infinite if less than half of the pixel is covered."""
+    """Return the mean depth at each pixel of a camera, or infinity if alpha is at most 0.5."""
     pose = camera.world_to_camera.to(drawn.gaussians.means)
     z = (drawn.gaussians.means @ pose[2, :3] + pose[2, 3])[:, None]
     return _mean_of_pixels(drawn, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), torch.inf).double().cpu()
@@ -498,8 +496,10 @@ def _mean_of_pixels(
 
 
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
-    """Return free positions that face a target: those of images, and two rings around it at the height of the
-    cameras."""
+    """Return free positions for cameras that face a target.
+
+    They are positions of images, and positions on two rings around the target at the height of the cameras.
+    """
     away = space.camera_positions - target
     height = away @ space.up
     radius = (away - height[:, None] * space.up).norm(dim=1).median()
@@ -518,8 +518,7 @@ def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64
 def look_at(
     eye: Float64[Tensor, " 3"], target: Float64[Tensor, " 3"], up: Float64[Tensor, " 3"], like: Camera
 ) -> Camera:
-    """Return a camera with the size and focal length of another, and the principal point in the middle, as in
-    ns-render."""
+    """Return a camera with the size and focal length of `like`, and a centered principal point as in ns-render."""
     width, height = (max(2, side - side % 2) for side in (like.width, like.height))  # videos need even sizes
     focal = float(like.K[1, 1])
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -533,7 +532,7 @@ def suggest_poses(
     targets: Sequence[Sequence[float]],
     parts: Sequence[Tensor],
 ) -> list[Pose]:
-    """Suggest the poses that show regions best, greedily.
+    """Suggest poses for the regions, chosen greedily by their gain.
 
     Args:
         targets: centers of the regions.
@@ -559,7 +558,7 @@ def suggest_poses(
 
     @cache
     def accept(view: int) -> bool:
-        """Return whether a view shows a region, with all but a few pixels far enough from the camera."""
+        """Return True if a view shows a region and most of its pixels are far enough from the camera."""
         if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
             return False
         depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()
@@ -570,24 +569,24 @@ def suggest_poses(
 
 
 def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
-    """Return the numbers of the regions that a view shows, from 1."""
+    """Return the numbers of the regions in a view, from 1."""
     return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
 
 
-# Output files of the coverage study: renders of the new poses, and a camera path for ns-render.
+# Output files of the coverage study, which are renders of the new poses and a camera path for ns-render.
 
 
 _MAX_RENDER_PIXELS = 300_000
-"""Maximum number of pixels in a render."""
+"""Largest number of pixels of a render."""
 _INCHES = 6.0
 
 
 class PoseRender(NamedTuple):
-    """Render from a pose."""
+    """Render of the scene and of reliability from a pose."""
 
     image: UInt8[Tensor, "h w 3"]
     reliability: Float[Tensor, "h w"]
-    """R in 0..1, NaN for empty pixels."""
+    """Mean R in 0..1, or NaN for empty pixels."""
 
 
 def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
@@ -599,9 +598,9 @@ def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, 
 
 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
-    """Return a camera path for `ns-render camera-path`, one second per pose.
+    """Return a camera path for `ns-render camera-path`, with one second per pose.
 
-    It is valid only for the run that the poses were computed for, because it uses the coordinates of that run.
+    The path is valid only for the run of the poses, because it uses the coordinates of this run.
     """
     width, height = (poses[0].camera.width, poses[0].camera.height)
     cameras = [
@@ -624,14 +623,16 @@ def write_poses(
     documents: Mapping[Path, Mapping[str, Any]] | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write <stem>_camera_path.json and <stem>_pose_1.png …, either all or none; without poses, write none of them.
+    """Write <stem>_camera_path.json and <stem>_pose_1.png …, if there are poses, and return the paths.
+
+    On an error, none of the files is written.
 
     Args:
-        documents: more JSON files for the same folder.
-        overwrite: replace files of these names, and remove those of an earlier study.
+        documents: additional JSON files for the same folder.
+        overwrite: replace existing files, and remove those of an earlier study.
     Raises:
-        FileExistsError: a file exists and `overwrite` is False.
-        OSError: the files cannot be written.
+        FileExistsError: if a file exists and `overwrite` is False.
+        OSError: if the files cannot be written.
     """
     path, *images = pose_output_paths(stem)
     json_files = dict(documents or {})
@@ -650,7 +651,7 @@ def write_poses(
 
 
 def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
-    """Save the scene next to its reliability, with a color scale."""
+    """Save a figure of the scene and its reliability, with a color scale."""
     height, width = picture.reliability.shape
     figure, (left, right) = make_figure((2 * _INCHES, _INCHES * height / width + 0.6), 1, 2)
     left.imshow(picture.image.numpy())
@@ -668,28 +669,28 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
 
 
 RELIABLE = 0.5
-"""R above which a Gaussian is reliable; at beta 1, a single consistent view gives this value."""
+"""Smallest R of a reliable Gaussian. With beta 1, a single consistent view gives this value."""
 _MAX_IMAGES = 12
-"""Maximum number of suggested images."""
+"""Largest number of suggested images."""
 
 
 @dataclass(frozen=True)
 class SuggestedImage:
-    """An image that was left out of the lift."""
+    """Image that was not lifted, with its expected benefit."""
 
     name: str
     why: LeftOutReason
-    """Reason for leaving it out."""
+    """Reason why the image was not lifted."""
     gain: float
-    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the images above it."""
+    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous images."""
     regions: list[int]
-    """Numbers of the regions that it shows, from 1."""
+    """Numbers of the regions in the image, from 1."""
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Coverage:
-    """Gaps in the evidence of a lift, and views that would fill them.
+    """Regions without reliable evidence in a lift, and images and poses that would add evidence.
 
     >>> from normlift_ns import coverage, open_run
     >>> result = coverage(open_run(config))
@@ -700,38 +701,38 @@ class Coverage:
     """
 
     reliability: float
-    """Mean R_j(S) of `evaluation.coverage` over all surfaces that the images show, in 0..1."""
+    """Mean R_j(S) of `evaluation.coverage` over all surfaces in the images, in 0..1."""
     regions: list[WeakRegion]
-    """Regions that lack evidence, worst first."""
+    """Regions without reliable evidence, worst first."""
     photographs: list[SuggestedImage]
-    """Images to add to the lift, in this order."""
+    """Images to add to the lift, most helpful first."""
     poses: list[Pose]
-    """New poses for more images, in this order."""
+    """New poses for additional images, most helpful first."""
     pictures: list[PoseRender]
     """Renders of the poses."""
     left_out: dict[LeftOutReason, int]
-    """Number of images that are not in the lift, by reason."""
+    """Number of images that were not lifted, by reason."""
     remarks: list[str]
-    """Remarks in whole sentences."""
+    """Notes for the user, in full sentences."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON types, without the renders."""
+        """Return the result without the renders, as JSON types."""
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "pictures"}
         rows = {name: [asdict(row) for row in plain[name]] for name in ("regions", "photographs")}
         return {**plain, **rows, "poses": [pose.to_json() for pose in self.poses]}
 
     @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write a JSON file, and next to it <stem>_pose_1.png … and <stem>_camera_path.json; return the paths.
+        """Write a JSON file, <stem>_pose_1.png … and <stem>_camera_path.json, and return the paths.
 
         `ns-render camera-path` renders the camera path with the run.
 
         Args:
-            overwrite: replace files of these names.
+            overwrite: replace existing files.
         Raises:
-            FileExistsError: a file exists and `overwrite` is False.
-            ValueError: a file of the run has that name.
-            OSError: the files cannot be written.
+            FileExistsError: if a file exists and `overwrite` is False.
+            ValueError: if the path is not a file name, or a file of the run would be replaced.
+            OSError: if the files cannot be written.
 
         >>> from normlift_ns import coverage, open_run
         >>> [path.name for path in coverage(open_run(config)).save(folder / "next.json")][:2]
@@ -739,7 +740,7 @@ class Coverage:
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
-            raise InputError(f"{path} is not a valid file name; give one such as next.json")
+            raise InputError(f"{path} is not a valid file name; give a name such as next.json")
         stem = path.with_suffix("")
         refuse_inputs((path, *pose_output_paths(stem)), instead="name")
         documents = {path: self.to_json()}
@@ -748,17 +749,16 @@ class Coverage:
 
 @check_arguments
 def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
-    """Find regions that lack reliable evidence, unused images that would help most, and new poses for the worst
-    regions.
+    """Find regions without reliable evidence, unused images that would help most, and new poses for these regions.
 
-    Nothing is lifted and no image is read. Weights of views are rasterized at a low resolution. They determine the
-    reliability that one more view would give, by the formula in `evaluation.coverage`.
+    The study does not lift or read images. It rasterizes weights of views at a low resolution, and computes from them
+    the reliability with one more view, by the formula in `evaluation.coverage`.
 
     Args:
-        min_reliability: R below which a Gaussian is not reliable, in 0..1.
-        device: device for rasterizing, that of the run if None.
+        min_reliability: smallest R of a reliable Gaussian, in 0..1.
+        device: device for the rasterization (default: that of the run).
     Raises:
-        ValueError: the run does not record which images were lifted, or the images show no Gaussian.
+        ValueError: if the run does not record the lifted images, or no Gaussian is visible in the images.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)
@@ -773,7 +773,7 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
 def coverage_of(
     scene: Scene, field: SemanticField, *, min_reliability: float = RELIABLE, device: str = "cpu"
 ) -> Coverage:
-    """Compute `coverage` of a scene and its semantics."""
+    """Compute `coverage` of a scene and its semantic field."""
     check_number("min_reliability", min_reliability)
     images = study_images(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)
@@ -815,11 +815,11 @@ def _remarks(
     total, examined = sum(images.left_out.values()), len(images.reasons)
     hidden, single = len(regions) > 0 and len(poses) == 0, len(images.cameras) == 1
     remarks = {
-        f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except for "
-        "parts smaller than a thousandth of it.": len(regions) == 0,
-        "No new pose shows a region better than the images do; it may be hidden from all possible positions.": hidden,
-        "No image was left out of the lift, so none can be suggested.": examined == 0,
-        f"Of {total:,} images left out, only {examined}, evenly spaced, were examined.": examined < total,
-        "The scene has a single camera; the study cannot judge what this camera does not show.": single,
+        f"All surfaces in the images have R of at least {min_reliability:g}, except for parts with less than a "
+        "thousandth of the surface.": len(regions) == 0,
+        "No new pose shows a region well. The regions may be hidden from all free positions.": hidden,
+        "All images were lifted, so the study cannot suggest others.": examined == 0,
+        f"{total:,} images were not lifted. Only {examined} of them, evenly spaced, were examined.": examined < total,
+        "The scene has a single camera. The study does not cover surfaces that this camera does not show.": single,
     }
     return [text for text, applies in remarks.items() if applies]

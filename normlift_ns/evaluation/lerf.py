@@ -1,4 +1,4 @@
-"""Evaluation on LERF-OVS: labels and scores."""
+"""Evaluation on LERF-OVS, with its label files and scores."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from normlift_ns.evaluation.protocols import EvaluatedRun, scene_names
 from normlift_ns.evaluation.sfs import clean_mask, histogram_threshold
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 
-# Labels of LERF-OVS: one JSON file per annotated frame, with polygons of named objects.
+# Labels of LERF-OVS, with one JSON file of named polygons per annotated frame.
 
 
 _Point = tuple[float, float]
@@ -59,35 +59,35 @@ class _File(msgspec.Struct):
 
 
 class LabeledFrame(NamedTuple):
-    """Masks and boxes of an annotated frame."""
+    """Masks and boxes of the objects in an annotated frame."""
 
     stem: str
     """File stem of the annotated image."""
     masks: dict[str, Bool[Tensor, "h w"]]
-    """Mask of each category, the union of its objects."""
+    """Mask of each category, as the union of its objects."""
     boxes: dict[str, list[tuple[float, float, float, float]]]
-    """(x1, y1, x2, y2) of every object of a category, in pixels."""
+    """Boxes (x1, y1, x2, y2) of the objects of each category, in pixels."""
 
 
 def read_frames(folder: Path) -> list[Path]:
     """Return the JSON files of a folder such as lerf_ovs/label/figurines, sorted by name.
 
     Raises:
-        FileNotFoundError: the folder does not exist or has no JSON files.
+        FileNotFoundError: if the folder does not exist or has no JSON files.
     """
     files = sorted(folder.glob("*.json")) if os.path.isdir(folder) else []
     if len(files) == 0:
         raise FileNotFoundError(
-            f"{folder} has no label files; give the folder with files such as frame_00041.json, lerf_ovs/label/SCENE"
+            f"{folder} has no label files; give a folder such as lerf_ovs/label/SCENE, with files like frame_00041.json"
         )
     return files
 
 
 def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
-    """Read a label file and fill its polygons, scaled to the size of the image.
+    """Read a label file, and fill its polygons after scaling them to the size of the image.
 
     Raises:
-        ValueError: the file has another format, or is for an image with another aspect ratio. The message names the
+        ValueError: if the file has another format, or labels an image with another aspect ratio. The message names the
             file.
     """
     try:
@@ -101,8 +101,8 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
         ) from error
     if abs(size[0] * height - size[1] * width) > 0.01 * size[0] * height:
         raise InputError(
-            f"{file} labels an image of {size[0]} x {size[1]} pixels, but that of the run has {width} x {height}; use "
-            "the images that the labels were drawn on"
+            f"{file} labels an image of {size[0]} x {size[1]} pixels, but the image of the run has {width} x {height}; "
+            "use the images that were annotated"
         )
     scale = np.array([width / size[0], height / size[1]])
     masks: dict[str, np.ndarray] = {}
@@ -114,8 +114,8 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
         cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
         if not drawn.any():
             raise InputError(
-                f"{file}: a segmentation of {category!r} lies completely outside its image of {size[0]} x {size[1]} "
-                "pixels; correct or remove it"
+                f"{file} has a segmentation of {category!r} outside its image of {size[0]} x {size[1]} pixels; correct "
+                "or remove it"
             )
         mask |= drawn
         low, high = (scaled.min(0), scaled.max(0)) if box is None else box * scale
@@ -124,11 +124,11 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Return the points of a polygon, which may lie slightly outside the image, but not by its whole size."""
+    """Return the points of a polygon. Raise InputError if a point is outside the image by more than its size."""
     points = np.array(segmentation, dtype=float)
     if np.abs(points / (width, height) - 0.5).max() > 1.5:
         raise InputError(
-            f"a segmentation of an image of {width} x {height} pixels has the coordinate {np.abs(points).max():g}"
+            f"a segmentation of an image of {width} x {height} pixels has a coordinate of {np.abs(points).max():g}"
         )
     return points
 
@@ -141,9 +141,9 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     """Match label files with images by their stems.
 
     Returns:
-        The image of every label file that has one, and the stems of the files without one.
+        The image of every label file with an image, and the stems of the other label files.
     Raises:
-        ValueError: no file has an image, or a file has several.
+        ValueError: if no label file has an image, or a label file has several images.
     """
     images: dict[str, list[str]] = {}
     for name in names:
@@ -152,34 +152,34 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     if len(matches) == 0:
         stems = ", ".join(sorted(images)[:3])
         raise InputError(
-            f"none of the {len(files)} label files in {files[0].parent} has an image in the run; the first file is "
-            f"{files[0].name}, but the run has {stems}, …"
+            f"none of the {len(files)} label files in {files[0].parent}, such as {files[0].name}, matches an image of "
+            f"the run, such as {stems}, …; give the labels of this scene"
         )
     for file, candidates in matches.items():
         if len(candidates) > 1:
             raise InputError(
-                f"{file} labels one image, but {' and '.join(candidates)} of the run are all called {file.stem}; "
+                f"{file} matches several images of the run, {' and '.join(candidates)}, by the name {file.stem}; "
                 "rename all but one of them"
             )
     return {file: candidates[0] for file, candidates in matches.items()}, [f.stem for f in files if f not in matches]
 
 
-# 2D open-vocabulary segmentation on LERF-OVS, with composited scores of prompts instead of feature maps.
+# 2D open-vocabulary segmentation on LERF-OVS, which composites scores of prompts instead of feature maps.
 
 
 _BOX, _THRESHOLD, _HALF_WINDOW = 30, 0.4, 3
-"""LangSplat's values: side of the box filter, threshold, and half the side of the majority window."""
+"""Side of the box filter, threshold, and half the side of the majority window, as in LangSplat."""
 
 
 class FrameScores(NamedTuple):
-    """Composited scores of a frame."""
+    """Composited scores of prompts in a frame."""
 
     frame: LabeledFrame
     prompts: Float[Tensor, "h w q"]
     """Scores of the frame's categories, in the order of `frame.masks`."""
     background: Float[Tensor, "h w b"]
-    """Scores of `BACKGROUND_WORDS`, for masking "background". With LangSplat's maskings, `prompts` are relevancies
-    already."""
+    """Scores of `BACKGROUND_WORDS` for masking "background". With LangSplat's maskings, they are not used, because
+    `prompts` are relevancies."""
 
 
 def prompt_mask(
@@ -193,10 +193,12 @@ def prompt_mask(
     """Return the mask of a prompt.
 
     Args:
-        masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores that
-            reach SFS's threshold, computed from their histogram and the number of true instances. "langsplat" and
-            "langsplat_composited" scale the relevancy to 0..1 over the image. They select pixels if it exceeds 0.7 (0.4
-            after 2 x - 1) in the majority of the pixels around them.
+        masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores
+            above SFS's threshold, from their histogram and the number of true instances. "langsplat" and
+            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels
+            around it exceed 0.7, which is 0.4 after 2 x - 1.
+        margin: lead over the background words, in cosine.
+        instances: number of true instances.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin
@@ -207,9 +209,9 @@ def prompt_mask(
 
 
 def _majority(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Select a pixel if more than half of the pixels at most 3 rows and columns away are selected.
+    """Select a pixel if more than half of the pixels within 3 rows and columns are selected.
 
-    As in LangSplat, the last row and the last column of the image do not count.
+    As in LangSplat, windows do not include the last row and the last column of the image.
     """
     sums = torch.nn.functional.pad(mask.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
 
@@ -223,10 +225,10 @@ def _majority(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 
 
 def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Apply LangSplat's box filter.
+    """Apply LangSplat's box filter of 30 x 30 pixels.
 
     Returns:
-        The mean over 30 x 30 pixels, for the peak; and the average of this mean and the relevancy, for the threshold.
+        The filtered relevancy for the peak, and its average with the relevancy for the threshold.
     """
     image = relevancy.float().numpy()
     kernel = np.full((_BOX, _BOX), 1 / _BOX**2, np.float32)
@@ -237,7 +239,8 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
 def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
     """Compute IoU, recall and localization of each category.
 
-    A category is localized if its peak lies in the mask. With LangSplat's maskings, any peak may lie in any box.
+    A category is localized if its peak is in the mask. With LangSplat's maskings, any of several peaks in any box
+    suffices.
     """
     rows = []
     frame, langsplat = scores.frame, masking in LANGSPLAT_MASKINGS
@@ -263,7 +266,7 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
 
 
 def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, width: int) -> Bool[Tensor, "h w"]:
-    """Return the pixels inside any of the boxes, including their edges."""
+    """Return a mask of the pixels inside any box, including the edges."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     inside = torch.zeros(height, width, dtype=torch.bool)
     for x1, y1, x2, y2 in boxes:
@@ -272,9 +275,9 @@ def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, wi
 
 
 def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, settings: dict[str, Any]) -> Evaluation:
-    """Compute miou, macc and loc_acc of every scene and their means over scenes, as the paper averages.
+    """Compute miou, macc and loc_acc of every scene, and their means over scenes as in the paper.
 
-    Results with _pooled are averaged over the frames, pairs or categories of all scenes together.
+    Results with the suffix _pooled are averages over the frames, pairs or categories of all scenes.
 
     Args:
         rows: results of `frame_rows`, each with its scene.
@@ -318,7 +321,7 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
     """Run protocol lerf with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
+        FileNotFoundError, ValueError: if labels are missing, are damaged, or belong to other images.
     """
     files = [read_frames(folder) for folder in labels]
     rows, missing = [], []
@@ -339,7 +342,7 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
     if len(rows) == 0:
-        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
+        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; annotate at least one")
     settings = {**asdict(options), "labels_without_image": missing}
     return summarize_lerf(rows, options.average, settings)
 
@@ -351,7 +354,7 @@ def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] |
 def _frame_scores(
     lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
 ) -> FrameScores:
-    """Return composited scores, divided by the length of each pixel's feature if given."""
+    """Return composited scores, divided by the length of the feature of each pixel if it is given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
     negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
     values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))

@@ -22,7 +22,7 @@ LANGSPLAT_MASKINGS: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
 """Maskings that use LangSplat's relevancy."""
 AveragingOrder = Literal["frames", "pairs", "categories"]
 MASK_MARGIN = 0.02
-"""Lead of a score over every background word (section "Mask thresholding" of the paper; 0 in SFS's code)."""
+"""Default lead over every background word, from section "Mask thresholding" of the paper. SFS's code uses 0."""
 
 
 MAX_SUGGESTED_POSES = 5
@@ -30,7 +30,7 @@ MAX_SUGGESTED_POSES = 5
 
 
 def pose_output_paths(stem: Path) -> tuple[Path, ...]:
-    """Return all paths that new poses may be written to: a camera path, and a render of each pose.
+    """Return all paths of files for new poses, which are a camera path and a render of each pose.
 
     >>> [path.name for path in pose_output_paths(Path("next"))][:2]
     ['next_camera_path.json', 'next_pose_1.png']
@@ -44,13 +44,13 @@ class ScannetOptions(CheckedOptions):
     """Options of --protocol scannet, which needs one *_vh_clean_2.labels.ply per run in --labels."""
 
     min_opacity: float = 0.1
-    """Smallest opacity of a scored Gaussian, in 0..1; larger values score fewer Gaussians, and 0 scores all."""
+    """Smallest opacity of a scored Gaussian, in 0..1. Larger values score fewer Gaussians. 0 scores all."""
     without_direction: WithoutDirection = "first"
-    """Class of Gaussians without a direction. first: wall, as in published scripts. none: no class. The table also
-    has the result of the other choice."""
+    """Class of Gaussians without a direction. first assigns wall, as in published scripts. none assigns no class. The
+    table also shows the result of the other choice."""
     spelling: Literal["script", "paper"] = "script"
-    """Spelling of the shower curtain prompt. script: showercurtain, as in OpenGaussian's script. paper: shower
-    curtain."""
+    """Spelling of one prompt. script uses "showercurtain", as in OpenGaussian's script. paper uses "shower
+    curtain"."""
 
 
 @dataclass(frozen=True)
@@ -58,41 +58,42 @@ class LerfOptions(CheckedOptions):
     """Options of --protocol lerf, which needs one folder of label files per run in --labels."""
 
     masking: Masking = "background"
-    """Conversion of scores to a mask. background: scores above all background words by --margin. auto: SFS's
-    threshold from the histogram. langsplat: LERF's relevancy of each pixel's unit feature, scaled as in LangSplat.
-    langsplat_composited: the same for composited scores, without division by the length of the pixel's feature."""
+    """Conversion of scores to masks. background selects scores above all background words by --margin. auto applies
+    SFS's threshold from the histogram. langsplat thresholds LERF's relevancy of unit features per pixel, as in
+    LangSplat. langsplat_composited does so for composited scores, without normalizing features."""
     margin: float = MASK_MARGIN
-    """Lead over the best background word for --masking background, in cosine; larger values give smaller masks. SFS's
+    """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. SFS's
     code uses 0."""
     average: AveragingOrder = "frames"
-    """Order of averaging within a scene; the scenes are averaged last. frames: categories of a frame, then frames.
-    pairs: all pairs of frame and category equally. categories: frames of a category, then categories."""
+    """Averaging within a scene. frames averages the categories of each frame, then the frames. pairs averages all
+    pairs of frame and category. categories averages the frames of each category, then the categories."""
     clean: bool = False
-    """Open and close each mask, keep its largest component and fill its holes, as in SFS's code; this empties the image
-    border. The paper does not specify it."""
+    """Open and close each mask, keep its largest component and fill its holes, as in SFS's code. The image border
+    becomes empty. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
-    """Scores to composite. unit: cosines. norm: cosines times ||f||, as in SFS, whose features are not normalized."""
+    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, as in SFS, which does not
+    normalize features."""
 
 
 @dataclass(frozen=True)
 class MaskOptions(CheckedOptions):
-    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks with the images' names."""
+    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks, named like the images."""
 
     names: Path | None = None
-    """JSON file with the name of every mask value. Default: labels.json next to the mask folder."""
+    """JSON file with the name of every mask value (default: labels.json next to the mask folder)."""
     purity: float = 0.75
-    """Smallest share of a Gaussian's weight that must lie in masks of one class to score it, in 0..1; larger values
-    score fewer Gaussians."""
+    """Smallest share of a Gaussian's weight in masks of one class for which it is scored, in 0..1. Larger values score
+    fewer Gaussians."""
     min_weight: float = 1.0
-    """Smallest weight of a scored Gaussian, in pixels over all training views, >= 0; larger values score fewer
+    """Smallest weight of a scored Gaussian, in pixels over all training views, >= 0. Larger values score fewer
     Gaussians."""
 
 
-# JSON files from other programs, validated against the types that a protocol expects.
+# JSON files of other programs, which are validated against the types that a protocol expects.
 
 
 PromptText = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
-"""Text that can be used as a prompt: not blank, and without lone surrogates."""
+"""Text of a prompt, which is not blank and has no lone surrogates."""
 _Document = TypeVar("_Document")
 
 
@@ -100,7 +101,8 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     """Read a JSON file and convert it to a type.
 
     Raises:
-        ValueError: the file is missing, too large or not valid JSON, a key occurs twice, or a value has another type.
+        ValueError: if the file is missing, too large or not valid JSON, a key is duplicated, or a value has another
+            type.
     """
     try:
         text = read_text(path)
@@ -123,20 +125,20 @@ def _reject_constant(text: str) -> float:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of one protocol over one or several runs."""
+    """Metrics of one protocol for one or several runs."""
 
     results: Mapping[str, float]
-    """Metrics by name, as `results` of ns-eval. Shares are in 0..1."""
+    """Metrics by name, for `results` in the file of ns-eval. Shares are in 0..1."""
     rows: Sequence[Mapping[str, Any]]
-    """Metrics per class (and scene or frame), as JSON types."""
+    """Metrics per class and per scene or frame, as JSON types."""
     settings: Mapping[str, Any]
-    """The protocol and its settings."""
+    """Protocol and its settings."""
     scenes: Sequence[Mapping[str, Any]] = ()
-    """Metrics of each scene, if `results` are their means."""
+    """Metrics of each scene, if `results` are means over scenes."""
 
 
 def mean(values: Sequence[float]) -> float:
-    """Return the mean of the values that are not NaN; NaN if there are none.
+    """Return the mean of the values that are not NaN, or NaN if there are none.
 
     >>> mean([1.0, float("nan"), 3.0])
     2.0
@@ -153,15 +155,14 @@ def write_evaluation(
     studies: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write experiment_name, method_name, checkpoint and results as ns-eval does, then settings, scenes, rows and
-    studies.
+    """Write an evaluation as a JSON file in the format of ns-eval.
 
-    NaN is written as null.
+    The keys settings, scenes, rows and studies are additional. NaN is written as null.
 
     Args:
         runs: name and checkpoint of every run.
     Raises:
-        FileExistsError: the file exists and `overwrite` is False.
+        FileExistsError: if the file exists and `overwrite` is False.
     """
     names, checkpoints = (", ".join(values) for values in zip(*runs))
     document: dict[str, Any] = {"experiment_name": names, "method_name": "normlift", "checkpoint": checkpoints}

@@ -1,4 +1,4 @@
-"""Lifted runs to evaluate, and the evaluation against instance masks."""
+"""Lifted runs for evaluation, and the evaluation against instance masks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _VALUE = re.compile(r"0|-?[1-9][0-9]{0,9}")
 
 
 class _NamesFile(msgspec.Struct):
-    """Content of the file of names."""
+    """Content of a file of mask names."""
 
     labels: dict[str, PromptText]
     background: int | None = None
@@ -44,17 +44,19 @@ class Names:
     """Class names of the values of instance masks."""
 
     classes: tuple[str, ...]
-    """Distinct names, used as prompts."""
+    """Distinct names, which are used as prompts."""
     class_of: Mapping[int, int]
-    """Class of each value; pixels with other values do not count."""
+    """Class of each value. Pixels with other values are ignored."""
 
 
 def read_names(path: Path) -> Names:
-    """Read {"labels": {"1": "table", ...}, "background": 0}, or only the inner part; equal names are one class.
+    """Read a JSON file such as {"labels": {"1": "table", ...}, "background": 0}, or only the inner part.
+
+    Values with the same name belong to the same class.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file has another format.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file has another format.
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
@@ -67,9 +69,9 @@ def read_names(path: Path) -> Names:
             raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
         name_of = {int(value): name for value, name in named.labels.items()}
         if named.background is not None and named.background in name_of:
-            raise InputError(f"value {named.background} is the background, but has a name")
+            raise InputError(f"value {named.background} is the background, but also has a name")
         if len(name_of) == 0:
-            raise InputError("it has no names")
+            raise InputError("it contains no names")
     except ValueError as error:
         raise InputError(f"{path} is not a valid file of mask names ({error}); {expected}") from error
     classes = tuple(dict.fromkeys(name_of.values()))
@@ -77,17 +79,18 @@ def read_names(path: Path) -> Names:
 
 
 def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
-    """Return the class of every pixel of an image; -1 if it does not count.
+    """Return the class of every pixel of an image, or -1 for pixels to ignore.
 
     Raises:
-        FileNotFoundError, ValueError: the mask is missing, damaged or of another size; the message names it.
+        FileNotFoundError, ValueError: if the mask is missing, is damaged, or has another size. The message names the
+            file.
     """
     values = masks.values(name)
     if values.shape != (1, height, width):
         size = values.shape if len(values) > 1 else values.shape[1:]
         raise InputError(
             f"mask {masks.path(name)} has shape {size}, but its image {name} is {height} x {width} (height x width); "
-            "give masks the size of the undistorted image"
+            "provide masks in the size of the undistorted images"
         )
     unique, inverse = np.unique(values[0], return_inverse=True)
     table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in unique])
@@ -97,13 +100,13 @@ def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width:
 def gaussian_truth(
     evidence: Evidence, classes: int, *, purity: float = 0.75, min_weight: float = 1.0
 ) -> Int64[Tensor, " n"]:
-    """Return the true class of every Gaussian from evidence of the exact masks, with one column per view and class.
+    """Return the true class of every Gaussian from evidence of the true masks, with one column per view and class.
 
     A Gaussian below either minimum has class -1.
 
     Args:
-        purity: minimum share of the class in the weight of the Gaussian, including pixels that do not count.
-        min_weight: minimum weight in all views together, in pixels.
+        purity: smallest share of the class in the weight of the Gaussian, which includes ignored pixels.
+        min_weight: smallest weight over all views, in pixels.
     """
     columns = torch.arange(evidence.num_regions) % classes
     by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
@@ -150,27 +153,27 @@ def evaluate_masks(
 
 
 _CHANNELS = 64
-"""Number of feature channels that are composited together."""
+"""Number of feature channels to composite at a time."""
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """A lifted run, and which of its features to evaluate."""
+    """A lifted run with the settings of its evaluation."""
 
     scene: Scene
     field: SemanticField
     texts: TextEncoder
     refined: bool
     cache: Path | None = None
-    """Folder in which the lift caches 2D features."""
+    """Folder of the lift's cache of 2D features, or None without a cache."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
-        """Return the cosine between every Gaussian's direction and each prompt; 0 without a direction."""
+        """Return the cosine between every Gaussian's direction and each prompt, or 0 without a direction."""
         return self.field.query(self.texts.text(names), refined=self.refined).float()
 
     @property
     def valid(self) -> Bool[Tensor, " n"]:
-        """Gaussians with a direction."""
+        """Mask of the Gaussians with a direction."""
         return self.field.valid(refined=self.refined)
 
     @property
@@ -179,17 +182,17 @@ class EvaluatedRun:
         return RasterSettings.recorded(self.field.manifest)
 
     def composite(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
-        """Render values [H, W, Q] and alpha [H, W] with the settings of the lift."""
+        """Render values [H, W, Q] and alpha [H, W] with the rasterizer settings of the lift."""
         mode = self.scene.rasterize_mode
         return render(self.scene.gaussians, camera, values, rasterize_mode=mode, settings=self.settings)
 
     def feature_lengths(
         self, cameras: Sequence[Camera], factor: Float[Tensor, "n 1"] | float = 1.0
     ) -> list[Float[Tensor, "h w"]]:
-        """Return the length of every pixel's composited feature vector, computed in groups of channels.
+        """Return the length of the composited feature vector of every pixel, for each camera.
 
         Args:
-            factor: factor on the directions before they are composited.
+            factor: factor of the directions before compositing.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -205,18 +208,17 @@ class EvaluatedRun:
 
 
 Rasterize = Callable[..., Evidence]
-"""`rasterize_evidence` with the arguments that are the same in all calls."""
+"""`rasterize_evidence` with fixed arguments that all calls share."""
 
 
 def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
-    """Return `rasterize_evidence` for a scene, or for its Gaussians on another device."""
+    """Return `rasterize_evidence` for a scene, or for its Gaussians on another device if they are given."""
     gaussians = scene.gaussians if gaussians is None else gaussians
     return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)
 
 
 def scene_names(labels: Sequence[Path]) -> list[str]:
-    """Return scene names for label files or folders: the name of the file or folder, or the whole path if names are
-    equal.
+    """Return a scene name for each label file or folder, which is its name, or its path if names are not unique.
 
     >>> scene_names([Path("label/ramen"), Path("a/scene0000_00_vh_clean_2.labels.ply")])
     ['ramen', 'scene0000_00']
@@ -233,9 +235,9 @@ class MaskTruth:
 
     classes: tuple[str, ...]
     gaussians: Int64[Tensor, " n"]
-    """Class of every Gaussian, -1 if it does not count."""
+    """Class of every Gaussian, or -1 for Gaussians to ignore."""
     held_out: Sequence[Int64[Tensor, "h w"]]
-    """Class of every pixel in the held-out views."""
+    """Class of every pixel in each held-out view, or -1 for pixels to ignore."""
     settings: Mapping[str, Any]
 
 
@@ -245,9 +247,9 @@ def mask_truth(
     """Derive the ground truth of Gaussians and of held-out pixels from instance masks.
 
     Args:
-        settings: rasterizer settings, those of gsplat 1.4 if None.
+        settings: rasterizer settings (default: those of gsplat 1.4).
     Raises:
-        FileNotFoundError, ValueError: masks or names are missing or damaged; the message names the file.
+        FileNotFoundError, ValueError: if masks or names are missing or damaged. The message names the file.
     """
     masks = LabelFiles(folder, description="instance mask", flag="--labels")
     images = [*scene.train.names, *scene.held_out.names]
@@ -274,7 +276,7 @@ def mask_truth(
 
 
 def run_masks(lifted: EvaluatedRun, truth: MaskTruth) -> Evaluation:
-    """Run protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
+    """Run protocol masks on one run, in 3D over Gaussians and in 2D over held-out views."""
     cosine, pixels = lifted.cosine(truth.classes), []
     for camera, exact in zip(lifted.scene.held_out.cameras, truth.held_out):
         values, alpha = lifted.composite(camera, cosine)

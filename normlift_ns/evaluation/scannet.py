@@ -1,4 +1,4 @@
-"""3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh."""
+"""3D semantic segmentation on ScanNet with OpenGaussian's protocol, in which Gaussian i is vertex i of the mesh."""
 
 from __future__ import annotations
 
@@ -27,88 +27,82 @@ NYU40 = {
     10: "bookshelf", 11: "picture", 12: "counter", 14: "desk", 16: "curtain", 24: "refrigerator", 28: "showercurtain",
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
-"""Prompts by NYU40 id: bare class names, spelled as in OpenGaussian's script."""
+"""Prompts by NYU40 id, which are class names as spelled in OpenGaussian's script."""
 PAPER_SPELLING = {28: "shower curtain"}
-"""Class names that the paper spells differently."""
+"""Class names by NYU40 id that the paper spells differently."""
 _LAST_ID = 40
 CLASS_SETS = {
     19: tuple(NYU40),
     15: tuple(i for i in NYU40 if i not in (11, 24, 28, 36)),
     10: (1, 2, 4, 5, 6, 7, 8, 9, 10, 33),
 }
-"""NYU40 ids of the three sets."""
+"""NYU40 ids of the three class sets, by their number of classes."""
 SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
 _OTHER: dict[WithoutDirection, WithoutDirection] = {"first": "none", "none": "first"}
 
 
 class SceneLabels(NamedTuple):
-    """Data of one scene that the protocol needs."""
+    """Inputs of the protocol for one scene."""
 
     name: str
     cosine: Float[Tensor, "n 19"]
-    """Cosine between every Gaussian and the names of `NYU40`, in their order."""
+    """Cosine between every Gaussian and the names in `NYU40`, in this order."""
     valid: Bool[Tensor, " n"]
-    """Gaussians that have a direction."""
+    """Mask of the Gaussians with a direction."""
     opacity: Float[Tensor, " n"]
     nyu40: Int64[Tensor, " n"]
-    """True NYU40 id of each Gaussian's vertex."""
+    """True NYU40 id of the vertex of each Gaussian."""
 
 
 def read_labels(path: Path) -> Int64[Tensor, " n"]:
-    """Read the property `label` of the vertices of a PLY file, such as scene0000_00_vh_clean_2.labels.ply.
+    """Read the property `label` of the vertices in a PLY file such as scene0000_00_vh_clean_2.labels.ply.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is not a PLY file, is damaged, or has no labels.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is not a PLY file, is damaged, or has no labels.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(
-            f"labels {path} do not exist; expected ScanNet's *_vh_clean_2.labels.ply, which you may download after "
-            "registration, under its license"
+            f"the label file {path} does not exist; expected ScanNet's *_vh_clean_2.labels.ply, which you can download "
+            "after registration, under its license"
         )
     try:
         check_ply_header(path)
         vertex = next((x for x in PlyData.read(str(path), mmap="c").elements if x.name == "vertex"), None)
         if vertex is None or vertex.count == 0:
-            raise InputError("its header declares no vertices")
+            raise InputError("its header has no vertices")
         names = [item.name for item in vertex.properties]
         if "label" not in names:
-            raise InputError(f"its vertices have no property label (found {', '.join(names)})")
+            raise InputError(f"its vertices have no property label, only {', '.join(names)}")
         column = np.asarray(vertex["label"])
         labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
         if (labels != column).any():
             raise InputError("its labels are not 32-bit integers")
     except (OSError, ValueError, TypeError, PlyParseError, EOFError, MemoryError, OverflowError) as error:
         raise InputError(
-            f"{path} is damaged, or not a PLY file with labeled vertices ({error}); download the scene's "
-            "*_vh_clean_2.labels.ply again"
+            f"{path} is damaged, or is not a PLY file with labeled vertices ({error}); download the "
+            "*_vh_clean_2.labels.ply of the scene again"
         ) from error
     if not np.isin(labels, list(NYU40)).any():
-        raise InputError(
-            f"{path}: no label is one of the NYU40 ids {', '.join(map(str, NYU40))}; nothing can be scored"
-        )
+        raise InputError(f"{path} has no label to score, expected NYU40 ids such as {', '.join(map(str, NYU40))}")
     unknown = (labels > _LAST_ID) | (labels < -1)
     if unknown.any():
         warnings.warn(
-            f"{path}: {int(unknown.sum()):,} of {len(labels):,} labels are not NYU40 ids, such as "
-            f"{labels[unknown][0]}; they count as unlabeled",
+            f"{path}: {int(unknown.sum()):,} of {len(labels):,} labels are not valid NYU40 ids, such as "
+            f"{labels[unknown][0]}; they are treated as unlabeled",
             stacklevel=2,
         )
     return torch.from_numpy(np.where(unknown, 0, labels))
 
 
 def check_identity(name: str, gaussians: int, labels: Int64[Tensor, " n"], path: Path) -> None:
-    """Check that there are as many Gaussians as vertices, because Gaussian i must be vertex i.
-
-    Raises:
-        ValueError: their numbers differ.
-    """
+    """Raise ValueError unless the number of Gaussians equals that of vertices, because Gaussian i must be vertex i."""
     if len(labels) != gaussians:
         raise InputError(
-            f"run {name} has {gaussians:,} Gaussians, but {path} has {len(labels):,} vertices; the protocol needs one "
-            "Gaussian per vertex, in the same order. Train from all vertices with densification and culling off and "
-            "positions fixed"
+            f"run {name} has {gaussians:,} Gaussians, but {path} has {len(labels):,} vertices. The protocol needs one "
+            "Gaussian per vertex, in the same order. Train with ns-train normlift-scannet, from all vertices, with "
+            "fixed positions and without densification or culling"
         )
 
 
@@ -117,9 +111,11 @@ def scene_scores(
 ) -> ClassScores:
     """Score one scene with one of `CLASS_SETS`.
 
-    A Gaussian is not scored if its true class is outside the set, or if its opacity is below `min_opacity`. All names
-    of the set are prompts, including those that the scene lacks. IoU and recall are computed for the classes that it
-    has.
+    A Gaussian is not scored if its true class is not in the set, or if its opacity is below `min_opacity`. All names of
+    the set are prompts, but IoU and recall are computed only for the classes in the scene.
+
+    Args:
+        classes: number of classes of the set, 10, 15 or 19.
     """
     truth, prediction = predict_classes(scene, classes, min_opacity=min_opacity, without_direction=without_direction)
     return class_scores(confusion(truth, prediction, classes))
@@ -128,8 +124,7 @@ def scene_scores(
 def predict_classes(
     scene: SceneLabels, classes: int, *, min_opacity: float, without_direction: WithoutDirection
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Return the true and the predicted class of every Gaussian, as indices into the set of classes; see
-    `scene_scores`."""
+    """Return the true and the predicted class of every Gaussian as indices of the class set, as in `scene_scores`."""
     ids = list(NYU40)
     columns = [ids.index(i) for i in CLASS_SETS[classes]]
     class_of = torch.full((max(int(scene.nyu40.max()), *ids) + 1,), NO_CLASS)
@@ -140,9 +135,9 @@ def predict_classes(
 
 
 def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> Evaluation:
-    """Compute mIoU and mAcc of every set of classes, averaged over scenes.
+    """Compute mIoU and mAcc of every class set, averaged over scenes.
 
-    `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
+    Results with the suffix _none or _first use the other choice of `without_direction`.
     """
     min_opacity, without_direction = options.min_opacity, options.without_direction
     other = _OTHER[without_direction]
@@ -156,8 +151,8 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
         }
         if all(math.isnan(score.miou) for score in scores[without_direction]):
             raise InputError(
-                f"nothing can be scored with {classes} classes: no Gaussian of {', '.join(names)} has a label among "
-                f"them and an opacity of at least {min_opacity:g} (--min-opacity)"
+                f"nothing can be scored with {classes} classes, because no Gaussian of {', '.join(names)} has one and "
+                f"an opacity of at least {min_opacity:g}; reduce --min-opacity or check the labels"
             )
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
@@ -173,7 +168,7 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
 
 
 def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
-    """Return the scores of each class that a scene has."""
+    """Return the scores of each class in a scene."""
     return [
         {"scene": scene, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
         for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())
@@ -184,10 +179,10 @@ def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str,
 def label_scene(
     lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
 ) -> SceneLabels:
-    """Return the data of a run that protocol scannet needs.
+    """Return the inputs of protocol scannet for a run.
 
     Raises:
-        ValueError: the number of vertices differs from that of Gaussians.
+        ValueError: if the number of vertices differs from that of Gaussians.
     """
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
     prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
@@ -199,7 +194,7 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
     """Run protocol scannet with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
+        FileNotFoundError, ValueError: if labels are missing or damaged, or have another number of vertices.
     """
     truths = [read_labels(path) for path in labels]
     inputs = zip(runs, scene_names(labels), labels, truths)

@@ -1,4 +1,4 @@
-"""Score maps as in the published code of Splat Feature Solver (SFS), number by number, including its oddities."""
+"""Thresholds and mask cleaning that reproduce the results of the published code of Splat Feature Solver (SFS)."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from torch import Tensor
 _BINS, _MIN_PEAK, _UPPER_QUANTILE = 40, 600, 0.75
 _MIN_RANGE, _MIN_VARIANCE = 1e-12, 1e-10
 _MAX_QUANTILE_VALUES = 2**24
-"""Maximum number of values for torch's quantile."""
+"""Largest number of values that torch.quantile accepts."""
 _EPSILON = 1e-12
-"""Keeps the means of empty sides finite."""
+"""Lower bound of shares, so that means of empty sides are finite."""
 
 
 def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
-    """Return the threshold of SFS's attention maps, a float32 number. Scores that reach it (>=) are selected.
+    """Return the threshold of SFS's attention maps as a float32 number. It selects scores >= threshold.
 
-    The histogram has 40 bins from the smallest to the largest score. Its peaks are the bins of at least 600 pixels that
-    no neighbor exceeds; on a plateau, every bin is a peak. The rule uses the k-th peak from the right, with k the
-    number of true instances. If there are fewer than k, it uses the rightmost peak.
+    The histogram has 40 bins from the smallest to the largest score. A peak is a bin with at least 600 pixels and no
+    larger neighbor, so every bin of a plateau is a peak. The rule uses the k-th peak from the right for k true
+    instances, or the rightmost peak if there are fewer.
 
-    The valley is the nearest bin to the left that is lower than the peak and that no neighbor undercuts. The first bin
-    is excluded. If there is no such bin, the valley is the rightmost bin of all that lies right of the peak and is
-    lower. The threshold is the middle of the valley.
+    The valley is the nearest bin to the left that is lower than the peak and has no lower neighbor. The first bin
+    is excluded. If there is no such bin, the valley is the rightmost lower bin on the right of the peak. The threshold
+    is the center of the valley.
 
-    Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. It
-    is the mean of all scores if these are nearly equal (variance below 1e-10).
+    Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. If
+    all scores are nearly equal (variance below 1e-10), it is their mean.
 
-    In two cases, the published code has no answer to follow. It fails if the last two bins are equal and the peak is
-    the last; this function then follows the rule above. Its float32 mean of a constant map may exceed the constant;
-    this function then selects every pixel. The last digit of float32 sums depends on the memory layout, so this
-    function keeps that of `score`.
+    This function differs from the published code in two cases. If the last two bins are equal and the peak is the last
+    bin, the published code fails, and this function applies the rule above. For a constant map, the float32 mean of the
+    published code may exceed the constant, but this function selects every pixel. The last digit of float32 sums
+    depends on the memory layout, so this function keeps the layout of `score`.
     """
     values = score.detach().cpu().float().flatten()
     low, high = float(values.min()), float(values.max())
@@ -71,7 +71,8 @@ def _valley(counts: list[int], instances: int) -> int | None:
 
 
 def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> float:
-    """Return the center of the bin after which a split maximizes the variance between both sides, in float32."""
+    """Return the float32 center of the last bin of the lower side in the split with the largest variance between
+    sides."""
     center, share = (edges[:-1] + edges[1:]) / 2, counts.float() / int(counts.sum())
     below, moment = share.cumsum(0), (share * center).cumsum(0)
     above, total = 1 - below, (share * center).sum()
@@ -80,11 +81,10 @@ def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> flo
 
 
 def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Open and close the mask by 3 x 3 pixels, keep its largest 8-connected component (the first of equals), and fill
-    holes.
+    """Open and close a mask by 3 x 3 pixels, keep the largest 8-connected component, and fill its holes.
 
-    The outside of the image counts as empty in every step, so erosion removes the border. In the outermost rows and
-    columns, only filled holes remain.
+    The first of several equal components is kept. Pixels outside the image are empty in every step, so erosion removes
+    the border. In the outermost rows and columns, only filled holes remain.
     """
     image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
     for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):

@@ -1,4 +1,4 @@
-"""Studies of lifted runs: ablation, sweeps, signals and timing."""
+"""Studies of lifted runs, which are ablation, sweeps, signals, timing and baselines."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def refine_variant(
 
     Args:
         variant: "none" returns the directions of the lift. "linear" averages the directions of N+ with the weights
-            R d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
+            R_k d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
         beta: prior strength of the shrinkage of R, as in `lift`.
     Raises:
         ValueError: if the variant is unknown.
@@ -83,20 +83,20 @@ def variant_source(
     beta: float = 1.0,
     neighbors: Neighbors | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Run `refine` as one of the variants that vote.
+    """Run `refine` with the options and reliability of a variant.
 
     Raises:
-        ValueError: if the variant is unknown, or `refine` rejects the arguments.
+        ValueError: if the variant is unknown, or an argument of `refine` is invalid.
     """
     reliability, config = variant_reliability(variant, scalars, beta), variant_config(variant, config)
     return refine(means, directions, reliability, config, own=scalars.own_evidence, neighbors=neighbors)
 
 
 def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
-    """Return the options of a variant's vote.
+    """Return the vote options of a variant.
 
-    The result is `config` if that is for the variant's kind of vote. Otherwise it has the defaults of that kind, with
-    the `k` and `prior` of `config`. All variants but "posterior" use the paper's vote.
+    "posterior" needs options of the posterior vote, and all other variants need those of the paper's vote. The result
+    is `config` if it is of this kind. Otherwise, it has the defaults of this kind, with `k` and `prior` of `config`.
 
     >>> variant_config("posterior", RefineConfig(vote="paper", k=12, sigma_d=3.0)).numbers.sigma_d
     2.0
@@ -106,16 +106,16 @@ def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
 
 
 def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
-    """Return the R that a variant votes with.
+    """Return the reliability R for the vote of a variant.
 
-    "plain_knn" uses 1 for every Gaussian with a direction, "norm_only" uses ||f||, and "support_only" uses
-    N_eff / (N_eff + beta). All others use NormLift's R, the product of the last two.
+    R is 1 for every Gaussian with a direction ("plain_knn"), ||f|| ("norm_only"), or N_eff / (N_eff + beta)
+    ("support_only"). All other variants use the product of the last two, which is NormLift's R.
 
     Raises:
         ValueError: if the variant is unknown.
     """
     if variant not in get_args(Variant):
-        raise InputError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
+        raise InputError(f"variant must be one of {', '.join(get_args(Variant))}, got {variant!r}")
     if variant == "plain_knn":
         return (scalars.norm > 0).to(scalars.norm.dtype)
     if variant == "norm_only":
@@ -127,7 +127,7 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
 def linear_average(
     directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
 ) -> Float[Tensor, "n d"]:
-    """Return normalize(sum_{k in N+} R_k d_ik u_k), or u_i if that sum is 0."""
+    """Return normalize(sum_{k in N+} R_k d_ik u_k) for every Gaussian i, or u_i if the sum is 0."""
     out, width = torch.empty_like(directions), decay_width(neighbors.spacing, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)
@@ -137,7 +137,7 @@ def linear_average(
     return torch.where(length > 0, out / length, directions)
 
 
-# Alternative votes over the stored directions of a run: the paper's ablation, and a sweep of every parameter.
+# Alternative votes over the stored directions of a run, for the paper's ablation and a sweep of every parameter.
 
 
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -148,16 +148,16 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "gamma": (0.05, 0.1, 0.2, 0.4, 0.8),
     "delta": (0.0, 0.05, 0.1, 0.2, 0.3),
 }
-"""Values of each parameter, in addition to its default and the values of the runs; the others stay as in the lift.
+"""Values of each parameter, in addition to its default and the values of the runs.
 
-beta, K and Delta are as in the paper's appendix.
+Other parameters keep the values of the lift. The values of beta, K and Delta are those of the paper's appendix.
 """
 CONSENSUS_VARIANTS: dict[str, Variant] = {
     "consensus": "none",
     "consensus_paper": "paper",
     "consensus_posterior": "posterior",
 }
-"""Vote after the consensus, by variant name."""
+"""Variants of the vote after the consensus, by their name in the table."""
 BETA = LiftOptions().reliability_beta
 """Default of `LiftOptions.reliability_beta`."""
 
@@ -170,21 +170,21 @@ class Vote:
     config: RefineConfig
     beta: float
     label: Mapping[str, Any]
-    """Columns that distinguish it from other votes."""
+    """Columns of the table that distinguish the vote from others."""
 
 
 def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
-    """Return the vote that a run was lifted with, with defaults for values that its manifest does not record."""
+    """Return the vote of the lift from its manifest, with defaults for missing values."""
     options = manifest.get("options", {})
-    kind = {"vote": "paper"} if "vote" in options else {}  # the only one in version 0.1
+    kind = {"vote": "paper"} if "vote" in options else {}  # the only kind in version 0.1
     config = RefineConfig(**{**kind, **options.get("vote", {})})
     return Vote(config.vote, config, options.get("reliability_beta", BETA), {})
 
 
 def voting_scalars(field: SemanticField) -> Scalars:
-    """Return the scalars that a run votes with.
+    """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is the one before the consensus, from which R was computed.
+    With consensus, ||f|| is replaced by the value before the consensus, which R was computed from.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False):
@@ -194,7 +194,7 @@ def voting_scalars(field: SemanticField) -> Scalars:
 
 
 def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """Yield variants by name, one vote per run."""
+    """Yield the votes of every variant, one vote per run."""
     for name, variant in variants.items():
         yield [replace(own, variant=variant, label={"variant": name}) for own in owns]
 
@@ -202,7 +202,7 @@ def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iter
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
     """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
 
-    They include the default and the values of the runs, and mark both.
+    Labels mark the default and the values of the runs, which are included.
     """
     for parameter, values in SWEEPS.items():
         default = default_value(parameter, owns[0].config.vote)
@@ -213,7 +213,7 @@ def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
 
 
 def default_value(parameter: str, kind: VoteKind) -> float:
-    """Return the default of a parameter of `SWEEPS` for a kind of vote."""
+    """Return the default value of a parameter of `SWEEPS` for a kind of vote."""
     return _value(Vote(kind, RefineConfig(vote=kind), BETA, {}), parameter)
 
 
@@ -231,9 +231,9 @@ def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) 
 
 
 def make_voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:
-    """Return a function that votes again on the device.
+    """Return a function that repeats the vote of a field with other options, on the device.
 
-    It searches neighbors once per K. Only linear averaging holds all directions in memory.
+    The function searches neighbors once per K. Only linear averaging keeps all directions in memory.
     """
     device_field, means = field.to(device), means.to(device)
     scalars = voting_scalars(device_field)
@@ -266,43 +266,43 @@ def make_voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -
     return apply
 
 
-# Statistics of R in a scene: Gaussians without evidence, accuracy by R and by ||f||, and R against opacity.
+# Statistics of Gaussians without evidence, of accuracy by R and by ||f||, and of R against opacity.
 
 
 _FAINT_OPACITY = 0.1
-"""Opacity below which a Gaussian is faint."""
+"""Opacity below which Gaussians count as faint."""
 _HISTOGRAM_BINS = 20
-"""Number of bins of R from 0 to 1; R = 0 is counted separately."""
+"""Number of bins of R from 0 to 1. Gaussians with R = 0 are counted separately."""
 
 
 @dataclass(frozen=True)
 class SceneSignals:
-    """Data on the Gaussians of a scene."""
+    """Reliability, opacity, and true and predicted classes of the Gaussians of a scene."""
 
     scalars: Scalars
     opacity: Float[Tensor, " n"]
     """Opacity in 0..1."""
     truth: Int[Tensor, " n"] | None = None
-    """Class of every Gaussian, `NO_CLASS` if it does not count. None means that it is unknown; there are no accuracies
-    then."""
+    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None if there is no ground truth."""
     predictions: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
-    """Predicted class of each direction: "unrefined", and "refined" after a vote."""
+    """Predicted class of every Gaussian, under the keys "unrefined" and, if there was a vote, "refined"."""
 
 
 def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
-    """Return statistics by name, over the Gaussians of all scenes together.
+    """Return statistics by name, over the pooled Gaussians of all scenes.
 
     The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
     has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
-    `.views` that see them. It also has `.accuracy_unrefined` and `.accuracy_refined`, over Gaussians with ground truth.
+    `.views`. With ground truth, it also has `.accuracy_unrefined` and `.accuracy_refined`.
 
-    For Gaussians with R > 0, R is compared with opacity. There are `opacity.spearman` and `opacity.kendall` with their
-    p-values `…_p`, and `opacity.jaccard` of the lowest fifths. `opacity.quintile1` … are mean opacities by ascending R.
+    Opacity is compared with R for Gaussians with R > 0. `opacity.spearman` and `opacity.kendall` are correlations, with
+    p-values `…_p`. `opacity.jaccard` compares the lowest fifths. `opacity.quintile1` … are mean opacities by ascending
+    R.
 
-    `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in tenths of equal count.
-    `….spearman_bins` is their rank correlation with the order. `histogram.0.00` … are shares by R.
+    `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in ten bins of equal
+    count. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00` … are shares by R.
 
-    The p-values assume that Gaussians are independent of each other, which neighbors are not.
+    The p-values assume that Gaussians are independent, but neighbors are not.
     """
     reliability, norm, views = (
         torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")
@@ -333,7 +333,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
 
 def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
-    """Return the Gaussians with ground truth, and those for which each kind of prediction is correct."""
+    """Return a mask of the Gaussians with ground truth, and a mask of correct predictions for each kind."""
     truths = [scene.truth for scene in scenes if scene.truth is not None]
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
@@ -346,7 +346,7 @@ def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, "
 
 
 def accuracy_bins(key: Float[Tensor, " n"], correct: Bool[Tensor, " n"], bins: int = 10) -> list[float]:
-    """Return the share of correct predictions in bins of equal count by the key; only positive keys count."""
+    """Return the share of correct predictions in bins of equal count by the key. Keys <= 0 are ignored."""
     positive = key > 0
     return list(_bins(key[positive], correct[positive].double(), bins))
 
@@ -359,14 +359,14 @@ def _mean(values: Tensor, group: Tensor) -> float:
     return float(values[group].double().mean())
 
 
-# Figures of the studies: a curve for every parameter, and R with accuracy.
+# Figures of sweeps and signals.
 
 
 def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:
-    """Write a figure, the same bytes each time.
+    """Write a figure reproducibly, without a date or random ids.
 
     Args:
-        overwrite: replace a file of that name.
+        overwrite: replace an existing file.
     """
     import matplotlib as mpl  # noqa: PLC0415 (only drawing needs it)
 
@@ -375,13 +375,12 @@ def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:
 
 
 def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None) -> Figure:
-    """Plot the metric against each parameter of `votes.SWEEPS`, one panel each, with the run's values and the default
-    marked.
+    """Plot the metric against each parameter of `SWEEPS`, with one panel per parameter.
 
     Args:
-        rows: rows with parameter, value and metric; `default` and `own` mark values.
-        label: label of the metric's axis.
-        result: main result of the run, drawn as a line across all panels.
+        rows: rows with parameter, value and metric. The flags `default` and `own` mark the default and the run's value.
+        label: axis label of the metric.
+        result: main result of the run, drawn as a horizontal line in all panels.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
     figure, axes = make_figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
@@ -411,10 +410,10 @@ _MARKS: dict[str, dict[str, Any]] = {
 
 
 def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Plot accuracy and reliability, one line of panels per row of the study (that is, per scene).
+    """Plot accuracy and reliability, with two panels per row of the study.
 
-    The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, given ground truth. The
-    right panel shows the histogram of R, with R = 0 as a separate bar.
+    The left panel shows the accuracy of unrefined predictions in ten bins by R and by ||f||, if there is ground truth.
+    The right panel shows the histogram of R, with a separate bar for R = 0.
     """
     figure, axes = make_figure((9, 3.5 * len(rows)), len(rows), 2)
     for row, curves, histogram in zip(rows, axes[::2], axes[1::2]):
@@ -439,7 +438,7 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def make_figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
-    """Return a figure of a size in inches, and its panels row by row."""
+    """Return a figure with a size in inches, and its panels row by row."""
     from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
 
     figure = Figure(figsize=size, layout="constrained")
@@ -456,7 +455,7 @@ def study_votes(
     votes: Callable[[Sequence[Vote]], Iterator[Sequence[Vote]]],
     device: str,
 ) -> list[Row]:
-    """Evaluate the protocol with every vote, around that of each run; equal votes are evaluated once."""
+    """Evaluate the protocol with the votes that `votes` yields for the runs. Equal votes are evaluated once."""
     voters = [make_voter(lifted.field, lifted.scene.gaussians.means, device) for lifted in runs]
     results: dict[Any, Mapping[str, float]] = {}
     rows = []
@@ -473,34 +472,34 @@ def study_votes(
 def study_ablation(
     runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, warn: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Evaluate the protocol with every variant, with and without consensus, no matter how the runs were lifted.
+    """Evaluate the protocol with every variant, both with and without consensus.
 
     Args:
-        warn: called with the reason if variants are left out, because the features of a run cannot be computed again.
+        warn: callback with the reason if variants are skipped, because the features of a run are not available.
     """
     rows: list[Row] = []
     for on, names in ((False, {name: name for name in get_args(Variant)}), (True, CONSENSUS_VARIANTS)):
         try:
             again = [with_consensus(lifted, on, device) for lifted in runs]
         except (ValueError, FileNotFoundError) as error:
-            warn(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
+            warn(f"The ablation skips all variants {'with' if on else 'without'} consensus: {error}")
             continue
         rows += study_votes(again, evaluate, partial(variant_votes, names), device)
     return rows
 
 
 def signal_rows(names: Sequence[str], scenes: Sequence[SceneSignals]) -> list[Row]:
-    """Return `signal_statistics` of every scene and, if there are several, of all of them pooled."""
+    """Return `signal_statistics` of every scene and, if there are several scenes, of all scenes pooled."""
     rows: list[Row] = [{"scene": name, **signal_statistics(scene)} for name, scene in zip(names, scenes)]
     return [*rows, {"scene": POOLED_SCENE, **signal_statistics(*scenes)}] if len(rows) > 1 else rows
 
 
 POOLED_SCENE = "all scenes"
-"""Scene name of the pooled row."""
+"""Scene name in the row of pooled statistics."""
 
 
 def scannet_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> list[Row]:
-    """Return `signal_rows` for the 19 classes of ScanNet."""
+    """Return `signal_rows` of runs for the 19 classes of ScanNet."""
     names, scenes = scene_names(labels), []
     kwargs = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
     for lifted, name, path in zip(runs, names, labels):
@@ -519,13 +518,13 @@ def mask_signals(lifted: EvaluatedRun, truth: MaskTruth) -> list[Row]:
 
 
 def plain_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path]) -> list[Row]:
-    """Return `signal_rows` without true classes."""
+    """Return `signal_rows` of runs without ground truth."""
     scenes = [SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities) for lifted in runs]
     return signal_rows(scene_names(labels), scenes)
 
 
 def _by_refinement(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
-    """Return the run with unrefined directions and, if it was lifted with a vote, with refined ones."""
+    """Return the run with unrefined directions and, if it was lifted with a vote, with refined directions."""
     voted = lifted.field.manifest.get("options", {}).get("refine", True)
     kinds = {"unrefined": False, **({"refined": True} if voted else {})}
     return {kind: replace(lifted, refined=refined) for kind, refined in kinds.items()}
@@ -535,7 +534,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
     """Evaluate the protocol for the runs and for `BASELINES` on the same features. Baselines are not refined.
 
     Raises:
-        ValueError, FileNotFoundError: for the same reasons as `lifted_batches`.
+        ValueError, FileNotFoundError: if the features of a run are not available (see `lifted_batches`).
     """
     rows: list[Row] = []
     for name, what, refined in (("normlift", "the run, refined", True), ("unrefined", "the run, unrefined", False)):
@@ -550,12 +549,12 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
 def study_timing(
     runs: Sequence[EvaluatedRun], device: str = "cpu", tell: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Return the seconds of every stage and the peak memory of every lift, from the manifests, and their means.
+    """Return the time of every stage in seconds and the peak memory of every lift, from the manifests, and their means.
 
-    On a GPU, also time SFS's method and this package's on some views of each run.
+    On a GPU, also time SFS's method and that of this package on some views of each run.
 
     Args:
-        tell: called with the reason if SFS's method is left out.
+        tell: callback with the reason if SFS's method is skipped.
     """
     rows = []
     for lifted in runs:
@@ -564,10 +563,10 @@ def study_timing(
         if reason is None:
             try:
                 row |= time_dense_lift(lifted, device)
-            except (ValueError, FileNotFoundError) as error:  # its features cannot be computed again
+            except (ValueError, FileNotFoundError) as error:  # features are not available
                 reason = str(error)
         if reason is not None:
-            tell(f"The timing of {lifted.scene.name} leaves out SFS's method (512 channels through gsplat): {reason}")
+            tell(f"The timing of {lifted.scene.name} skips SFS's method (512 channels through gsplat): {reason}")
         rows.append(row)
     keys = list(dict.fromkeys(key for row in rows for key in row if key != "scene"))
     table: list[Row] = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]

@@ -1,1 +1,1 @@
-"""GPU kernels in Triton, which torch brings along: functions on plain tensors, without the rest of this package."""
+"""Triton kernels for GPUs, as functions of plain tensors that do not use the rest of this package."""

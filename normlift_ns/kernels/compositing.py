@@ -1,8 +1,8 @@
-"""Triton kernels that composite: lists of splats per cell, sums by region, and images of any number of channels.
+"""Triton kernels for compositing, which list splats by cell, sum weights by region, and render any number of channels.
 
-A cell is one of gsplat's tiles or a part of one. A splat is in the list of a cell if its rectangle touches the tile, as
-in gsplat, and alpha can reach its threshold in a pixel of the cell. The second condition is computed in float64 with a
-margin for all float32 rounding of alpha. So the sums equal those with gsplat's own lists.
+A cell is one of gsplat's tiles or a part of one. The list of a cell contains every splat whose rectangle touches the
+tile, as in gsplat, and whose alpha can reach its threshold in the cell. The second condition is computed in float64
+with a margin for all float32 rounding of alpha. The sums are therefore the same as with gsplat's lists.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from normlift_ns.kernels.projection import SPLAT, ProjectedSplats
 
 _BLOCK = 32
 _ROUNDING = tl.constexpr(2.0**-20)
-"""Relative float32 rounding error of the squares in an exponent: at most 12 half units in the last place."""
+"""Relative float32 rounding error of the squares in an exponent, at most 12 half units in the last place."""
 _REACH_MARGIN = tl.constexpr(1e-3)
-"""Added to the largest relevant exponent, for the rounding of the exponential and of float64 here."""
+"""Margin of the largest relevant exponent, for rounding of the exponential and of the float64 computation here."""
 _NEEDLE = tl.constexpr(1e-6)
-"""Ratio of a determinant to the product of its diagonal below which it does not determine the reach of a splat."""
+"""Ratio of a determinant to the product of its diagonal below which it is too inaccurate to cull a splat."""
 _FAR = tl.constexpr(1e30)
 
 
@@ -36,9 +36,9 @@ class CellGrid(NamedTuple):
     tile: int
     """Side of gsplat's tiles in pixels, a power of two."""
     cell_width: int
-    """Width in pixels of the cells that have lists; it divides a tile."""
+    """Width of a cell in pixels, a divisor of `tile`."""
     cell_height: int
-    """Height in pixels of the cells that have lists; it divides a tile."""
+    """Height of a cell in pixels, a divisor of `tile`."""
 
     @property
     def across(self) -> int:
@@ -57,14 +57,14 @@ class CellGrid(NamedTuple):
 
 
 class CellLists(NamedTuple):
-    """Splats by cell, nearest first: cell c has members[offsets[c]:offsets[c + 1]].
+    """Lists of the splats of every cell, nearest first.
 
-    Cells are numbered row by row, view after view.
+    The list of cell c is members[offsets[c]:offsets[c + 1]]. Cells are numbered row by row, view after view.
     """
 
     offsets: Int32[Tensor, " cells_plus_1"]
     members: Int32[Tensor, " pairs"]
-    """Rows of the splats."""
+    """Rows of the splats in `ProjectedSplats`."""
 
 
 @triton.jit
@@ -74,14 +74,14 @@ def _pairs(
     TILE: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, CULL: tl.constexpr, WRITE: tl.constexpr,
     SPLAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Count the cells of every splat in some order, or write them, at most as many as were counted."""
+    """Count the cells of every splat, or write them. At most as many are written as were counted."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < entries
     e = tl.load(order + i, mask=valid, other=0)
     row = splats + SPLAT * e
     u, v = tl.load(row, mask=valid, other=0.0), tl.load(row + 1, mask=valid, other=0.0)
     half_width, half_height = tl.load(row + 6, mask=valid, other=0.0), tl.load(row + 7, mask=valid, other=0.0)
-    # The tiles of the rectangle, in float32 like gsplat, and their cells.
+    # Tiles of the rectangle, in float32 as in gsplat, and their cells.
     x0 = tl.minimum(tl.maximum(tl.floor(u / TILE - half_width / TILE), 0.0), tiles_across).to(tl.int32)
     x1 = tl.minimum(tl.maximum(tl.ceil(u / TILE + half_width / TILE), 0.0), tiles_across).to(tl.int32)
     y0 = tl.minimum(tl.maximum(tl.floor(v / TILE - half_height / TILE), 0.0), tiles_down).to(tl.int32)
@@ -90,7 +90,7 @@ def _pairs(
     y0, y1 = y0 * (TILE // CELL_H), tl.minimum(y1 * (TILE // CELL_H), cells_down)
     y1 = tl.where(valid, y1, y0)
 
-    # {a dx^2 + 2 b dx dy + c dy^2 <= reach}: an ellipse that contains every pixel with alpha >= min_alpha.
+    # The ellipse a dx^2 + 2 b dx dy + c dy^2 <= reach contains every pixel with alpha >= min_alpha.
     a = 2.0 * tl.load(row + 2, mask=valid, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
     c = 2.0 * tl.load(row + 3, mask=valid, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
     b = tl.load(row + 4, mask=valid, other=0.0).to(tl.float64)
@@ -145,18 +145,17 @@ def _pairs(
 def build_cell_lists(
     projected: ProjectedSplats, views: int, grid: CellGrid, min_alpha: float, *, cull: bool = True
 ) -> CellLists:
-    """Return the splats of every cell of all views.
+    """Return the lists of splats of all cells and views.
 
     Args:
         projected: Splats of all views.
         views: Number of views.
         grid: Cells of an image.
-        min_alpha: Threshold of alpha.
-        cull: Whether to omit a splat from cells in which alpha stays below the threshold. Other entries of the lists
-            do not depend on it.
+        min_alpha: Smallest alpha that is drawn.
+        cull: Omit splats from cells in which their alpha is below `min_alpha`. Other entries do not depend on it.
     """
     device, entries, tile = projected.depth.device, len(projected.depth), grid.tile
-    order = projected.depth.sort(stable=True).indices  # equal depths stay in the order of the Gaussians
+    order = projected.depth.sort(stable=True).indices  # equal depths keep the order of the Gaussians
     count = torch.empty(entries, dtype=torch.int32, device=device)
     launch = (triton.cdiv(entries, _BLOCK),)
     sizes = (entries, views, grid.width, grid.height, min_alpha, -(-grid.width // tile), -(-grid.height // tile))
@@ -171,7 +170,7 @@ def build_cell_lists(
         )  # fmt: skip
     ends = count.cumsum(0)
     pairs = int(ends[-1]) if entries > 0 else 0
-    # If a cell was counted but not written, because of different rounding, its entry sorts behind all cells.
+    # If different rounding causes a cell to be counted but not written, its entry is sorted behind all cells.
     end = views * grid.cells
     dtype = torch.int16 if end < 2**15 else torch.int32
     cell = torch.full((pairs,), end, dtype=dtype, device=device)
@@ -186,25 +185,25 @@ def build_cell_lists(
     return CellLists(torch.searchsorted(cell, bounds, out_int32=True), member[by_cell])
 
 
-# Sums of compositing weights by (splat, region): one single-warp program per cell, without atomics.
+# Sums of compositing weights by (splat, region), with one single-warp program per cell and without atomics.
 #
-# A program holds the pixels of its cell in registers and iterates over its splats, nearest first, with the arithmetic
-# of gsplat's rasterize_to_pixels_fwd.cu. Every cell has its own part of the output, large enough for any result, and
-# fills it from the start. So the result does not depend on the order in which programs run.
+# A program keeps the pixels of its cell in registers and iterates over its splats, nearest first, with the arithmetic
+# of gsplat's rasterize_to_pixels_fwd.cu. Every cell writes to its own part of the output, which is large enough for any
+# result. The result therefore does not depend on the order in which programs run.
 
 
 UNROLL = 4
-"""Number of splats between checks whether a cell is finished."""
+"""Number of splats between two checks whether all pixels of a cell are finished."""
 _MOST_SLOTS = 2**26
 """Largest number of slots in a chunk, of 8 or 12 bytes each."""
 _COPIED = 128
-"""Number of sums that a program copies in one step."""
+"""Number of sums that a program of `_pack` copies in one step."""
 _PLACES = 512
-"""Number of sums per program that decodes keys."""
+"""Number of sums per program of `decode_keys`."""
 
 
 class AlphaLimits(NamedTuple):
-    """Fields of the rasterizer's settings that compositing uses."""
+    """Fields of `RasterSettings` that compositing uses."""
 
     max_alpha: float
     min_alpha: float
@@ -212,16 +211,16 @@ class AlphaLimits(NamedTuple):
 
 
 class RegionSums(NamedTuple):
-    """Nonzero sums, one per cell, splat and region, ordered by cell; a key can occur in several cells."""
+    """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """Keys row * columns + label + 1, with the row of the splat."""
+    """Keys row * columns + label + 1, with row the row of the splat."""
     weight: Float32[Tensor, " m"]
 
 
 @triton.jit
 def cell_pixels(cell, cells_across, CELL_W: tl.constexpr, CELL_H: tl.constexpr):
-    """Return the rows [CELL_H, 1] and columns [1, CELL_W] of a cell in the image."""
+    """Return the rows y, [CELL_H, 1], and columns x, [1, CELL_W], of the pixels of a cell."""
     y = (cell // cells_across) * CELL_H + tl.arange(0, CELL_H)[:, None]
     x = (cell % cells_across) * CELL_W + tl.arange(0, CELL_W)[None, :]
     return y, x
@@ -235,7 +234,7 @@ def _unpack_floats(pair):
 
 @triton.jit
 def load_splat(splats, m, valid):
-    """Return u, v, half of xx, half of yy, xy and opacity of a splat; an invalid splat has opacity 0."""
+    """Return u, v, half of xx, half of yy, xy and opacity of a splat. An invalid splat has opacity 0."""
     row = splats + 4 * m.to(tl.int64)
     u, v = _unpack_floats(tl.load(row, mask=valid, other=0))
     a, c = _unpack_floats(tl.load(row + 1, mask=valid, other=0))
@@ -245,9 +244,9 @@ def load_splat(splats, m, valid):
 
 @triton.jit
 def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
-    """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
+    """Return A_ij of one splat and the transmittance behind it in all pixels, which is 0 in finished pixels."""
     dx, dy = u - px, v - py
-    # Fused as by nvcc in rasterize_to_pixels_fwd.cu.
+    # Multiply-adds are fused as nvcc does in rasterize_to_pixels_fwd.cu.
     sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
     visible = (sigma >= 0) & (alpha >= min_alpha)
@@ -262,7 +261,7 @@ def _number_labels(
 ):
     """Number the labels >= -1 of a cell in ascending order.
 
-    The numbers are written to local[cell, pixel], -1 for none, and the labels to table[cell, number].
+    The numbers are written to local[cell, pixel], or -1 for other labels, and the labels to table[cell, number].
     """
     cell = tl.program_id(0).to(tl.int64)
     view = cell // cells
@@ -302,7 +301,7 @@ def _sum_regions(
         T = tl.where(number >= 0, 1.0, 0.0)
         i = start
         alive = 1
-        # The next splat is loaded while the current one is computed.
+        # Load the next splat during the computation of the current one.
         m = tl.load(members + i)
         u, v, a, c, b, o = load_splat(splats, m, i < stop)
         later = tl.load(members + i + 1, mask=i + 1 < stop, other=0)
@@ -363,11 +362,11 @@ def sum_regions(
     """Return the sums of A_ij ** weight_power over the pixels of each region in each cell, for views of one size.
 
     Args:
-        splats: Projected Gaussians; see `SPLAT`.
-        lists: Splats by cell.
-        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels below -1 are ignored.
+        splats: Projected Gaussians, as described at `SPLAT`.
+        lists: Lists of splats by cell.
+        labels: Region of every pixel. Unlabeled pixels, -1, are summed like a region. Pixels below -1 are ignored.
         grid: Cells of an image.
-        columns: A number above the largest label + 1.
+        columns: Number of columns in keys, larger than the largest label + 1.
         limits: Limits of alpha and transmittance.
         weight_power: Exponent of A_ij.
     """
@@ -401,9 +400,9 @@ def sum_regions(
 
 
 def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, int]]:
-    """Return ranges of cells with at most _MOST_SLOTS slots, or of a single cell: (first, last) cell and slot.
+    """Return ranges (first cell, last cell, first slot, last slot), with exclusive ends.
 
-    The last cell and slot are exclusive.
+    A range has at most _MOST_SLOTS slots or is a single cell.
     """
     total = int(slots[-1])
     if total <= _MOST_SLOTS:
@@ -436,10 +435,10 @@ def decode_keys(
     """Return the Gaussian and the column of every sum.
 
     Args:
-        key: Keys as in `RegionSums`.
+        key: Keys of `RegionSums`.
         splat_keys: Keys gaussian * views + view of every splat.
         first: First column of every view.
-        columns: Columns per row in `key`.
+        columns: Number of columns in `key`.
     """
     gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))
     if len(key) > 0:
@@ -449,11 +448,11 @@ def decode_keys(
     return gaussian, column
 
 
-# Compositing of images with any number of channels: one single-warp program per cell and group of channels.
+# Compositing of images with any number of channels, with one single-warp program per cell and group of channels.
 
 
 _CHANNELS = 8
-"""Largest number of channels in a program; more channels need more programs, which recompute the weights."""
+"""Largest number of channels per program. More channels need more programs, which compute the weights again."""
 
 
 @triton.jit
@@ -502,8 +501,8 @@ def composite(
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel of one view.
 
     Args:
-        splats: Projected Gaussians; see `SPLAT`.
-        lists: Splats by cell.
+        splats: Projected Gaussians, as described at `SPLAT`.
+        lists: Lists of splats by cell.
         gaussians: Gaussian of every splat.
         values: Values of every Gaussian.
         grid: Cells of the image.

@@ -1,9 +1,9 @@
-"""Exact nearest neighbors on the GPU: a balanced k-d tree, one warp per leaf of 32 points.
+"""Exact nearest neighbors on the GPU, with a balanced k-d tree and one warp per leaf of 32 points.
 
-All points of a leaf search together. They walk through the tree from their own leaf outward. A subtree is skipped if
-its box is farther than the worst candidate of every point. Candidates, a few more than requested, are kept by
-float32 distance, and finally ranked by float64 distance and index. The result is certified: if a dropped point could
-be as near as the last kept one, the query is reported as uncertain.
+A warp searches for the neighbors of all points of a leaf together. It visits the tree from this leaf outward, and skips
+a subtree if its box is farther than the worst candidate of every point. It keeps a few more candidates than requested,
+by float32 distance, and finally ranks them by float64 distance and index. The result is certified. If a dropped point
+could be as near as the last neighbor, the row is reported as uncertain.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from torch import Tensor
 LEAF = 32
 SLOTS = 64
 SPARE = 4
-"""Number of candidates kept in addition to K, because float32 may confuse the last few."""
+"""Number of candidates in addition to K, because float32 rounding can change the order of the last ones."""
 MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
-"""Number of distances per chunk, each of 8 bytes plus the same for its components."""
+"""Number of distances per chunk of `brute_force_nearest`, of 8 bytes each plus their components."""
 _SORTED_IN_A_BLOCK = 4096
-"""Number of points that torch sorts in one GPU block, without passes over memory."""
+"""Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Number of leaves per launch: half a million points, 320 bytes each at K = 36."""
+"""Number of leaves per launch, which is half a million points of 320 bytes each for K = 36."""
 
 
 class GatheringProcesses(Protocol):
-    """Group of processes, implemented by `core.partition.Communicator`."""
+    """Interface of a group of processes, implemented by `core.partition.Communicator`."""
 
     @property
     def rank(self) -> int:
@@ -44,38 +44,38 @@ class GatheringProcesses(Protocol):
         ...
 
     def all_gather(self, rows: Tensor, /) -> Tensor:
-        """Return the concatenated rows of all processes, in every process."""
+        """Return the concatenated rows of all processes in every process."""
         ...
 
 
 class KdTree(NamedTuple):
-    """Balanced k-d tree of L = 2 ** depth leaves; nodes in heap order, root 1, leaves L..2 L - 1."""
+    """Balanced k-d tree with L = 2 ** depth leaves. Nodes are in heap order, with root 1 and leaves L..2 L - 1."""
 
     index: Int64[Tensor, " slots"]
-    """Leaf l holds the points index[32 l:32 l + 32]; empty slots are -1 and follow all points."""
+    """Indices of the points, with index[32 l:32 l + 32] for leaf l. Empty slots are -1 and follow all points."""
     points: Float32[Tensor, "slots 3"]
-    """Coordinates of the points in `index`; infinity for empty slots."""
+    """Coordinates of the points in `index`, or infinity for empty slots."""
     boxes: Float32[Tensor, "nodes 6"]
-    """Least and greatest coordinates of each node; the box of an empty node is at infinity."""
+    """Smallest and largest coordinates of each node, or infinity for an empty node."""
 
 
 class NearestNeighbors(NamedTuple):
-    """The K nearest other points of each point, sorted by (distance, index)."""
+    """K nearest other points of each point, sorted by distance and then by index."""
 
     index: Int32[Tensor, "n k"]
-    """Indices of the neighbors; -1 for none."""
+    """Indices of the neighbors, padded with -1."""
     distance: Float32[Tensor, "n k"]
-    """Distances rounded from float64; inf if the index is -1."""
+    """Distances rounded from float64, padded with inf."""
     spacing: Float64[Tensor, " n"]
-    """Distance to the nearest candidate at a different position; inf if there is none."""
+    """Distance to the nearest candidate at another position, or inf if there is none."""
     certain: Bool[Tensor, " n"]
     """False if the result may be wrong."""
 
 
 def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcesses | None = None) -> KdTree:
-    """Build a tree level by level by splitting nodes at the median along their longest side.
+    """Build a tree level by level, by splitting nodes at the median along their longest side.
 
-    Each level needs one sort, and small nodes are sorted independently.
+    Each level needs one sort. Small nodes are sorted independently.
 
     Args:
         points: Points of the tree.
@@ -117,7 +117,7 @@ def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcess
 def _split(
     index: Int64[Tensor, " slots"], points: Float32[Tensor, "slots 3"], count: int
 ) -> tuple[Int64[Tensor, " slots"], Float32[Tensor, "slots 3"]]:
-    """Reorder the points of `count` nodes, so that the lower half along the longest side of each node comes first."""
+    """Sort the points of each of `count` nodes along its longest side, so that they can be split in the middle."""
     nodes = points.view(count, -1, 3)
     low, high = _box(nodes)
     axis = (high - low).nan_to_num(-1).argmax(dim=1)
@@ -135,8 +135,8 @@ def _box(nodes: Float32[Tensor, "nodes m 3"]) -> tuple[Float32[Tensor, "nodes 3"
 
 
 def _ascending_bits(x: Tensor) -> Tensor:
-    """Return int32 values in the order of float32 values."""
-    bits = (x + 0.0).view(torch.int32)  # + 0.0: no negative zero
+    """Return int32 numbers that have the same order as the float32 numbers."""
+    bits = (x + 0.0).view(torch.int32)  # + 0.0 replaces -0.0
     return torch.where(bits < 0, -(bits & 0x7FFFFFFF), bits)
 
 
@@ -146,7 +146,7 @@ def _search(
 ):
     """Write the `wanted` nearest points of each point of a leaf to candidates[slot, point].
 
-    A candidate is an int64: the float32 bits of the squared distance above the position of the point.
+    A candidate is an int64. Its high half is the squared distance as float32, and its low half the slot of the point.
     """
     leaf = tl.load(query_leaves + tl.program_id(0))
     lane = tl.arange(0, LEAF)
@@ -157,7 +157,7 @@ def _search(
     x0, y0, z0 = tl.load(boxes + 6 * node), tl.load(boxes + 6 * node + 1), tl.load(boxes + 6 * node + 2)
     x1, y1, z1 = tl.load(boxes + 6 * node + 3), tl.load(boxes + 6 * node + 4), tl.load(boxes + 6 * node + 5)
     LAST: tl.constexpr = 0x7FFFFFFFFFFFFFFF
-    FAR: tl.constexpr = 0x7F800000 << 32  # infinity, with room for a distinct number in each free slot
+    FAR: tl.constexpr = 0x7F800000 << 32  # infinity, plus a distinct number for each free slot
     slot = tl.arange(0, SLOTS).to(tl.int64)
     best = tl.where(slot < wanted, FAR + slot, -1)[:, None] + tl.zeros([SLOTS, LEAF], tl.int64)
     root, path = node, node
@@ -198,7 +198,7 @@ def _search(
                 node += 1
             elif path == 1:
                 root = 0
-            else:  # this ancestor is finished, its sibling is next
+            else:  # this ancestor is finished; continue with its sibling
                 root = path ^ 1
                 node = root
                 path = path // 2
@@ -211,7 +211,7 @@ def _rank(
     points, index, candidates, out_index, out_distance, out_spacing, out_certain, query_leaves, row_of, stride,
     wanted, k, LEAF: tl.constexpr, SLOTS: tl.constexpr,
 ):  # fmt: skip
-    """Rank the candidates of one point by float64 distance, then index."""
+    """Rank the candidates of one point by float64 distance and then by index."""
     own = tl.load(query_leaves + tl.program_id(0) // LEAF) * LEAF + tl.program_id(0) % LEAF
     own_name = tl.load(index + own)
     row = tl.load(row_of + own_name, mask=own_name >= 0, other=-1).to(tl.int64)
@@ -235,7 +235,7 @@ def _rank(
         tl.store(out_distance + row * k + rank, distance.to(tl.float32), mask=keep)
         elsewhere = tl.min(tl.where(distance > 0, distance, float("inf")), axis=0)
         tl.store(out_spacing + row, elsewhere)
-        # A dropped point is at least as far as the farthest candidate, up to rounding.
+        # Dropped points are at least as far away as the farthest candidate, up to rounding.
         full = tl.sum(valid.to(tl.int32), axis=0) == wanted
         worst = tl.max(tl.where(valid, (key >> 32).to(tl.int32).to(tl.float32, bitcast=True), 0.0), axis=0)
         last = tl.max(tl.where(keep & valid, distance, 0.0), axis=0)
@@ -256,15 +256,15 @@ def find_nearest(
 
     Args:
         points: Finite points.
-        k: Number of neighbors in 1..MOST_NEIGHBORS.
-        query_indices: Distinct indices of the query points, one per row of the result; None: all points.
-        progress: Function called with the number of rows whose search has been launched.
+        k: Number of neighbors, in 1..MAX_TREE_NEIGHBORS.
+        query_indices: Distinct indices of the query points, one per row of the result (default: all points).
+        progress: Callback with the number of rows whose search has been launched.
         communicator: Processes that call this function together with the same points, each for its own query points.
     """
     tree, device, wanted = build_kd_tree(points, communicator), points.device, k + SPARE
     n, leaves = len(points) if query_indices is None else len(query_indices), len(tree.index) // LEAF
     row_of = torch.arange(len(points), dtype=torch.int32, device=device)
-    query_leaves = torch.arange(-(-len(points) // LEAF), dtype=torch.int32, device=device)  # others are empty
+    query_leaves = torch.arange(-(-len(points) // LEAF), dtype=torch.int32, device=device)  # other leaves are empty
     if query_indices is not None:
         row_of = torch.full_like(row_of, -1).index_copy_(0, query_indices, row_of[:n])
         rows = torch.where(tree.index < 0, -1, row_of[tree.index.clamp(min=0)])
@@ -294,7 +294,7 @@ def find_nearest(
 
 
 def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> NearestNeighbors:
-    """Return the K nearest other points of some points by brute force, for uncertain results of `find_nearest`."""
+    """Return the K nearest other points of some points from all distances, for uncertain rows of `find_nearest`."""
     exact, parts = points.double(), []
     n = len(points)
     for chunk in rows.split(max(1, _PAIRS // n)):
@@ -302,7 +302,7 @@ def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"
         distance[torch.arange(len(chunk), device=rows.device), chunk] = torch.inf
         spacing = torch.where(distance > 0, distance, torch.inf).amin(dim=1)
         last = distance.topk(min(k, n), largest=False).values[:, -1:]
-        row, index = (distance <= last).nonzero(as_tuple=True)  # by row, then index; ties give more than K
+        row, index = (distance <= last).nonzero(as_tuple=True)  # by row, then index; more than K with ties
         order = distance[row, index].sort(stable=True).indices
         order = order[row[order].sort(stable=True).indices]
         row, index = row[order], index[order]

@@ -1,9 +1,9 @@
-"""gsplat's projection of Gaussians into cameras, one thread per Gaussian.
+"""Projection of Gaussians into cameras as in gsplat, with one thread per Gaussian.
 
 The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
-flags (-O3 --use_fast_math). The code spells out which products of a sum are rounded and which are fused, as read from
-that machine code. The compiler may not fuse anything else. Divisions, square roots and reciprocals are the
-approximate ones of both compilers. So every number is the same bit for bit, except numbers below 2 ** -126.
+flags (-O3 --use_fast_math). The code rounds and fuses the same products as this machine code. Other fused
+operations are disabled. Divisions, square roots and reciprocals are the approximate versions of both compilers. All
+numbers are therefore equal bit for bit, except numbers below 2 ** -126.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 CAMERA = 16
-"""Number of values per camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
+"""Number of values per camera, which are the rows (r, r, r, t) of its pose, fx, fy, cx and cy."""
 SPLAT = 8
-"""Number of values per splat, read as four pairs.
+"""Number of values per splat, which are read as four pairs.
 
-These are the center u, v in pixels; half of xx, half of yy, and xy of the inverse covariance; the opacity; half width
-and half height of the rectangle.
+The values are the center u, v in pixels, then half of xx, half of yy, and xy of the inverse covariance. The last ones
+are the opacity, and half width and half height of the rectangle in pixels.
 """
 _BLOCK = 128
 _ENORMOUS = tl.constexpr(2.0**60)
-"""Covariance in square pixels above which determinants are computed in larger units."""
+"""Covariance in square pixels above which determinants are computed in larger units to avoid overflow."""
 _LARGEST = tl.constexpr(3.4028234e38)
 
 
 class ProjectionSettings(NamedTuple):
-    """Fields of the rasterizer's settings that the projection uses."""
+    """Fields of `RasterSettings` that the projection uses."""
 
     near_plane: float
     far_plane: float
@@ -44,12 +44,12 @@ class ProjectionSettings(NamedTuple):
 
 
 class ProjectedSplats(NamedTuple):
-    """Visible Gaussians of some cameras."""
+    """Visible Gaussians of all cameras, as splats."""
 
     keys: Int64[Tensor, " m"]
-    """Keys gaussian * views + view, ascending."""
+    """Ascending keys gaussian * views + view."""
     splats: Float32[Tensor, "m 8"]
-    """Values described at `SPLAT`."""
+    """Values of every splat, as described at `SPLAT`."""
     depth: Float32[Tensor, " m"]
 
 
@@ -95,13 +95,13 @@ def _covariance(quats, scales, i, valid):
 
 @triton.jit
 def _row_times(a, b, c, xx, xy, xz, yy, yz, zz):
-    """Return a row of the pose times the covariance; the last entry is summed in another order, as in gsplat."""
+    """Return a row of the pose times the covariance. The last entry is summed in another order, as in gsplat."""
     return _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
 
 
 @triton.jit
 def _rotate_covariance(camera, xx, xy, xz, yy, yz, zz):
-    """Return the nine entries of the covariance C in camera axes, row by row; C_ij and C_ji are rounded differently."""
+    """Return the nine entries of the covariance C in camera axes, row by row. C_ij and C_ji are rounded differently."""
     a, b, c = tl.load(camera), tl.load(camera + 1), tl.load(camera + 2)
     d, e, f = tl.load(camera + 4), tl.load(camera + 5), tl.load(camera + 6)
     g, h, k = tl.load(camera + 8), tl.load(camera + 9), tl.load(camera + 10)
@@ -121,7 +121,7 @@ def _splat(
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr,
 ):  # fmt: skip
-    """Return (visible in the image, u, v, conic xx, xy, yy, opacity, half width, half height, depth)."""
+    """Return visibility, u, v, conic (xx, xy, yy), opacity, half width, half height and depth of a splat."""
     fx, fy = tl.load(camera + 12), tl.load(camera + 13)
     cx, cy = tl.load(camera + 14), tl.load(camera + 15)
     xc, yc, depth = _camera_axis(camera, 0, x, y, z), _camera_axis(camera, 1, x, y, z), _camera_axis(camera, 2, x, y, z)
@@ -180,7 +180,7 @@ def _find_visible(
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write to out[gaussian, view] whether the image can show the Gaussian with an opacity of at least min_alpha."""
+    """Write 1 to out[gaussian, view] if the Gaussian can be visible with an opacity of at least min_alpha, else 0."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < gaussians
     valid = tl.load(drawable + i, mask=inside, other=0) != 0
@@ -208,7 +208,7 @@ def _project_visible(
     valid = e < count
     key = tl.load(keys + e, mask=valid, other=0)
     i = key // views
-    # Every lane has its own camera.
+    # Every lane has a different camera.
     camera = cameras + (key - i * views) * CAMERA
     x = tl.load(means + 3 * i, mask=valid, other=0.0)
     y = tl.load(means + 3 * i + 1, mask=valid, other=0.0)
@@ -254,12 +254,12 @@ def project_gaussians(
         scales: Standard deviations.
         opacities: Opacities.
         drawable: Mask of the Gaussians to project.
-        cameras: Values described at `CAMERA`.
+        cameras: Values of every camera, as described at `CAMERA`.
         width: Width of the images in pixels.
         height: Height of the images in pixels.
         rules: Constants of the projection.
-        antialiased: Whether to scale opacities like splatfacto's rasterize_mode "antialiased".
-        per_axis: Whether to use a rectangle, as gsplat does from 1.5 on, instead of a square.
+        antialiased: Scale opacities as splatfacto does with rasterize_mode "antialiased".
+        per_axis: Use rectangles as in gsplat 1.5 and later, instead of squares.
     """
     views, n, device = len(cameras), len(means), means.device
     scene = [x.contiguous() for x in (means, quats, scales, opacities)]

@@ -1,7 +1,7 @@
-"""Triton kernels for SAM: measurements of masks, and the upscaling of its mask decoder.
+"""Triton kernels for SAM, which measure masks and compute the upscaling of its mask decoder.
 
-Enlarging is linear and separable, and every pixel is computed from three neighboring logits along each axis. One
-program handles some rows of one mask. It keeps three lines of logits, enlarged along the row, until a row needs others.
+Masks are enlarged by linear, separable interpolation of three neighboring logits along each axis. One program measures
+some rows of one mask. It keeps three interpolated lines of logits in registers until a row needs other lines.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _ROWS = 64
 
 @triton.jit
 def _line(logits, line, first, w0, w1, w2, inside):
-    """Return a line of logits, interpolated at the columns of the image."""
+    """Return a line of logits that is interpolated at the columns of the image."""
     pointer = logits + line + first
     a = tl.load(pointer, mask=inside, other=0.0).to(tl.float32)
     b = tl.load(pointer + 1, mask=inside, other=0.0).to(tl.float32)
@@ -31,7 +31,7 @@ def _measure(
     logits, row_first, row_weights, column_first, column_weights, out, height, width, low_height, low_width, offset,
     ROWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the pixels above offset, the pixels above -offset, and x0, y0, x1, y1 of some rows to out[mask, part]."""
+    """Write the pixel counts above offset and -offset, and x0, y0, x1, y1 of some rows to out[mask, part]."""
     mask = tl.program_id(0).to(tl.int64)
     mask_logits = logits + mask * low_height * low_width
     x = tl.arange(0, BLOCK)
@@ -89,12 +89,11 @@ def measure_masks(
 
     Args:
         logits: Logits at the resolution of the network.
-        row_first: Row i of the image is the sum of the lines row_first[i] to row_first[i] + 2 of the logits, weighted
-            by row_weights[i].
-        row_weights: Weights of the rows.
-        column_first: Same as `row_first` for columns.
-        column_weights: Weights of the columns.
-        offset: Distance of the thresholds from 0.
+        row_first: First of the three lines of logits that row i of the image is interpolated from.
+        row_weights: Weights of the three lines for every row.
+        column_first: First of the three columns of logits for every column of the image.
+        column_weights: Weights of the three columns.
+        offset: Distance of both thresholds from 0.
 
     Returns:
         The number of pixels above the offset, the number above minus the offset, and the box of the pixels above 0.
@@ -112,10 +111,10 @@ def measure_masks(
     return *partial[:, :, :2].sum(dim=1, dtype=torch.int32).unbind(dim=1), boxes
 
 
-# Final steps of SAM's mask decoder in one pass: two transposed convolutions and the products with mask channels.
+# Final steps of SAM's mask decoder in one pass, which are two transposed convolutions and products with mask channels.
 #
-# Computed separately, the pixels with their channels would be many times larger than the image and the masks. Here
-# they stay in registers, in float32 except as input of tensor cores.
+# In separate steps, the channels of all pixels would take many times the memory of the image and the masks. Here, they
+# stay in registers, in float32 except as input of tensor cores.
 
 
 _BLOCK = 64
@@ -133,7 +132,7 @@ def _upscale(
     keys, first, first_bias, scale, shift, second, second_bias, mask_channels, masks, positions, side, channels, middle,
     last, eps, MASKS: tl.constexpr, BLOCK: tl.constexpr, C: tl.constexpr, M: tl.constexpr, L: tl.constexpr,
 ):  # fmt: skip
-    """Write masks[prompt, mask, 4 y + row, 4 x + column] of some positions (y, x), with row and column in 0..3."""
+    """Write masks[prompt, mask, 4 y + row, 4 x + column] for some positions (y, x), with row and column in 0..3."""
     prompt = tl.program_id(1).to(tl.int64)
     position = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     c, m, o = tl.arange(0, C), tl.arange(0, M), tl.arange(0, L)
@@ -174,15 +173,15 @@ def upscale_masks(
     mask_channels: Float[Tensor, "p k o"],
     side: int,
 ) -> Float[Tensor, "p k y x"]:
-    """Return the logits of masks, 4 x 4 for every position of an image with `side` columns.
+    """Return the logits of masks, with 4 x 4 logits for every position of an image embedding.
 
     Args:
-        keys: Positions of the image of every prompt, in half precision.
-        weights: Weights of both convolutions; a position becomes four, row by row.
+        keys: Image embedding of every prompt, [prompts, positions, channels], in half precision.
+        weights: Weights of both convolutions. Each convolution turns a position into four, row by row.
         biases: Biases of both convolutions.
         norm: Weight, bias and epsilon of the layer norm after the first convolution.
-        mask_channels: Channels of the masks.
-        side: Columns of the image.
+        mask_channels: Vector of every mask of every prompt.
+        side: Number of columns of the image embedding.
     """
     (prompts, positions, channels), middle, last = keys.shape, len(biases[0]), len(biases[1])
     masks = keys.new_empty(prompts, mask_channels.shape[1], 4 * (positions // side), 4 * side)

@@ -1,4 +1,4 @@
-"""Triton kernels for sparse matrices: sums over rows, and products of rows."""
+"""Triton kernels for sums and products of sparse matrices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ROWS = 128
 
 
 class RowNorms(NamedTuple):
-    """Norms and sums of every row j of a matrix E with columns s in views v, for a table of unit rows F."""
+    """Norms and sums of every row j of a sparse matrix E, for unit rows F_s of its columns s in views v."""
 
     total: Float64[Tensor, " n"]
     """||sum_s E_js F_s||"""
@@ -40,9 +40,9 @@ def _segment_sum(values, offsets, out, segments, ROWS: tl.constexpr):
 
 
 def segment_sum(values: Float[Tensor, " m"], offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
-    """Return the sums of values[offsets[i]:offsets[i + 1]], from left to right in float64.
+    """Return the sums of the segments values[offsets[i]:offsets[i + 1]], from left to right in float64.
 
-    This is fast for many short segments.
+    The kernel is fast for many short segments.
     """
     out = torch.empty(len(offsets) - 1, dtype=torch.float64, device=values.device)
     _segment_sum[(triton.cdiv(len(out), _ROWS),)](values, offsets, out, len(out), ROWS=_ROWS, num_warps=4)
@@ -68,7 +68,7 @@ def multiply_vector(
     weight: Float[Tensor, " nnz"],
     vector: Float[Tensor, " s"],
 ) -> Float[Tensor, " n"]:
-    """Return E x in the precision of x, summed in float64. This is fast for many short rows."""
+    """Return E x in the precision of x, summed in float64. The kernel is fast for many short rows."""
     out = torch.empty(len(offsets) - 1, dtype=vector.dtype, device=vector.device)
     grid = (triton.cdiv(len(out), _ROWS),)
     _product[grid](offsets, column, weight, vector, out, len(out), ROWS=_ROWS, num_warps=4)
@@ -77,7 +77,7 @@ def multiply_vector(
 
 @triton.jit
 def _exact_sum(column, weight, table, start, stop, dimension, BLOCK: tl.constexpr):
-    """Return the sum of weighted rows in float64."""
+    """Return the weighted sum of rows of the table in float64."""
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float64)
     for e in range(start, stop):
@@ -102,10 +102,10 @@ def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
     dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Compute one row per program. If float32 has lost digits to cancellation or rounding, sum again in float64."""
+    """Compute one row per program. Repeat a sum in float64 if it cancels or has many entries."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
-    if stop - start <= 1:  # no vector sum is needed: rows of the table are unit vectors
+    if stop - start <= 1:  # no vector sum is needed, because rows of the table are unit vectors
         only = tl.load(weight + start, mask=start < stop, other=0.0).to(tl.float64)
         _store_norms(out_total, out_by_view, out_weight, out_squared, out_views, j, only, only, only, only * only,
                      tl.where(only > 0, 1, 0))  # fmt: skip
@@ -117,7 +117,7 @@ def _row_norms(
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
-        # While an entry is added, the row of the next entry and the column of the one after it are loaded.
+        # Load the row of the next entry and the column of the one after it during the sum of an entry.
         s = tl.load(column + start)
         next_column = tl.load(column + start + 1)
         next_view, next_w = tl.load(column_view + s), tl.load(weight + start)
@@ -129,8 +129,8 @@ def _row_norms(
             next_view = tl.where(e + 1 < stop, tl.load(column_view + s), -2)
             next_w = tl.where(e + 1 < stop, tl.load(weight + following), 0.0)
             next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
-            if (entry_view != view) & (view != -1):  # the entries of a view end here
-                norm = view_weight  # of a single unit row
+            if (entry_view != view) & (view != -1):  # end of the entries of a view
+                norm = view_weight  # norm of a single unit row
                 if e - first > 1:
                     norm = tl.sqrt(tl.sum(view_total * view_total, axis=0)).to(tl.float64)
                     if (norm < min_share * view_weight) | (e - first > max_entries):
@@ -169,12 +169,12 @@ def row_norms(
 
     Args:
         offsets: Row offsets of E.
-        column: Columns of the entries, ascending in each row, so that the entries of a view are consecutive.
+        column: Columns of the entries, ascending in each row. Entries of a view are therefore consecutive.
         weight: Weights of the entries.
-        column_view: View of every column.
+        column_view: View of every column, non-decreasing.
         table: Unit rows F.
-        min_share: A sum is repeated in float64 if its norm is below this share of its weight.
-        max_entries: A sum is repeated in float64 if it has more entries than this.
+        min_share: Norm of a sum, as a share of its weight, below which it is repeated in float64.
+        max_entries: Number of entries above which a sum is repeated in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
     out = RowNorms(
@@ -223,10 +223,10 @@ def unit_sums(
     min_share: float,
     max_entries: int,
 ) -> Float[Tensor, "m d"]:
-    """Return sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 if the norm is 0.
+    """Return sum_s E_js F_s of some rows j as unit vectors, or 0 if the norm is 0.
 
     Args:
-        rows: Rows j.
+        rows: Indices of the rows j.
         offsets: Row offsets of E.
         column: Columns of the entries.
         weight: Weights of the entries.
@@ -246,12 +246,12 @@ def unit_sums(
     return out
 
 
-# Products of two sparse matrices, in blocks of dense rows, and row maxima.
+# Products of two sparse matrices as blocks of dense rows, and row maxima.
 
 
 _PRODUCT_ROWS = 128
 _WIDTH = 64
-"""Number of entries of a row that are added in one step."""
+"""Number of entries of a row that a program adds in one step."""
 
 
 class SparseRowsLike(Protocol):
@@ -282,7 +282,7 @@ def _row_max(offsets, column, value, out, rows, ROWS: tl.constexpr):
 def row_max(
     offsets: Int64[Tensor, " n_plus_1"], column: Int32[Tensor, " nnz"], value: Float64[Tensor, " s"]
 ) -> Float64[Tensor, " n"]:
-    """Return the maximum of value[column] over every row, for values >= 0; 0 for an empty row."""
+    """Return the maximum of value[column] over every row, or 0 for an empty row. Values must be >= 0."""
     out = torch.empty(len(offsets) - 1, dtype=torch.float64, device=value.device)
     _row_max[(triton.cdiv(len(out), _PRODUCT_ROWS),)](
         offsets, column, value, out, len(out), ROWS=_PRODUCT_ROWS, num_warps=4
@@ -292,9 +292,9 @@ def row_max(
 
 @triton.jit
 def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out, first, columns, WIDTH: tl.constexpr):
-    """Compute one row of A B per program. Rows of B are added one after another, always in the same order.
+    """Compute one row of A B per program. Rows of B are added in a fixed order.
 
-    Columns within a row of B are distinct.
+    The columns in a row of B must be distinct.
     """
     block = tl.program_id(0).to(tl.int64)
     row_start = out + block * columns
@@ -309,13 +309,13 @@ def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out,
             value = tl.load(b_weight + entry, mask=inside, other=0.0)
             before = tl.load(pointer, mask=inside, other=0.0)
             tl.store(pointer, before + factor * value, mask=inside)
-        tl.debug_barrier()  # the next row of B may hold the same columns
+        tl.debug_barrier()  # the next row of B may have the same columns
 
 
 def multiply_rows(
     a: SparseRowsLike, b: SparseRowsLike, columns: int, first: int, last: int
 ) -> Float32[Tensor, "rows columns"]:
-    """Return rows first..last - 1 of the product A B, dense, in float32; bitwise the same on every run."""
+    """Return the dense float32 rows first..last - 1 of the product A B, bitwise the same on every run."""
     out = torch.zeros(last - first, columns, device=a.weight.device)
     arrays = (a.offsets, a.column, a.weight.float(), b.offsets, b.column, b.weight.float())
     _products[(last - first,)](*arrays, out, first, columns, WIDTH=_WIDTH, num_warps=1, num_stages=1)

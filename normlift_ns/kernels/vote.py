@@ -1,14 +1,14 @@
-"""Vote of one Gaussian per program; the cosines among its neighbors are one small matrix product.
+"""Triton kernel of the vote, with one Gaussian per program and a small matrix product for the cosines of its neighbors.
 
-Float32 rows u are split into u = h + l, with 11 bits each. Three products on tensor cores at their fastest rate,
-h h + h l + l h, then give a cosine to 22 bits. Most votes need only the first product.
+Float32 rows u are split into u = h + l, with 11 bits each. Three products at the fastest rate of tensor cores,
+h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
 
-Let e be the largest |l| in the group, and let all products and sums be exact except for roundings of 2**-23 of at most
-1 each. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. As d/dc log(g (1 - g)) is at most
-1 / gamma, an error t of the cosine changes a sigmoid g by at most f g (1 - g), f = exp(t / gamma) - 1. By Jensen's
-inequality, the sum A of g with weights of sum W then has an error of at most f A (1 - A / W). If these intervals, plus
-3e-5 for the rounding of the sums, leave one winner, it is the result. All other votes add the remaining products and
-compare again.
+Let e be the largest |l| in the group. Assume that all products and sums are exact except for roundings of 2**-23
+relative to at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. The derivative of
+log(g (1 - g)) by the cosine is at most 1 / gamma. Let f = exp(t / gamma) - 1. An error t of the cosine then changes
+a sigmoid g by at most f g (1 - g). Let A be the sum of g with weights of sum W. By Jensen's inequality, its error
+is at most f A (1 - A / W). The rounding of sums adds at most 3e-5. If these error intervals determine the winner, it is
+the result. Otherwise, the vote adds the remaining products and compares again.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class LaunchConfig(NamedTuple):
     """Launch parameters of one program."""
 
     columns: int
-    """Number of columns of the rows loaded per step."""
+    """Number of columns of the rows that are loaded per step."""
     columns_later: int
-    """Number of columns loaded per step when both halves of the rows are loaded."""
+    """Number of columns per step if both halves of the rows are loaded."""
     stages: int
-    """Pipeline stages of the loads."""
+    """Number of pipeline stages of the loads."""
     warps: int
     registers: int | None = None
-    """Largest number of registers per thread; with fewer, more programs run simultaneously."""
+    """Largest number of registers per thread. With fewer registers, more programs run simultaneously."""
 
 
 _HALVES = LaunchConfig(columns=64, columns_later=32, stages=3, warps=4, registers=128)
@@ -55,7 +55,7 @@ def _winner(score, member, slot, valid, i, delta):
 
 @triton.jit
 def _certain(agreed, r, weight, slot, valid, spread, delta):
-    """Return whether the winner is the same for all scores within their errors (see above); false for NaN."""
+    """Return True if all scores within their error intervals (see above) have the same winner, and False for NaN."""
     share = agreed / tl.sum(weight, axis=0)  # A / W
     score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
@@ -101,12 +101,12 @@ def _vote(
             cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
         votes = (r > 0) & (slot > 0) if POSTERIOR else r > 0
         nearest = tl.min(tl.where(votes, d, float("inf")), axis=0)
-        excess = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product would round
+        excess = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2 without a fused product
         weight = r * tl.exp(-0.5 * excess)
         if POSTERIOR:
             near = tl.where(slot > 0, weight, 0.0)
             weight = tl.where(slot > 0, near / tl.sum(near, axis=0) * prior, own_views)
-        else:  # scaled like these weights, which omit the distance of the nearest one
+        else:  # multiplied by the same factor as the weights
             delta = tl.where(delta > 0, delta * tl.exp(0.5 * nearest * nearest), 0.0)
         undecided = True
         if CERTIFY:
@@ -116,7 +116,7 @@ def _vote(
             undecided = certain == 0
             if certain:
                 tl.store(source + i, _winner(r * agreed, member, slot, valid, i, delta).to(tl.int32))
-        if FINISH:  # noqa: SIM102 (this condition is known at compile time, the next one is not)
+        if FINISH:  # noqa: SIM102 (only this condition is known at compile time)
             if undecided:
                 if HALVES:
                     cross = tl.zeros([GROUP, GROUP], tl.float32)
@@ -148,7 +148,7 @@ def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
 def split_float16(
     rows: Float32[Tensor, "m d"],
 ) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
-    """Return h, 2048 l and |l| of unit rows u = h + l; |l| is inf for rows longer than 1."""
+    """Return h, 2048 l and |l| of unit rows u = h + l. |l| is inf for rows longer than 1."""
     high, low = (torch.empty_like(rows, dtype=torch.float16) for _ in range(2))
     rough = torch.empty(len(rows), device=rows.device)
     if len(rows) > 0:
@@ -175,26 +175,26 @@ def vote(
     prior: float = 0.0,
     precision: VotePrecision = "certified",
 ) -> None:
-    """Write the index of the Gaussian whose direction each voter takes to `source`; formulas in `core.refine`.
+    """Write to `source` the index of the Gaussian whose direction each voter takes, by the formulas of `core.refine`.
 
     Args:
-        voters: Gaussians that vote. Neighbors in space should be close in this list, because they read the same rows.
-        neighbors: Neighbors of every Gaussian, nearest first, -1 for none; at most MOST_NEIGHBORS.
+        voters: Gaussians to refine. Neighbors in space should be close in this list, because they read the same rows.
+        neighbors: Neighbors of every Gaussian, nearest first, padded with -1. K is at most MAX_VOTE_NEIGHBORS.
         distance: Distances of the neighbors.
-        directions: Rows that are unit vectors or 0, multiplied on tensor cores and added in float32.
-        row_of: Row of every Gaussian's direction; read for the voters and their neighbors.
+        directions: Unit rows or 0. Tensor cores multiply them and sum in float32.
+        row_of: Row of every Gaussian's direction, valid for the voters and their neighbors.
         reliability: Reliability of every Gaussian.
         source: Output.
         tau: Threshold of the sigmoid.
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
-        delta: Lead that a neighbor needs over the Gaussian itself.
-        own: Views that agree on each Gaussian's own direction, for a posterior vote (None: the paper's vote).
-        prior: Weight of the neighbors in a posterior vote, in views.
-        precision: Precision of the products of float32 directions. "halves": two halves of 11 bits each. "certified":
-            the same winners, computed from the first halves if these decide. "first": only writes winners that the
-            first halves decide. "tf32", "tf32x3", "ieee": rounded to 11 bits, in three such parts, or not rounded.
-            Half-precision directions are not rounded.
+        delta: Support by which a neighbor must exceed the Gaussian itself.
+        own: Number of views that agree on each Gaussian's own direction, or None for the paper's vote.
+        prior: Weight of the neighbors in a posterior vote, as a number of views.
+        precision: Precision of the products of float32 directions. "halves" uses two halves of 11 bits each.
+            "certified" has the same winners, but uses only the first halves if these determine the winner. "first"
+            writes only winners that the first halves determine. "tf32" rounds to 11 bits, "tf32x3" uses three such
+            parts, and "ieee" does not round. Directions in half precision are not rounded.
     """
     if len(voters) == 0:
         return

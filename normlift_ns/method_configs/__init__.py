@@ -1,1 +1,1 @@
-"""nerfstudio method specifications, discovered through entry points."""
+"""nerfstudio method specifications, which nerfstudio finds through entry points."""

@@ -1,7 +1,8 @@
-"""Targets of nerfstudio's entry points: each method, or None and a line on standard error if it cannot be loaded.
+"""Method specifications for nerfstudio's entry points, or None if a method cannot be loaded.
 
 Every ns-* command loads all entry points without a try block. An error in one of them would therefore disable the
-methods of all packages. nerfstudio ignores anything that is not a MethodSpecification.
+methods of all packages. Here, it is printed to standard error instead. nerfstudio ignores objects that are not a
+MethodSpecification.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 
 def _rename_flags(words: list[str]) -> list[str]:
-    """Return the command line of this process with the new names of options, if it is ns-train with our method."""
+    """Replace old names of options in the command line of this process, if it is ns-train with a normlift method."""
     from normlift_ns.options import LiftOptions, SourceOptions, rename_flags, renamed_flags  # noqa: PLC0415 (may fail)
 
     if Path("".join(words[:1])).stem != "ns-train" or not "".join(words[1:2]).startswith("normlift"):
@@ -29,7 +30,7 @@ def _load_method(name: str) -> Any:
     except Exception as error:  # any missing or broken dependency
         if sys.stderr is not None:
             reason = f"{type(error).__name__}: {error}"
-            sys.stderr.write(f"normlift_ns: the method {name} cannot be used ({reason}). Other methods work.\n")
+            sys.stderr.write(f"normlift_ns: the method {name} cannot be used ({reason}). Other methods still work.\n")
         return None
 
 

@@ -1,7 +1,7 @@
-"""Methods of `ns-train`: normlift, normlift-lerf-ovs and normlift-scannet.
+"""Methods normlift, normlift-lerf-ovs and normlift-scannet of `ns-train`.
 
-Every ns-* command imports this module while nerfstudio builds its list of methods. It must therefore import neither
-that list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.
+Every ns-* command imports this module while nerfstudio builds its list of methods. It must therefore not import that
+list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils), or slow or optional modules.
 """
 
 from pathlib import Path
@@ -31,10 +31,10 @@ def trainer_config(
     image_scale: float = 1.0,
     **optimizers: Any,
 ) -> TrainerConfig:
-    """Return splatfacto's trainer config with a lift at the end; the viewer listens on this machine only.
+    """Return splatfacto's trainer config with a lift at the end. The viewer only listens on 127.0.0.1.
 
     Args:
-        source: options of the 2D features; None: the defaults of ns-normlift.
+        source: options of the 2D features (default: those of ns-normlift).
         image_scale: size of the training images relative to the files.
         optimizers: replacements of splatfacto's optimizers, by parameter name.
     """
@@ -81,11 +81,11 @@ normlift_method = MethodSpecification(
 )
 
 
-# Method of `ns-train normlift-lerf-ovs`, for scenes of LERF-OVS: COLMAP folders with images/ and sparse/0.
+# Method of `ns-train normlift-lerf-ovs`, for LERF-OVS scenes, which are COLMAP folders with images/ and sparse/0.
 #
-# All images are used for training, including the labeled frames, at the size of the labels. Features are read from
-# language_features/ of the scene, as written by LangSplat's preprocessing. `--pipeline.source.features none` computes
-# them from the images instead.
+# All images are used for training, including the labeled frames, at the size of the labels. Features from LangSplat's
+# preprocessing are read from language_features/ of the scene. `--pipeline.source.features none` computes features from
+# the images instead.
 
 
 lerf_ovs_method = MethodSpecification(
@@ -95,14 +95,14 @@ lerf_ovs_method = MethodSpecification(
         NormLiftModelConfig(),
         source=SourceOptions(features="langsplat"),
     ),
-    description="normlift for scenes of the LERF-OVS benchmark: COLMAP folders with LangSplat's language_features/.",
+    description="normlift for scenes of the LERF-OVS benchmark with LangSplat's language_features/.",
 )
 
 
-# Method of `ns-train normlift-scannet`: one Gaussian per vertex of a ScanNet mesh, at its position and in its order.
+# Method of `ns-train normlift-scannet`, with one Gaussian per vertex of a ScanNet mesh, in the order of the vertices.
 #
-# The benchmark compares labels vertex by vertex. Training therefore does not move, split or cull the seed points
-# (`ply_file_path` of transforms.json: the vertices), and keeps the coordinates of the dataset.
+# The benchmark compares labels vertex by vertex. Training therefore does not move, split or cull the seed points, which
+# are the vertices in `ply_file_path` of transforms.json, and keeps the coordinates of the dataset.
 
 
 scannet_method = MethodSpecification(
@@ -120,5 +120,5 @@ scannet_method = MethodSpecification(
         image_scale=0.5,
         means=_optimizer(0.0),
     ),
-    description="normlift with frozen points, for ScanNet: Gaussian i is vertex i.",
+    description="normlift for ScanNet, with one fixed Gaussian per vertex of the mesh.",
 )

@@ -1,1 +1,1 @@
-"""Integration with nerfstudio: configs, model, pipeline and viewer panel."""
+"""Model, pipeline and viewer panel for nerfstudio."""

@@ -1,4 +1,4 @@
-"""splatfacto's model with a semantic field, and an LPIPS metric that is built at its first use."""
+"""splatfacto model with a semantic field, and an LPIPS metric that loads its weights at the first use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from normlift_ns.rendering.figures import Display, render_outputs
 
 
 class LazyLpips(torch.nn.Module):
-    """Stand-in for torchmetrics' LearnedPerceptualImagePatchSimilarity, whose constructor downloads weights.
+    """Replacement of torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights at the first use.
 
     Args:
         options: keyword arguments of the metric.
@@ -45,11 +45,11 @@ class LazyLpips(torch.nn.Module):
         super().__init__()
         self.options = options
         self.available = True
-        """False once loading the weights has failed."""
-        self._metric: list[torch.nn.Module] = []  # in a list, which keeps the network out of checkpoints
+        """False if the weights could not be loaded."""
+        self._metric: list[torch.nn.Module] = []  # a list keeps the network out of checkpoints
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Return the LPIPS of images [B, 3, H, W] in 0..1; NaN, with a single warning, if the weights are missing."""
+        """Return the LPIPS of images [B, 3, H, W] in 0..1, or NaN and a single warning if the weights are missing."""
         if self.available and not self._metric:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
 
@@ -57,39 +57,39 @@ class LazyLpips(torch.nn.Module):
                 self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
             except (ImportError, OSError) as error:
                 self.available = False
-                warnings.warn(f"LPIPS is skipped: its weights cannot be downloaded ({error})", stacklevel=2)
+                warnings.warn(f"LPIPS is skipped, because its weights cannot be downloaded ({error})", stacklevel=2)
         return self._metric[0].to(image.device)(image, reference) if self.available else image.new_tensor(torch.nan)
 
 
-# splatfacto's model with a semantic field, as loaded by ns-viewer, ns-render, ns-eval and ns-export.
+# splatfacto model with a semantic field, for ns-viewer, ns-render, ns-eval and ns-export.
 
 
 _MIN_FOCAL = 1e-3
-"""Smallest focal length that is rendered, as a fraction of the image's longer side; its inverse is the largest."""
+"""Smallest focal length to render, as a fraction of the longer side of the image. Its inverse is the largest."""
 
 
 @dataclass
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """splatfacto with the semantics that ns-normlift has lifted onto its Gaussians."""
+    """Config of splatfacto with a semantic field from ns-normlift."""
 
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
-    """Folder of the semantic field (normlift/ in a lifted run), relative to config.yml. None: plain splatfacto."""
+    """Folder of the semantic field, normlift/ in a lifted run, relative to config.yml. None means no field."""
 
 
 class NormLiftModel(SplatfactoModel):
-    """splatfacto model that loads without LPIPS weights and without CUDA, and renders scalars of its Gaussians.
+    """splatfacto model that loads without LPIPS weights and without CUDA, and renders values of its Gaussians.
 
-    On CUDA, everything except the scalars is stock splatfacto. On the CPU, where splatfacto cannot render,
-    normlift_ns renders instead.
+    On CUDA, stock splatfacto renders all outputs except these values. On the CPU, splatfacto cannot render, and
+    normlift_ns renders all outputs.
     """
 
     config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
 
     def populate_modules(self) -> None:
-        """Set up splatfacto's modules without CUDA and without downloads, and add the panel of the viewer."""
-        if not torch.cuda.is_available():  # splatfacto moves the colors of seed points to CUDA, and trains there only
-            # four seed points: with none, splatfacto searches the neighbors of 50,000 random points
+        """Set up splatfacto's modules without CUDA and without downloads, and add the viewer panel."""
+        if not torch.cuda.is_available():  # splatfacto moves the colors of seed points to CUDA
+            # without seed points, splatfacto would search neighbors of 50,000 random points, so pass four points
             seeds = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
             self.seed_points = None if self.config.semantics is None else seeds  # until the checkpoint is loaded
         # the stock metric downloads AlexNet
@@ -98,23 +98,23 @@ class NormLiftModel(SplatfactoModel):
         self._field: SemanticField | None = None
         self._display: Display | None = None
         self.normlift = SearchPanel(self)
-        self.viewer_control = self.normlift.control  # for nerfstudio, which searches the attributes of modules
+        self.viewer_control = self.normlift.control  # nerfstudio searches for it in the attributes of modules
 
     @property
     def renders_on_cpu(self) -> bool:
-        """True if normlift_ns renders; stock splatfacto needs CUDA."""
+        """True if normlift_ns renders, because stock splatfacto needs CUDA."""
         return self.device.type == "cpu"
 
     @property
     def field(self) -> SemanticField | None:
-        """The attached semantic field, on the model's device; None if no field is attached."""
+        """Semantic field on the device of the model, or None if no field is attached."""
         return self._field
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
-        """Load a splatfacto or normlift checkpoint, then the field that the config names.
+        """Load a splatfacto or normlift checkpoint, and then the semantic field of the config.
 
         Raises:
-            FileNotFoundError, ValueError: the field is missing, damaged, or belongs to other Gaussians.
+            FileNotFoundError, ValueError: if the field is missing, is damaged, or belongs to other Gaussians.
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
@@ -125,26 +125,26 @@ class NormLiftModel(SplatfactoModel):
             compile_renderer()
 
     def attach(self, semantic_field: SemanticField, question: Query | None = None) -> None:
-        """Render a field and the answer to a query from now on, and enable the panel for the field."""
+        """Attach a field, so that the model renders it with the answer to a query, and enable the panel."""
         self._field = semantic_field.to(self.device)
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
 
     def detach(self) -> None:
-        """Drop the field, because the Gaussians are about to change."""
+        """Remove the field before the Gaussians change."""
         self.config.semantics = self._field = self._display = None
         self.normlift.close()
 
     def show(self, display: Display | None) -> None:
-        """Replace the display that is rendered in addition to the colors. Safe to call while another thread renders."""
+        """Set the display that is rendered in addition to the colors. Other threads may render during the call."""
         self._display = display
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Return the stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
+        """Return the stock outputs (rgb, depth, accumulation, background), and with a field also `render_outputs`.
 
         Args:
-            camera: one camera. For an invalid camera from nerfstudio's viewer, a valid one near it is rendered.
-            obb_box: crop box; Gaussians outside are not drawn.
+            camera: one camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
+            obb_box: crop box. Gaussians outside it are not drawn.
         """
         display, (camera, view) = self._display, _valid_camera(camera.to(self.device))
         rows = self.drawn_mask(obb_box, display)
@@ -154,7 +154,7 @@ class NormLiftModel(SplatfactoModel):
                 outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
             outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
-            # if nothing is left after cropping, splatfacto's outputs are on the CPU and its background is [3]
+            # if all Gaussians are cropped, splatfacto returns outputs on the CPU and a background of shape [3]
             outputs = {name: value.to(self.device) for name, value in outputs.items()}
             outputs["background"] = outputs["background"].expand(view.height, view.width, 3)
             scalars = self._composited(view, values, rows)
@@ -169,7 +169,7 @@ class NormLiftModel(SplatfactoModel):
             }
 
     def drawn_mask(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
-        """Return the mask of the Gaussians that are drawn: in the box and not hidden. None: all."""
+        """Return the mask of the Gaussians that are in the box and not hidden, or None if all are drawn."""
         drawn = None if display is None else display.drawn
         if obb_box is None:
             return drawn
@@ -177,17 +177,17 @@ class NormLiftModel(SplatfactoModel):
         return inside if drawn is None else inside & drawn
 
     def ray_weights(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
-        """Return the `ray_weights` of the Gaussians drawn in the last render, and 0 for all others."""
+        """Return the `ray_weights` of the Gaussians that the last render drew, and 0 for all others."""
         rows = self.drawn_mask(self.crop_box, self._display)
         weights = ray_weights(self._scene(rows), origin, direction)
         return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
 
     def scene(self) -> GaussianScene:
-        """Return all Gaussians."""
+        """Return all Gaussians with activated parameters."""
         return self._scene(None)
 
     def splat_parameters(self) -> TrainedSplat:
-        """Return the trained Gaussians, for `write_splat`."""
+        """Return the trained parameters, as input of `write_splat`."""
         return TrainedSplat(dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode)
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
@@ -195,7 +195,7 @@ class NormLiftModel(SplatfactoModel):
         return GaussianScene(*(part.detach() if rows is None else part.detach()[rows] for part in parts))
 
     def _render_on_cpu(self, view: Camera, values: Tensor, rows: Tensor | None) -> tuple[dict[str, Tensor], Tensor]:
-        """Render the outputs of `SplatfactoModel.get_outputs` outside training, and the values [N, C], in one pass."""
+        """Render the outputs of `SplatfactoModel.get_outputs` in evaluation, and the values [N, C], in one pass."""
         scene = self._scene(rows)
         coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
         if rows is not None:
@@ -216,13 +216,13 @@ class NormLiftModel(SplatfactoModel):
         return outputs, image[:, :, 4:]
 
     def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
-        """Composite values: sum_j A_ij value_j [H, W, C], with the rasterizer settings of the lift."""
+        """Return sum_j A_ij values_j, [H, W, C], with the rasterizer settings of the lift."""
         values, mode = values if rows is None else values[rows], self.config.rasterize_mode
         return render(self._scene(rows), view, values, rasterize_mode=mode, settings=self._settings)[0]
 
     @property
     def _settings(self) -> RasterSettings:
-        """Rasterizer settings of the lift."""
+        """Rasterizer settings of the lift, or those of gsplat 1.4 without a field."""
         return RasterSettings.recorded({} if self._field is None else self._field.manifest)
 
     def get_image_metrics_and_images(
@@ -238,11 +238,11 @@ class NormLiftModel(SplatfactoModel):
 def find_field_folder(semantics: Path) -> Path:
     """Return the folder of the semantic field next to the config.yml that nerfstudio's `eval_setup` reads.
 
-    The config of a copied run still names the folder of the original run, and nerfstudio does not pass a model the path
-    of its config. The path is therefore read from the call stack.
+    The config of a copied run contains the path of the original run, and nerfstudio does not pass the path of the
+    config to models. It is therefore read from the call stack.
 
     Args:
-        semantics: the folder that the config names; returned if there is no folder next to config.yml.
+        semantics: folder in the config, which is returned if there is no folder next to config.yml.
     """
     frame = inspect.currentframe()
     while frame is not None:
@@ -263,7 +263,7 @@ class _Rows(NamedTuple):
 
 
 def compile_renderer() -> None:
-    """Compile the CPU rasterizer now; later, the viewer renders under a tracer that would slow the compiler down."""
+    """Compile the CPU rasterizer before the viewer renders under a tracer that would slow the compiler down."""
     scene = GaussianScene(torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1))
     pose = torch.eye(4)
     pose[2, 3] = 3
@@ -277,10 +277,10 @@ def _opencv(camera: Cameras) -> Camera:
 
 
 def _valid_camera(camera: Cameras) -> tuple[Cameras, Camera]:
-    """Return the camera if it is valid, else a valid camera near it.
+    """Return the camera if it is valid, else a similar valid camera.
 
-    nerfstudio's viewer accepts any number as resolution and field of view. The camera that it makes of a resolution
-    of 0, or of 180 degrees and more, would end the thread that renders.
+    nerfstudio's viewer accepts any number as resolution and field of view. A resolution of 0, or a field of view of at
+    least 180 degrees, gives a camera that would terminate the render thread.
     """
     with suppress(InputError):
         return camera, _opencv(camera)
@@ -300,9 +300,9 @@ def _valid_camera(camera: Cameras) -> tuple[Cameras, Camera]:
 
 @contextmanager
 def without_tracer() -> Iterator[None]:
-    """Suspend the tracer with which nerfstudio's viewer interrupts a render at any line of Python.
+    """Suspend the tracer of nerfstudio's viewer, which can interrupt a render at any line of Python.
 
-    If the tracer raises inside Numba's dispatcher, or in the middle of an import, the thread that renders ends.
+    An exception from the tracer inside numba's dispatcher or during an import would terminate the render thread.
     """
     tracer = sys.gettrace()
     sys.settrace(None)

@@ -1,4 +1,4 @@
-"""Search panel in the nerfstudio viewer: its widgets, their contents, and their effect on the history of states."""
+"""Search panel in nerfstudio's viewer, with its widgets and their actions."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ from normlift_ns.viewer.widgets import (
 )
 
 VISER_SCALE = 10.0
-"""Units of the viser scene per scene unit: nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
+"""Units of the viser scene per scene unit, nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
 
 
 class ClickListener:
-    """Listener for clicks on the scene, in at most one browser of a viewer.
+    """Listener for a click on the scene in one browser.
 
     Args:
-        hit: called with the action of the click, and with the origin and direction of its ray in scene units.
+        hit: callback with the action of the click, and the origin and direction of its ray in scene units.
     """
 
     def __init__(self, hit: Callable[[Action, Tensor, Tensor], None]) -> None:
@@ -73,24 +73,24 @@ class ClickListener:
 
     @property
     def armed(self) -> bool:
-        """True if a browser waits for a click."""
+        """True while a click is expected."""
         return self._armed is not None
 
     def arm(self, action: Action, client: Any) -> None:
-        """Wait for a click in one browser."""
+        """Expect a click in one browser, and no longer in another one."""
         self.disarm()
         client.scene.on_pointer_event("click")(self._clicked)
         self._armed = (action, client)
 
     def disarm(self) -> None:
-        """Stop waiting for a click."""
+        """Stop expecting a click."""
         armed, self._armed = self._armed, None
         if armed is not None and armed[1].scene._scene_pointer_cb is not None:
-            with suppress(Exception):  # raised by viser if the browser has just disconnected
+            with suppress(Exception):  # viser raises if the browser has just disconnected
                 armed[1].scene.remove_pointer_callback()
 
     def on_disconnect(self, client: Any) -> bool:
-        """Handle a disconnected browser; return whether it waited for a click."""
+        """Stop expecting a click in a disconnected browser, and return True if one was expected there."""
         waited = self._armed is not None and self._armed[1].client_id == client.client_id
         if waited:
             self._armed = None
@@ -117,11 +117,11 @@ def visible_mask(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
 
 
 def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> str:
-    """Return the status: running work, message, size of the selection, reasons for differing counts, and warnings.
+    """Return the status as MDX, with the running work, message, size of the selection, remarks on it, and warnings.
 
     Args:
-        busy: description of the running work; empty: none.
-        drawn: mask of Gaussians, as from `visible_mask`.
+        busy: description of the running work, or an empty string.
+        drawn: mask of Gaussians from `visible_mask`.
     """
     lines = [escape_mdx(text) for text in (busy, clip_text(message, 400)) if text]
     selection = state.selection
@@ -131,10 +131,10 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     else:
         lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}")
     faint = int((selection & ~drawn.to(selection.device)).sum())
-    counts = [(faint, "of them are never drawn or exported (opacity below 1/255).")]
+    counts = [(faint, "of the selected Gaussians cannot be drawn or exported (opacity below 1/255).")]
     if state.answer is not None and state.prompts_select and state.shown is None:
         several = int((state.answer.selected.sum(dim=1) > 1).sum())
-        counts.append((several, "of them are selected by several prompts."))
+        counts.append((several, "of the selected Gaussians match several prompts."))
     counts.append((hidden, "Gaussians are hidden."))
     lines += [f"{count:,} {text}" for count, text in counts if count > 0]
     if state.warning:
@@ -143,36 +143,36 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
 
 
 def prompt_table(state: State) -> str:
-    """Return a table with the color, count and highest relevancy of each prompt, or with the prompt's error."""
+    """Return a table with the color, count and highest relevancy of each prompt, or with its error."""
     answer = state.answer
     if len(state.prompts) == 0 or answer is None:
         return ""
     counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
     peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
     numbers = {text: (f"{counts[i]:,}", f"{peaks[i]:.2f}") for i, text in enumerate(answer.texts)}
-    failed_first = sorted(state.prompts, key=lambda prompt: not prompt.error)  # to be noticed
+    failed_first = sorted(state.prompts, key=lambda prompt: not prompt.error)  # so that users notice errors
     rows = prompt_rows(failed_first, ("selected", "peak"), numbers, max_rows=_MAX_TABLE_ROWS)
     return "\n".join([f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}", "", *rows])
 
 
-# Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
+# Widgets of the panel, which is the first tab in nerfstudio's viewer.
 #
-# The widgets are viser's. nerfstudio's own elements appear in a folder far down, do not report which browser pressed
-# them, and hold the render lock while their callbacks run.
+# They are viser widgets. nerfstudio's own elements are at the bottom of another tab, do not report the browser that
+# used them, and hold the render lock during their callbacks.
 
 
 TAB_LABEL = "Search"
 
 
 class PanelWidgets(ActionWidgets):
-    """The tab with its widgets, shared by all browsers."""
+    """Tab with the widgets of the panel, shared by all browsers."""
 
     def __init__(self, gui: Any, act: Act, lock: AbstractContextManager[Any]) -> None:
         super().__init__(gui, act, lock)
         with add_first_tab(gui, TAB_LABEL, "SEARCH"):
             self.prompts = gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
-            self.ask = self._button(Action.ASK, hint="Or press Enter in the Prompts field.")
-            self.cancel = self._button(Action.CANCEL, hint="Stop the query or the pending click, as Escape does.")
+            self.ask = self._button(Action.ASK, hint="Search for the prompts (Enter in the text field).")
+            self.cancel = self._button(Action.CANCEL, hint="Cancel the query or the pending click (Escape).")
             self.cancel.visible = False
             self.status = gui.add_markdown("")
             self.remove_weak = self._button(Action.REMOVE_WEAK)
@@ -181,38 +181,38 @@ class PanelWidgets(ActionWidgets):
             numbers = (MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5)
             self.threshold = self._slider(Action.THRESHOLD, numbers, "Relevancy above which Gaussians are selected.")
             self.reliability = self._slider(
-                Action.RELIABILITY, (0.0, 1.0, 0.01, 0.0), "Minimum reliability R of selected Gaussians."
+                Action.RELIABILITY, (0.0, 1.0, 0.01, 0.0), "Smallest reliability R of selected Gaussians."
             )
             self._button(Action.SUGGESTED, hint="Use the threshold suggested by the histogram (dashed line).")
             self._group("Selection", (Action.HIDE, Action.SHOW_ONLY, Action.SHOW_ALL))
-            self._button(Action.SELECT_FLOATERS, hint="Gaussians that lie on no surface. Check, then hide them.")
+            self._button(Action.SELECT_FLOATERS, hint="Select Gaussians that float free. Check before hiding them.")
             self.prompt_table = gui.add_markdown("")
             self.histograms = gui.add_markdown("")
             self.rows = ObjectRows(gui, act)
             with gui.add_folder("Why"):
-                hint = "Show the training images that voted for the selection."
+                hint = "Show the training images with the largest votes for the selection."
                 self.explain_button = self._button(Action.EXPLAIN, hint=hint)
                 self.reasons = gui.add_markdown("")
             with gui.add_folder("Click in the scene"):
-                self._button(Action.LIKE, hint="Ask for everything similar to the Gaussian you click.")
+                self._button(Action.LIKE, hint="Search for everything similar to the Gaussian that you click.")
                 self._group("Objects", (Action.SELECT, Action.ADD, Action.REMOVE))
                 numbers = (-MAX_GROW_STEPS, MAX_GROW_STEPS, 1, 0)
-                self.steps = self._slider(Action.GROW, numbers, "Grow or shrink the selection, from part to whole.")
+                self.steps = self._slider(Action.GROW, numbers, "Grow (> 0) or shrink (< 0) the selection.")
             with gui.add_folder("Keep"):
                 self._button(Action.DOWNLOAD, hint="Download the selected Gaussians as a PLY file.")
-                self._button(Action.SAVE, hint="Add them to the stored prompts; ns-render draws them.")
+                self._button(Action.SAVE, hint="Add the prompts to those in the run, which ns-render draws.")
                 self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
             with gui.add_folder("Advanced", expand_by_default=False):
-                choice = gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt to show.")
+                choice = gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt to display.")
                 self.shown = self._input(Action.SHOW_PROMPT, choice)
-                colors = gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
+                colors = gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Colormap of the relevancy.")
                 self._input(Action.COLORS, colors)
-                hint = "Prompts to compare with, separated by commas."
+                hint = "Negative prompts to compare with, separated by commas."
                 self.negatives = gui.add_text("Negatives", "", hint=hint)
                 rules = ("auto", *RELEVANCY_RULES)
                 self.rule = gui.add_dropdown("Relevancy", rules, "auto", hint="Only lerf and margin use negatives.")
-                refined = gui.add_checkbox("Refined", True, hint="Use refined features.")
+                refined = gui.add_checkbox("Refined", True, hint="Use directions after the refinement.")
                 self.refined = self._input(Action.REFINED, refined)
         gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=KEYS_SCRIPT))
 
@@ -234,7 +234,7 @@ class PanelWidgets(ActionWidgets):
 
 
 def add_first_tab(gui: Any, label: str, icon: str) -> Any:
-    """Add a tab in front of the viewer's tabs. Widgets created in its context are placed in it.
+    """Add a tab in front of the viewer's tabs, and return it as a context for widgets.
 
     viser adds new tabs at the end, and the viewer does not expose its tab group.
     """
@@ -250,22 +250,22 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
 
 
 _DELAY = 0.1
-"""Seconds without a change before the details are computed."""
+"""Time without a change after which details are computed, in seconds."""
 
 
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:
     """Return the explanations of a lifted run.
 
-    The run is opened a second time at the first explanation, with its images.
+    The first explanation opens the run again, with its images.
 
     Args:
-        folder: folder of the semantic field; None: the run is not stored yet.
+        folder: folder of the semantic field, or None if the run is not stored yet.
     """
 
     @cache
     def votes() -> RecordedVotes:
         if folder is None or field is None:
-            raise InputError("The run is not stored yet, so the images behind the selection are unknown.")
+            raise InputError("The run is not stored yet, so its images are unknown. Ask again after training.")
         scene = open_scene(folder.parent / "config.yml")
         return RecordedVotes(scene, field.to("cpu"), cache_folder(folder.parent))
 
@@ -273,7 +273,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
 
 
 def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
-    """Move the camera of one browser to face an object, from the current side unless something blocks the view."""
+    """Move the camera of one browser to face an object, from the current side if the view is not blocked."""
     camera = client.camera
     view = (np.asarray(camera.position) / VISER_SCALE, camera.up_direction, float(camera.fov))
     position = unoccluded_viewpoint(target, scene, drawn, *view)
@@ -282,27 +282,27 @@ def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Boo
         camera.look_at = np.array(target.center) * VISER_SCALE
 
 
-# All browsers share one panel, as they share nerfstudio's own. States are immutable, and so is the `Display` of a
-# state that the model gets. Other threads can therefore render images without waiting for this one.
+# All browsers share one panel, as they share nerfstudio's own panel. A state and its `Display` are immutable, so other
+# threads can render without waiting for the panel.
 
 
 def rerender_clients(viewer: Any) -> None:
-    """Render the image again in every browser that shows nerfstudio's viewer.
+    """Render the image again in every browser of nerfstudio's viewer.
 
-    nerfstudio 1.1.5's own `Viewer._trigger_rerender` stops at the first browser that connects or disconnects at this
-    moment, and leaves outdated images in the browsers after it.
+    `Viewer._trigger_rerender` of nerfstudio 1.1.5 stops at the first browser that is just connecting or disconnecting.
+    The other browsers would keep outdated images.
     """
     if not viewer.ready:
         return
     for number, client in viewer.viser_server.get_clients().items():
-        with suppress(KeyError):  # connecting, and about to render anyway, or disconnecting
+        with suppress(KeyError):  # the browser is disconnecting, or connecting and renders anyway
             machine = viewer.render_statemachines[number]
             machine.action(RenderAction("move", viewer.get_camera_state(client)))
-            machine.state = "low_move"  # its thread renders again soon even if it has just overwritten the action
+            machine.state = "low_move"  # the render thread renders again even if it has just overwritten the action
 
 
 class _Control(ViewerControl):
-    """Element through which nerfstudio passes its viewer to the panel."""
+    """Control through which nerfstudio passes its viewer to the panel."""
 
     def __init__(self, panel: SearchPanel) -> None:
         self._panel = panel
@@ -313,10 +313,10 @@ class _Control(ViewerControl):
 
 
 class SearchPanel(Controller):
-    """The panel in nerfstudio's viewer.
+    """Search panel in nerfstudio's viewer.
 
     Args:
-        host: the `NormLiftModel`, whose module imports this one.
+        host: the `NormLiftModel`, untyped because its module imports this one.
     """
 
     reading_message = "Reading the prompts. The first query also loads the text encoder, which takes a while."
@@ -332,7 +332,7 @@ class SearchPanel(Controller):
         self._overlay_due = False
         self._detail_turns = RequestTokens()
         self._encoder: list[LazyTextEncoder] = []
-        """The text encoder as the only item once a prompt has loaded it; empty before."""
+        """The text encoder as the only item, or empty before the first prompt."""
         self._clicks = ClickListener(self._on_click)
         self._handlers[Action.COLORS] = lambda colormap, _: self._set_colormap(colormap)
         self._handlers[Action.REPLACE] = lambda *_: self._save(replaces=True)
@@ -340,7 +340,7 @@ class SearchPanel(Controller):
 
     @property
     def answer(self) -> Answer | None:
-        """The answer to the query of the state; None without one."""
+        """Answer to the query of the current state, or None without a query."""
         return None if self.state is None else self.state.answer
 
     @property
@@ -354,7 +354,7 @@ class SearchPanel(Controller):
         """Enable the panel for a field, and show the answer to a query.
 
         Args:
-            folder: folder of the field; None: prompts cannot be saved.
+            folder: folder of the field, or None if prompts cannot be saved.
         """
         with self._lock:
             self._folder, state = folder, State(SelectionContext(field, means))
@@ -370,7 +370,7 @@ class SearchPanel(Controller):
             self._show(History.of(state, lean=State.without_caches))
 
     def close(self) -> None:
-        """Drop the field, because the Gaussians are about to change."""
+        """Remove the field before the Gaussians change."""
         with self._lock:
             self._discard()
             self._detail_turns.cancel()
@@ -386,7 +386,7 @@ class SearchPanel(Controller):
         super()._go_to(history)
 
     def _clear(self) -> None:
-        """Remove the query and the selection, show everything, and reset the settings of queries."""
+        """Clear the query and the selection, show all Gaussians, and reset the query settings."""
         self._discard()
         self._set_prompts("")
         self._set_default_negatives(self.history.now.space.field)
@@ -395,7 +395,7 @@ class SearchPanel(Controller):
         self._do(replace(actions.show_all(actions.clear(self.history.now)), action="Clear"))
 
     def _set_default_negatives(self, field: SemanticField) -> None:
-        with suppress(ValueError, OSError):  # a missing file of text embeddings is reported when it is needed
+        with suppress(ValueError, OSError):  # errors of text embedding files are reported at the next query
             self._negatives = self._default_negatives = join_prompts(default_rule(field).negatives)
 
     def _discard(self) -> None:
@@ -407,10 +407,10 @@ class SearchPanel(Controller):
 
     def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:
         if not bool(mask.any()):
-            raise InputError("Nothing is selected; there is nothing to download.")
+            raise InputError("Nothing is selected. Select Gaussians before you download them.")
         file_name, content, count = splat_bytes(self._host.splat_parameters(), self.history.now, mask, name)
         client.send_file_download(file_name, content)
-        self.show_message(f"Sent {file_name} with {count:,} Gaussians to the browser's downloads.")
+        self.show_message(f"Sent {file_name} with {count:,} Gaussians to the browser.")
 
     def _ask(self) -> None:
         if self._widgets is not None:
@@ -426,7 +426,7 @@ class SearchPanel(Controller):
 
     def _known_vectors(self) -> dict[str, Any]:
         vectors = dict(self._session.clicks)
-        with suppress(ValueError, OSError):  # a damaged file is reported when it is shown or replaced
+        with suppress(ValueError, OSError):  # errors of damaged files are reported when prompts are saved
             vectors |= {prompt.text: prompt.vector for prompt in prompts_of_query(self._stored_query())}
         return vectors
 
@@ -446,14 +446,14 @@ class SearchPanel(Controller):
         return self._encoder[0].rows(texts)
 
     def _stored_query(self) -> Query | None:
-        """Return the query stored in the run; None if it stores none."""
+        """Return the query that is stored in the run, or None if there is none."""
         return None if self._folder is None else load_query(self._folder)
 
     def _find_floaters(self) -> Bool[Tensor, " n"]:
         return find_floaters(self._host.scene(), self.history.now.space.field.scalars).mask
 
     def on_disconnect(self, client: Any) -> None:
-        """Stop waiting for the click of a disconnected browser."""
+        """Stop expecting a click in a disconnected browser."""
         if self._clicks.on_disconnect(client):
             self.show_message("")
 
@@ -462,11 +462,11 @@ class SearchPanel(Controller):
         self.show_message("Click on the scene, or press Cancel or Escape to stop.")
 
     def _on_click(self, action: Action, origin: Tensor, direction: Tensor) -> None:
-        """Handle a click: ask for everything similar, or select, add or remove the object under it."""
+        """Search for objects similar to a clicked Gaussian, or select, add or remove the clicked object."""
 
         def click() -> None:
             device = self.history.now.space.means.device
-            with self._viewer.train_lock:  # a render in another thread may change which Gaussians are drawn
+            with self._viewer.train_lock:  # a render in another thread may change the set of drawn Gaussians
                 weights = self._host.ray_weights(origin.to(device), direction.to(device))
             if action is Action.LIKE:
                 stored = self._stored_query()
@@ -479,7 +479,7 @@ class SearchPanel(Controller):
         self._guard(click)
 
     def _save(self, *, replaces: bool = False) -> None:
-        """Store the prompts in the run, in addition to those stored there or instead of them."""
+        """Store the prompts in the run, either in addition to the stored ones or instead of them."""
         query = self.history.now.query
         try:
             prompts = store_query(self._folder, query, replaces=replaces)
@@ -487,7 +487,7 @@ class SearchPanel(Controller):
             self._offer_to_replace(query is not None)
             raise
         self._offer_to_replace(False)
-        self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
+        self.show_message(f"Saved. The run now stores {prompts}, which ns-render draws.")
 
     def _offer_to_replace(self, visible: bool) -> None:
         if self._widgets is not None:
@@ -497,7 +497,7 @@ class SearchPanel(Controller):
         """Add the tab to a viewer."""
 
         def disconnected(client: Any) -> None:
-            # in another thread: viser calls this under its own lock, for which the holder of the panel's may be waiting
+            # in another thread to avoid a deadlock, because viser holds its lock during this call
             Thread(target=self.on_disconnect, args=(client,), daemon=True).start()
 
         self._viewer = viewer
@@ -513,10 +513,7 @@ class SearchPanel(Controller):
         self._update_widgets()
 
     def _show(self, history: History[State], message: str = "", *, answered: bool = False) -> None:
-        """Show the current state of a history. The display is complete before the model gets it.
-
-        A new selection replaces an rgb output by the overlay.
-        """
+        """Show the current state of a history. A new answer switches the viewer from rgb to the overlay."""
         state = history.now
         drawn = None if state.hidden is None else state.drawn
         display = make_display(
@@ -539,7 +536,7 @@ class SearchPanel(Controller):
             rerender_clients(self._viewer)
 
     def _select_output(self, display: Display, *, answered: bool) -> None:
-        """Switch to the overlay if the current output no longer exists, or if it is rgb and there is a new answer."""
+        """Switch to the overlay if the current output no longer exists, or if it is rgb and the answer is new."""
         output = self._viewer.control_panel._output_render
         if output.value.startswith("relevancy_") and output.value not in output_names(display.texts):
             output.value = "overlay"
@@ -547,7 +544,7 @@ class SearchPanel(Controller):
         self._show_overlay()
 
     def _show_overlay(self) -> None:
-        """Switch from rgb to the overlay if it is due and the viewer knows it."""
+        """Switch from rgb to the overlay if the switch is pending and the viewer lists the overlay."""
         output = self._viewer.control_panel._output_render
         if self._overlay_due and "overlay" in output.options:
             self._overlay_due = False
@@ -555,7 +552,7 @@ class SearchPanel(Controller):
                 output.value = "overlay"
 
     def _follow_outputs(self, control_panel: Any) -> None:
-        """Show an overlay that is due as soon as the viewer knows it, which is after its first image."""
+        """Apply a pending switch to the overlay when the viewer lists it, which is after its first render."""
         update = control_panel.update_output_options
 
         def updated(names: list[str]) -> None:
@@ -565,7 +562,7 @@ class SearchPanel(Controller):
         control_panel.update_output_options = updated
 
     def _update_widgets(self) -> None:
-        """Show the state in the widgets."""
+        """Show the current state in the widgets."""
         widgets, state = self._widgets, self.state
         if widgets is None:
             return
@@ -581,7 +578,7 @@ class SearchPanel(Controller):
         widgets.prompt_table.content = prompt_table(state)
 
     def _update_details(self, state: State) -> None:
-        """Show the objects and histograms of the state that is shown now, after a moment without changes."""
+        """Compute and show the objects and histograms of the current state, after a short time without changes."""
         token = self._detail_turns.start("Looking for objects.")
         Thread(target=self._compute_details, args=(token, state), daemon=True).start()
 
@@ -595,6 +592,6 @@ class SearchPanel(Controller):
                 if self._widgets is not None and self._detail_turns.finish(token):
                     self._widgets.rows.show(objects)
                     self._widgets.histograms.content = histograms
-        except Exception as error:  # no error may stop the viewer
+        except Exception as error:  # errors must not stop the viewer
             if self._detail_turns.finish(token):
                 self.show_message(describe_error(error)[0])

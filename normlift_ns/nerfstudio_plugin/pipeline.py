@@ -1,4 +1,4 @@
-"""Pipeline of `ns-train normlift`: trains splatfacto, then lifts features onto the trained Gaussians."""
+"""Pipeline of `ns-train normlift`, which trains splatfacto and then lifts features onto the trained Gaussians."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class NormLiftPipelineConfig(VanillaPipelineConfig):
-    """splatfacto's pipeline with a lift at the end of training."""
+    """Config of splatfacto's pipeline with a lift at the end of training."""
 
     _target: type = field(default_factory=lambda: NormLiftPipeline)
     source: SourceOptions = field(default_factory=SourceOptions)
@@ -48,17 +48,17 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
     lift: LiftOptions = field(default_factory=LiftOptions)
     """Options of the lift."""
     queries: tuple[str, ...] = ()
-    """Prompts to store in the run; ns-render and ns-viewer show their relevancy."""
+    """Prompts to store in the run. ns-render and ns-viewer show their relevancy."""
 
 
 class NormLiftPipeline(VanillaPipeline):
-    """splatfacto's pipeline. After the last checkpoint is saved, it lifts that checkpoint in the same run."""
+    """splatfacto's pipeline with a lift of the last checkpoint in the same run."""
 
     config: NormLiftPipelineConfig
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if hasattr(torch.serialization, "add_safe_globals"):  # nerfstudio cannot load from torch 2.4 on without it
+        if hasattr(torch.serialization, "add_safe_globals"):  # nerfstudio needs it with torch 2.4 and later
             torch.serialization.add_safe_globals(numpy_scalar_globals())
 
     def get_training_callbacks(
@@ -67,11 +67,11 @@ class NormLiftPipeline(VanillaPipeline):
         """Return splatfacto's callbacks and the lift, after checking the requirements of the lift.
 
         Raises:
-            ValueError, FileNotFoundError: the encoder or a query cannot be used.
+            ValueError, FileNotFoundError: if the encoder or a query cannot be used.
         """
         callbacks = super().get_training_callbacks(training_callback_attributes)
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
-        model.detach()  # the field of a lifted checkpoint whose training is resumed
+        model.detach()  # remove the field if the training of a lifted checkpoint is resumed
         if trainer is not None and trainer.local_rank == 0:
             check_before_training(trainer)
             source = feature_source_of(trainer.config)
@@ -89,9 +89,9 @@ def check_before_training(trainer: Trainer) -> None:
     """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
-        ValueError, FileNotFoundError: the lift does not support the data parser or model, an option is out of range, or
-            nerfstudio misreads the pixel values of an image.
-        PermissionError: the folder of the run or of the lift's caches is not writable.
+        ValueError, FileNotFoundError: if the lift does not support the scene, an option is out of range, or nerfstudio
+            misreads the pixel values of an image.
+        PermissionError: if the folder of the run or of the lift's caches is not writable.
     """
     config: Any = trainer.config
     path = trainer.base_dir / "config.yml"
@@ -112,16 +112,16 @@ def check_before_training(trainer: Trainer) -> None:
 
 
 def dataset_folder(config: TrainerConfig) -> Path:
-    """Return the folder of the dataset that the config names."""
+    """Return the folder of the dataset of a config."""
     data = dataset_in_config(config)
     return data.parent if data.suffix == ".json" else data
 
 
 def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
-    """Make the feature source of a config; without a folder of features, LangSplat's are read from the dataset.
+    """Make the feature source of a config. By default, LangSplat's features are read from the dataset.
 
     Raises:
-        ValueError, FileNotFoundError: for the same reasons as `make_source`; the message names the options of ns-train.
+        ValueError, FileNotFoundError: if `make_source` fails. The message names the options of ns-train.
     """
     options = _source_options(config)
     try:
@@ -130,8 +130,8 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
         if options.features != "langsplat":
             raise
         raise FileNotFoundError(
-            f"{error}. Write them there with LangSplat's preprocessing, name their folder with "
-            "--pipeline.source.features-dir, or compute features from the images: --pipeline.source.features none"
+            f"{error}. Write them there with LangSplat's preprocessing, set their folder with "
+            "--pipeline.source.features-dir, or compute features from the images with --pipeline.source.features none"
         ) from error
 
 
@@ -144,17 +144,17 @@ def _source_options(config: TrainerConfig) -> SourceOptions:
 
 
 def _lift_at_the_end(trainer: Trainer, step: int) -> None:
-    """Lift the trained scene; print any error instead of raising it, since training is complete and saved."""
+    """Lift the trained scene. Errors are printed instead of raised, because training is complete and saved."""
     config = trainer.base_dir / "config.yml"
     try:
         lift_last_checkpoint(trainer)
-    except Exception as error:  # no error may make a completed training fail
+    except Exception as error:  # a completed training must not fail
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
             f"Training is complete and saved, but lifting it at step {step} failed: {describe_error(error)[0]}\n"
-            f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",
+            f"To repeat the lift, run ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,
             soft_wrap=True,
@@ -162,7 +162,7 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
 
 
 def lift_last_checkpoint(trainer: Trainer) -> Path:
-    """Lift the last checkpoint of a trainer, write the field and its config into the run, and show it in the viewer.
+    """Lift the last checkpoint of a trainer, write the field and its config into the run, and update the viewer.
 
     Returns:
         Folder of the field.
@@ -196,5 +196,5 @@ def lift_last_checkpoint(trainer: Trainer) -> Path:
     if hasattr(viewer, "render_statemachines"):
         rerender_clients(viewer)
     command = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
-    CONSOLE.print(f"Lifted: {folder}. Query it with: {command}", markup=False, soft_wrap=True)
+    CONSOLE.print(f"Wrote the semantic field to {folder}. To query it, run {command}", markup=False, soft_wrap=True)
     return folder

@@ -1,4 +1,4 @@
-"""Interface of the rasterization backends. `rasterization.rasterize` has the table of all backends."""
+"""Interface of the rasterization backends, and the backend in plain torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 @dataclass(frozen=True)
 class RasterJob:
-    """Inputs that all views of one call share."""
+    """Scene and options of one call, shared by all its views."""
 
     scene: GaussianScene
     antialiased: bool
@@ -28,15 +28,15 @@ class RasterJob:
     dtype: torch.dtype
     """Precision of the computation."""
     weight_power: int = 1
-    """Exponent p of the evidence, the sums of A_ij ** p."""
+    """Exponent p of the weights in the evidence, which sums A_ij ** p."""
 
     @cached_property
     def prepared(self) -> projection.PreparedGaussians:
-        """The drawable Gaussians, prepared for any camera."""
+        """Drawable Gaussians with their covariances, for any camera."""
         return projection.prepare_gaussians(self.scene, self.dtype)
 
     def project(self, camera: Camera) -> tuple[projection.ProjectedGaussians, projection.TileLists]:
-        """Project the Gaussians into a camera and list them by tile."""
+        """Project the Gaussians into a camera, and list them by tile."""
         projected = projection.project(self.prepared, camera, self.settings, self.antialiased)
         return projected, projection.assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
 
@@ -47,13 +47,13 @@ def check_gpu(backend: str, job: RasterJob) -> None:
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
         raise InputError(
-            f'backend "{backend}" computes in float32 on a GPU, not in {other} on {means.device.type}; omit the '
-            "backend to use the fastest one that can"
+            f'backend "{backend}" needs float32 on a GPU, got {other} on {means.device.type}; use backend="auto" to '
+            "choose one that supports them"
         )
 
 
 class RasterBatch(NamedTuple):
-    """Views of one size that are rasterized together."""
+    """Views of the same size that are rasterized together."""
 
     cameras: Sequence[Camera]
     labels: Sequence[Int32[Tensor, "h w"]]
@@ -61,14 +61,14 @@ class RasterBatch(NamedTuple):
 
 
 class Backend(Protocol):
-    """Rasterization backend, implemented by the modules `numba`, `gsplat` and `triton` of this package."""
+    """Interface of a backend, implemented by `TileBackend` and the modules `numba`, `gsplat` and `triton`."""
 
     def check(self, job: RasterJob) -> None:
-        """Raise ValueError, with an alternative, if the backend cannot do the job."""
+        """Raise ValueError if the backend does not support the job. The message suggests an alternative."""
         ...
 
     def in_flight(self, job: RasterJob, camera: Camera) -> int:
-        """Return the best number of views of this camera's size for one call of `views_evidence`."""
+        """Return the number of views of this camera's size to pass to one call of `views_evidence`."""
         ...
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:
@@ -83,13 +83,13 @@ class Backend(Protocol):
 
 
 class TileBackend:
-    """Backend of plain torch: projected Gaussians and tile lists, one view at a time, in any precision."""
+    """Backend in plain torch for any device and precision, which processes one view at a time."""
 
     def check(self, job: RasterJob) -> None:
         """Accept every job on any device."""
 
     def in_flight(self, job: RasterJob, camera: Camera) -> int:
-        """Return 1: views are independent of each other."""
+        """Return 1, because views are processed one at a time."""
         return 1
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)

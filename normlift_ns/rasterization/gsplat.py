@@ -1,8 +1,8 @@
-"""Stock gsplat on the GPU: its projection, its tile lists, and evidence as the gradient of its renders.
+"""Backend that uses stock gsplat on a GPU, and computes evidence as the gradient of its renders.
 
 With colors c_j and the image I_i = sum_j A_ij c_j, the gradient of sum_{i in s} I_i with respect to c_j is E_js. One
-backward pass with one-hot pixel gradients gives 32 regions. This is slower than `rasterization.triton`, and not bitwise
-repeatable because gsplat adds with atomics. But all of it is gsplat's own code.
+backward pass with one-hot pixel gradients computes 32 regions. It runs only gsplat's own code, so it verifies
+`rasterization.triton`. It is slower, and results differ in their last bits between runs, because gsplat uses atomics.
 """
 
 from __future__ import annotations
@@ -27,30 +27,31 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
-"""Constants in gsplat's compiled code."""
+"""Constants of gsplat's compiled code."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""More such constants. They may differ if the scene uses squares, as up to gsplat 1.4: later versions accept these."""
+"""Further constants of the compiled code. They may differ if the scene uses the squares of gsplat 1.4, because later
+versions support these too."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
-"""Radius in pixels that any overflow exceeds: a determinant is of the order of (radius / 3) ** 4."""
+"""Radius in pixels that is exceeded at any overflow. The determinant is of the order of (radius / 3) ** 4."""
 _LONGEST_RADIUS = 2**31 - 128
-"""Largest int32 that float32 represents exactly."""
+"""Largest int32 number that float32 represents exactly."""
 
 
 class GsplatProjection(NamedTuple):
-    """N Gaussians projected into C cameras of one size: the input of gsplat's rasterizer."""
+    """N Gaussians projected into C cameras of one size, as input of gsplat's rasterizer."""
 
     means2d: Float32[Tensor, "c n 2"]
     conics: Float32[Tensor, "c n 3"]
     opacities: Float32[Tensor, "c n"]
     indices: Int32[Tensor, " intersections"]
-    """Indices into c * n, sorted by camera, tile and depth."""
+    """Indices c * N + n of projected Gaussians, sorted by camera, tile and depth."""
     offsets: Int32[Tensor, "c tiles_y tiles_x"]
-    """Start of each tile in `indices`."""
+    """Start of every tile in `indices`."""
     depths: Float32[Tensor, "c n"]
     radii: Int32[Tensor, "c n *axes"]
-    """Half sides of squares or rectangles; 0: not drawn."""
+    """Half sides of squares or rectangles in pixels, or 0 for Gaussians that are not drawn."""
 
 
 def project_views(job: RasterJob, cameras: Sequence[Camera]) -> GsplatProjection:
@@ -67,7 +68,7 @@ def project_views(job: RasterJob, cameras: Sequence[Camera]) -> GsplatProjection
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
         calc_compensations=job.antialiased, **rectangle,
     )  # fmt: skip
-    if radii.ndim == 3 and not settings.per_axis:  # a later gsplat with a scene trained by an earlier one
+    if radii.ndim == 3 and not settings.per_axis:  # gsplat 1.5 or later with a scene trained by gsplat 1.4
         radii = torch.where((radii > 0).all(2, keepdim=True), _squares(conics, settings), 0)
     radii = radii * (scene.drawable if radii.ndim == 2 else scene.drawable[:, None])
     opacities = scene.opacities.expand(len(cameras), -1)
@@ -80,7 +81,7 @@ def project_views(job: RasterJob, cameras: Sequence[Camera]) -> GsplatProjection
 
 
 def _squares(conics: Float32[Tensor, "c n 3"], settings: RasterSettings) -> Int32[Tensor, "c n 2"]:
-    """Return the half sides of the squares that gsplat 1.4 computes from the covariances."""
+    """Return the half sides in pixels of the squares that gsplat 1.4 computes from the covariances."""
     a, b, c = conics.unbind(2)
     det = 1 / (a * c - b * b)
     mean = 0.5 * det * (a + c)
@@ -98,7 +99,7 @@ def _project_enormous(
     conics: Tensor,
     opacities: Tensor,
 ) -> None:
-    """Replace gsplat's projection of Gaussians whose determinant overflows in float32 to inf or NaN."""
+    """Replace gsplat's projection of Gaussians whose determinant overflows in float32."""
     scene = job.scene
     rows = (scene.drawable & (scene.scales.amax(dim=1) > _LARGE)).nonzero().squeeze(1)
     if len(rows) == 0:
@@ -117,7 +118,7 @@ def _project_enormous(
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not float32 on a GPU, or needs constants that gsplat was not compiled with."""
+    """Raise ValueError if a scene is not float32 on a GPU, or needs other constants than the installed gsplat has."""
     check_gpu("gsplat", job)
     compiled = installed_settings()
     squares = compiled.per_axis and not job.settings.per_axis
@@ -131,7 +132,7 @@ def check(job: RasterJob) -> None:
 
 
 def installed_settings() -> RasterSettings:
-    """Return the constants of the installed gsplat.
+    """Return the constants of the installed gsplat version.
 
     Raises:
         ValueError: If gsplat is not installed or its version is unknown.
@@ -149,15 +150,16 @@ def installed_gsplat_version() -> str:
     try:
         return version("gsplat")
     except PackageNotFoundError as error:
-        raise InputError("gsplat is not installed; install it with: pip install gsplat") from error
+        raise InputError("gsplat is not installed; run pip install gsplat") from error
 
 
 def resolve_gsplat_rules(rules: str, recorded: str | None) -> str:
-    """Return the version of gsplat whose rules apply to a scene.
+    """Return the gsplat version whose constants apply to a scene, such as "1.4".
 
     Args:
         rules: One of `GsplatVersion`.
-        recorded: Version that trained the scene; None: unknown, which means 1.4, the version of nerfstudio 1.1.5.
+        recorded: Version that trained the scene, or None if it is unknown. "auto" then selects 1.4, the version of
+            nerfstudio 1.1.5.
 
     Raises:
         ValueError: If `rules` is "installed" and gsplat is not installed.
@@ -170,19 +172,19 @@ def resolve_gsplat_rules(rules: str, recorded: str | None) -> str:
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
-    """Return 1: gsplat's lists of a view take 60 bytes per Gaussian."""
+    """Return 1, because gsplat's lists of a view take 60 bytes per Gaussian."""
     return 1
 
 
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
-    """Return the entries of views, computed by gsplat's forward and backward pass only.
+    """Return the entries of views, computed with gsplat's forward and backward pass.
 
     Raises:
-        ValueError: If weight_power is not 1: other powers are not gradients.
+        ValueError: If weight_power is not 1, because sums of other powers are not gradients.
     """
     if job.weight_power != 1:
         raise InputError(
-            f'backend "gsplat" supports only weight_power 1, got weight_power {job.weight_power}; use backend="triton"'
+            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="triton" for other powers'
         )
     parts, before = [], 0
     for camera, label_map, count in zip(*batch):
@@ -196,7 +198,7 @@ def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
 def composite(
     job: RasterJob, camera: Camera, values: Float32[Tensor, "n c"]
 ) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
-    """Return sum_j A_ij values_j and sum_j A_ij of every pixel, computed by gsplat's own kernel."""
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel, computed by gsplat's kernel."""
     from gsplat.cuda._wrapper import rasterize_to_pixels  # noqa: PLC0415 (needs a GPU)
 
     size = (camera.height, camera.width)
@@ -216,12 +218,12 @@ def composite(
 def _gradients(
     job: RasterJob, camera: Camera, labels: Tensor, count: int
 ) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
-    """Yield (first column, sums of A_ij by column) for 32 columns at a time; column 0 holds the unlabeled pixels.
+    """Yield (first column, sums of A_ij by column) for 32 columns at a time. Column 0 is for unlabeled pixels.
 
-    The compiled functions are called as in gsplat's own autograd function (cuda/_wrapper.py). Its backward pass
-    starts from 1 - alpha, which has lost up to 3e-4 of a transmittance near 1e-4. All weights of a pixel are multiples
-    of it. So the ratio of the true transmittance to it corrects the weights; a black scene on a white background
-    renders the true transmittance.
+    The compiled functions are called as in gsplat's autograd function (cuda/_wrapper.py). Its backward pass computes
+    the transmittance as 1 - alpha, with a relative error of up to 3e-4 near 1e-4. All weights of a pixel are
+    proportional to it, so they are multiplied by the ratio of the exact transmittance to it. The exact transmittance is
+    the render of a black scene on a white background.
     """
     projections, settings = project_views(job, [camera]), job.settings
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
@@ -239,7 +241,7 @@ def _gradients(
 
 
 def compiled_rasterizer() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return gsplat's compiled forward and backward pass over pixels, under the names of the installed version."""
+    """Return gsplat's compiled forward and backward functions over pixels, whose names depend on the version."""
     from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
 
     name = "rasterize_to_pixels_3dgs" if hasattr(_C, "rasterize_to_pixels_3dgs_fwd") else "rasterize_to_pixels"

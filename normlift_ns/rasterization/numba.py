@@ -1,4 +1,4 @@
-"""Compiled CPU rasterizer: the sums of the reference, one thread per tile, limited to the pixels a Gaussian reaches."""
+"""Compiled CPU backend, which computes the sums of the torch backend with all cores."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _Triple = tuple[Any, Any, Any]
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not on the CPU."""
+    """Raise ValueError if the scene is not on the CPU."""
     device = job.scene.means.device
     if device.type != "cpu":
-        raise InputError(f'backend "numba" needs a scene on the CPU, found {device}; move it, or use backend="torch"')
+        raise InputError(f'backend "numba" needs a scene on the CPU, got {device}; move it, or use backend="torch"')
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
-    """Return 1: the kernels distribute one view over all cores."""
+    """Return 1, because the kernels distribute one view over all cores."""
     return 1
 
 
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
-    """Return the entries of one view, bitwise the same on every run."""
+    """Return the entries of one view, which are bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
     projected = project(job.prepared, camera, job.settings, job.antialiased)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
@@ -44,7 +44,7 @@ def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
     first_slot, used = np.cumsum(capacity) - capacity, np.zeros(len(capacity), np.int64)
     slots = tuple(
         np.empty(capacity.sum(), dtype) for dtype in (np.int32, np.int32, np.float64)
-    )  # pages are allocated when written
+    )  # memory pages are allocated when they are written
     kernels.sum_tiles(
         *(offsets, members, *arrays, shapes, projected.gaussian.numpy(), label_map),
         *(job.weight_power, size, limits, first_slot, used, slots, numba.get_num_threads()),
@@ -71,10 +71,10 @@ def composite(
 
 
 def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
-    """Return the input of the kernels in three groups.
+    """Return the input of the kernels as three groups.
 
-    These are means, conics and opacities; limits of alpha and transmittance; and offsets and members of the tiles with
-    shapes of the Gaussians.
+    The first group is means, conics and opacities. The second is the limits of alpha and transmittance. The third is
+    the result of `numba_kernels.list_tiles`.
     """
     means, conics, opacities = (
         x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
@@ -90,9 +90,9 @@ def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettin
 
 
 def compile_kernels(*dtypes: torch.dtype) -> Thread:
-    """Load the kernels for some precisions in the background, and compile those that are not in a cache.
+    """Load the kernels for some precisions in a background thread, and compile those that are not in a cache.
 
-    Callers need not wait for the thread: a call to a kernel that is not ready waits for this kernel only.
+    Callers do not have to wait for the thread. A call to a kernel waits only until this kernel is compiled.
     """
 
     def work() -> None:
@@ -106,7 +106,7 @@ def compile_kernels(*dtypes: torch.dtype) -> Thread:
 
 
 def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
-    """Return every kernel that this module calls with the types of its arguments; those for rendering come first."""
+    """Return (kernel, types of its arguments) for every kernel of this module, with those for rendering first."""
     number = numba.float64 if dtype == torch.float64 else numba.float32
     integer, integers, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
     labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)

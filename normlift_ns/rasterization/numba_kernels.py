@@ -1,7 +1,7 @@
 """Kernels of the CPU rasterizer, compiled with numba.
 
-numba caches a compiled function until its own file changes, and ignores changes to functions that it calls in other
-files. After a change to such a function, delete the .nbi files in the `__pycache__` of this folder.
+numba caches a compiled function until its file changes. It does not detect changes to functions in other files that the
+function calls. After such a change, delete the .nbi files in the `__pycache__` of this folder.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from normlift_ns.core.evidence import UNLABELED
 
 _F = np.float32
 _MAGIC32, _MAGIC64 = _F(1.5 * 2**23), 1.5 * 2**52
-"""Adding a number near 0 rounds it to an integer, which then occupies the last bits of the sum."""
+"""Constant that rounds a small number to an integer when added to it. The last bits of the sum are this integer."""
 _LOG2_E32, _LN2_HIGH32, _LN2_LOW32, _LEAST32 = _F(1.44269504088896341), _F(0.693359375), _F(-2.12194440e-4), _F(-87)
 _LOG2_E64, _LN2_HIGH64, _LN2_LOW64 = 1.44269504088896341, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
@@ -32,7 +32,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         try:
             return numba.njit(cache=True, error_model="numpy", **options)(function)
-        except RuntimeError:  # neither next to the code nor in the user's cache folder
+        except RuntimeError:  # numba cannot write to this folder or the user's cache folder
             return numba.njit(error_model="numpy", **options)(function)
 
     return decorate
@@ -40,21 +40,21 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 kernel = cached_njit()
 fused_kernel = cached_njit(fastmath={"contract"})
-"""Decorator that allows fused multiply-add, which rounds once, as on a GPU."""
+"""Decorator that allows fused multiply-add, with a single rounding as on a GPU."""
 parallel_kernel = cached_njit(parallel=True)
 
 
 def exp(x: float) -> float:
-    """Return e ** x for x <= 0 in the precision of x, within 1e-7 (float32) or 4e-16 (float64).
+    """Return e ** x for x <= 0 in the precision of x, with an error below 1e-7 (float32) or 4e-16 (float64).
 
-    Results are at least e ** -87 (float32) or e ** -700 (float64).
+    Results below e ** -87 (float32) or e ** -700 (float64) are raised to this value.
     """
     return math.exp(x)
 
 
 @overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
-    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomials of Cephes' expf and of Taylor."""
+    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomial of Cephes' expf or a Taylor series."""
 
     def single(x):
         x = x if x > _LEAST32 else _LEAST32
@@ -81,19 +81,19 @@ def _compiled_exp(x):  # pragma: no cover (compiled)
 
 @kernel
 def interleaved_index(position, count, threads):  # pragma: no cover (compiled)
-    """Return the work item at a position of a static schedule, so that each thread gets every n-th item.
+    """Return the work item at a position of a static schedule in which each of n threads gets every n-th item.
 
-    Skip items that are not below `count`.
+    The caller must skip items that are not below `count`.
     """
     per_thread = (count + threads - 1) // threads
     return position % per_thread * threads + position // per_thread
 
 
-# Compiled tile lists of the CPU rasterizer: the Gaussians that can contribute to each tile.
+# Compiled tile lists of the CPU rasterizer, with the Gaussians that can contribute to each tile.
 
 
 _REACH_MARGIN = 1e-2
-"""Added to the exponent at which alpha falls below min_alpha, so that rounding never drops a pixel of a Gaussian."""
+"""Margin of the exponent at which alpha falls below min_alpha, so that rounding does not drop pixels."""
 _ROUNDINGS = 4
 """Bound on the rounding error of an exponent, in units of machine epsilon times a dx^2 + c dy^2."""
 
@@ -102,7 +102,7 @@ _ROUNDINGS = 4
 def _axis(reach, own, mixed, other):  # pragma: no cover (compiled)
     """Return the parameters of `ellipse_extent` for s in the ellipse own s^2 + 2 mixed s t + other t^2 <= reach.
 
-    The extent is infinite if rounding has destroyed the ellipse.
+    The extent is infinite if rounding makes the ellipse degenerate.
     """
     det = own * other - mixed * mixed
     if own > 0 and other > 0 and det > 0 and reach < np.inf:
@@ -114,7 +114,7 @@ def _axis(reach, own, mixed, other):  # pragma: no cover (compiled)
 
 @kernel
 def ellipse_extent(axis, low, high):  # pragma: no cover (compiled)
-    """Return the least and greatest s of the ellipse for low <= t <= high."""
+    """Return the smallest and largest s of the ellipse for low <= t <= high."""
     peak, slope, reach, curvature = axis
     near, far = min(max(-peak, low), high), min(max(peak, low), high)
     return (
@@ -127,7 +127,7 @@ def ellipse_extent(axis, low, high):  # pragma: no cover (compiled)
 def _touched_tiles(center, radius, size, count):  # pragma: no cover (compiled)
     """Return the range (first, stop) of tiles along one axis that the square of a Gaussian touches.
 
-    The result equals that of `assign_tiles`.
+    The result is the same as in `assign_tiles`.
     """
     low, high = center / size - radius / size, center / size + radius / size
     return math.floor(min(max(low, 0), count)), math.ceil(min(max(high, 0), count))
@@ -135,9 +135,9 @@ def _touched_tiles(center, radius, size, count):  # pragma: no cover (compiled)
 
 @kernel
 def _shape(g, means2d, conics, opacities, radii, width, height, size, min_alpha, eps):  # pragma: no cover (compiled)
-    """Return the ellipse in which alpha can reach min_alpha: `_axis` of x and of y, and half its height.
+    """Return the ellipse in which alpha can reach min_alpha, as `_axis` of x, `_axis` of y and half its height.
 
-    The height is negative if there is no such ellipse.
+    The height is negative if alpha is below min_alpha everywhere.
     """
     a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
     if not opacities[g] >= min_alpha:
@@ -156,7 +156,7 @@ def _shape(g, means2d, conics, opacities, radii, width, height, size, min_alpha,
 
 @kernel
 def _columns(across, half_height, u, v, row, x0, x1, size, width, height):  # pragma: no cover (compiled)
-    """Return the range (first, stop) of tile columns with pixel centers that the ellipse reaches in a row of tiles."""
+    """Return the range (first, stop) of tile columns in which the ellipse covers pixel centers of a row of tiles."""
     low, high = row * size + 0.5 - v, min((row + 1) * size, height) - 0.5 - v
     if low > half_height or high < -half_height:
         return 0, 0
@@ -170,12 +170,12 @@ def _columns(across, half_height, u, v, row, x0, x1, size, width, height):  # pr
 def list_tiles(
     means2d, conics, opacities, radii, width, height, size, min_alpha, threads
 ):  # pragma: no cover (compiled)
-    """List, for every tile, the Gaussians that can contribute to one of its pixels.
+    """Return lists of the Gaussians that can contribute to pixels of each tile.
 
     Their square touches the tile as in `projection.assign_tiles`, and alpha can reach min_alpha in the tile.
 
     Returns:
-        The offsets and members of `Tiles`, and `_axis` of y of every Gaussian.
+        The offsets and indices of `projection.TileLists`, and nine values of `_shape` for every Gaussian.
     """
     m, columns, rows = len(means2d), (width + size - 1) // size, (height + size - 1) // size
     side, eps = means2d.dtype.type(size), np.finfo(means2d.dtype).eps
@@ -225,16 +225,16 @@ def list_tiles(
 
 # Compiled compositing of the CPU rasterizer, tile by tile, and its sums by (Gaussian, region).
 #
-# The rows of a tile are processed LANES pixels at a time and without branches, which the compiler turns into vector
-# instructions. Every thread writes to its own memory. So locks are not needed, and the sums are the same on every run
-# and with any number of threads.
+# The rows of a tile are processed LANES pixels at a time without branches, so the compiler uses vector instructions.
+# Every thread writes to its own memory. Locks are not needed, and the sums do not depend on the run or the number of
+# threads.
 
 
 LANES = 16
 _MANY_LABELS = 4
-"""Number of labels in a tile above which sums are taken pixel by pixel."""
+"""Number of labels in a tile above which sums are computed pixel by pixel."""
 _FEW_LABELS = 32
-"""Number of labels of a Gaussian up to which they are sorted on insertion."""
+"""Largest number of labels of a Gaussian that are sorted on insertion."""
 
 
 @kernel
@@ -260,7 +260,7 @@ def _tile_labels(labels, box, local, distinct):  # pragma: no cover (compiled)
 
 @kernel
 def _label_ranges(local, box, ranges):  # pragma: no cover (compiled)
-    """Write the least and greatest label number of each row of a tile to `ranges`."""
+    """Write the smallest and largest label number of each row of a tile to `ranges`."""
     top, left, bottom, right = box
     for row in range(bottom - top):
         low = high = local[row, 0, 0]
@@ -291,7 +291,7 @@ def count_labels(labels, size):  # pragma: no cover (compiled)
 
 @kernel
 def _reset_transmittance(box, transmittance):  # pragma: no cover (compiled)
-    """Set the transmittance of a tile to 1, and to 0 outside the image."""
+    """Set the transmittance of the pixels of a tile to 1 in the image, and to 0 outside it."""
     top, left, bottom, right = box
     transmittance[:] = 0
     for y in range(bottom - top):
@@ -301,7 +301,7 @@ def _reset_transmittance(box, transmittance):  # pragma: no cover (compiled)
 
 @kernel
 def _first_active(pixels, index):  # pragma: no cover (compiled)
-    """Return the first index from `index` on with a transmittance above 0; the number of pixels if there is none."""
+    """Return the first index from `index` on with a transmittance > 0, or the number of pixels if there is none."""
     while index < pixels.size and not pixels[index] > 0:
         index += 1
     return index
@@ -309,12 +309,12 @@ def _first_active(pixels, index):  # pragma: no cover (compiled)
 
 @fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
-    """Composite one Gaussian over a tile: weights[row, chunk, lane] = A_ij, or 0 if it is not drawn.
+    """Composite one Gaussian over a tile, and write A_ij to weights[row, chunk, lane], or 0 if it is not drawn.
 
-    The transmittance of a pixel that has stopped is stored with a minus sign.
+    The transmittance of a pixel that has stopped is stored as a negative number.
 
     Returns:
-        The range (first, stop) of rows that the Gaussian may reach; other rows are not written.
+        The range (first, stop) of rows that the Gaussian may reach. Other rows are not written.
     """
     top, left, bottom, right = box
     max_alpha, min_alpha, min_transmittance = limits
@@ -348,7 +348,7 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
 
 @kernel
 def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
-    """Return the range (least, stop) of label numbers in some rows."""
+    """Return the range (first, stop) of label numbers in some rows."""
     least, greatest = ranges[first, 0], ranges[first, 1]
     for row in range(first + 1, stop):
         least, greatest = min(least, ranges[row, 0]), max(greatest, ranges[row, 1])
@@ -357,7 +357,7 @@ def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
 
 @kernel
 def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: no cover (compiled)
-    """Return the sum of A_ij ** power over the pixels with one label in some rows; `lanes` is 0 before and after."""
+    """Return the sum of A_ij ** power over the pixels with one label in some rows. `lanes` is a buffer of zeros."""
     for row in range(first, stop):
         for chunk in range(weights.shape[1]):
             if power == 1:
@@ -405,9 +405,9 @@ def sum_tiles(  # pragma: no cover (compiled)
     slots,
     threads,
 ):
-    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile list entry and label with a positive weight.
+    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile, Gaussian and label with a positive sum.
 
-    The slots of a tile start at first_slot[tile], and used[tile] of them are written.
+    The slots of a tile start at first_slot[tile], and their number is written to used[tile].
     """
     slot_gaussian, slot_label, slot_weight = slots
     tiles, wide = offsets.size - 1, (size + LANES - 1) // LANES
@@ -424,7 +424,7 @@ def sum_tiles(  # pragma: no cover (compiled)
         _label_ranges(local, box, ranges)
         _reset_transmittance(box, transmittance)
         sums, lanes = np.zeros(count), np.zeros(LANES)
-        many = count > _MANY_LABELS  # independent of the rows that a Gaussian reaches, so these do not change its sums
+        many = count > _MANY_LABELS  # the same for all Gaussians of a tile, so sums do not depend on their rows
         pixels, slot, active = transmittance.reshape(-1), first_slot[tile], 0
         for entry in range(offsets[tile], offsets[tile + 1]):
             active = _first_active(pixels, active)
@@ -451,9 +451,9 @@ def sum_tiles(  # pragma: no cover (compiled)
 
 @kernel
 def merge_slots(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no cover (compiled)
-    """Sort the slots by (Gaussian, label + 1), and add up equal ones in the order of the tiles.
+    """Return the slots sorted by (Gaussian, label + 1), with equal ones summed in the order of the tiles.
 
-    This is a counting sort by Gaussian; the labels of each Gaussian are added up in a dense row and sorted.
+    A counting sort orders slots by Gaussian. The labels of each Gaussian are summed in a dense row and then sorted.
     """
     slot_gaussian, slot_label, slot_weight = slots
     end = np.zeros(num_gaussians + 1, np.int64)

@@ -1,4 +1,4 @@
-"""Projection of Gaussians to 2D and tile lists, as in gsplat, and the reference rasterizer in PyTorch.
+"""Projection of Gaussians and tile lists as in gsplat, and the reference rasterizer in torch.
 
 The gsplat sources are utils.cuh and isect_tiles.cu.
 """
@@ -19,22 +19,22 @@ from normlift_ns.core.sparse import row_offsets, sum_duplicates
 from normlift_ns.rasterization.settings import RasterSettings
 
 _ENORMOUS = 2.0**60
-"""Covariances above this, in square pixels, are multiplied by 1 / _ENORMOUS."""
+"""Covariance in square pixels above which covariances are multiplied by 1 / _ENORMOUS."""
 
 
 class PreparedGaussians(NamedTuple):
-    """The drawable Gaussians of a scene, prepared for any camera."""
+    """Drawable Gaussians of a scene with their covariances, for any camera."""
 
     gaussian: Int64[Tensor, " m"]
     """Rows of the scene."""
     means: Float[Tensor, "m 3"]
-    """Centers in the precision of the scene, which decides the drawing order."""
+    """Centers in the precision of the scene, because rounding would change the drawing order."""
     covariances: Float[Tensor, "m 3 3"]
     opacities: Float[Tensor, " m"]
 
 
 class ProjectedGaussians(NamedTuple):
-    """The Gaussians visible in a camera, nearest first."""
+    """Visible Gaussians of one camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
     """Rows of the scene."""
@@ -43,13 +43,13 @@ class ProjectedGaussians(NamedTuple):
     """Inverse covariance in square pixels: xx, xy, yy."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
-    """Half width and height of the rectangle that selects the tiles, in whole pixels."""
+    """Half width and half height of the rectangle that selects tiles, in whole pixels."""
 
 
 class TileLists(NamedTuple):
-    """Gaussians by tile, with tiles row by row.
+    """Lists of the Gaussians of every tile, with tiles numbered row by row.
 
-    Tile t has the rows members[offsets[t]:offsets[t + 1]] of `ProjectedGaussians`, nearest first.
+    Tile t contains the rows indices[offsets[t]:offsets[t + 1]] of `ProjectedGaussians`, nearest first.
     """
 
     offsets: Int64[Tensor, " tiles_plus_1"]
@@ -65,7 +65,7 @@ def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGauss
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Return the rotations of quaternions (w, x, y, z) of any length but 0."""
+    """Return the rotation matrices of quaternions (w, x, y, z) of any length > 0."""
     w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True)).unbind(1)
     return torch.stack(
         [
@@ -80,13 +80,13 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 def project(
     world: PreparedGaussians, camera: Camera, settings: RasterSettings, antialiased: bool
 ) -> ProjectedGaussians:
-    """Project the Gaussians, blur them by eps2d, drop invisible ones, and sort by depth (equal depths by index).
+    """Project Gaussians, blur them by eps2d, drop invisible ones, and sort by depth and then by index.
 
     Args:
         world: Gaussians.
         camera: Camera of the image.
         settings: Constants of the rasterizer.
-        antialiased: Whether to scale opacities by sqrt(det / det of the blurred covariance), like splatfacto's
+        antialiased: Scale opacities by sqrt(det / det of the blurred covariance), as splatfacto does with
             rasterize_mode "antialiased".
     """
     dtype, device = world.opacities.dtype, world.opacities.device
@@ -108,7 +108,7 @@ def project(
     )
     to_image = jacobian @ rotation
     covariance = to_image @ world.covariances[near] @ to_image.transpose(1, 2)
-    # Scale down enormous Gaussians, whose determinants overflow in float32. A power of two causes no rounding.
+    # Scale down enormous covariances, whose determinants would overflow float32. Powers of two do not cause rounding.
     unit = torch.where(covariance.diagonal(dim1=1, dim2=2).amax(dim=1) > _ENORMOUS, 1 / _ENORMOUS, 1.0).to(dtype)
     a, b, c = (unit * x for x in (covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]))
     det_sharp = a * c - b * b
@@ -119,7 +119,7 @@ def project(
         opacities = opacities * (det_sharp / det).clamp(min=settings.min_compensation**2).sqrt()
 
     if settings.per_axis:
-        # Standard deviations up to which alpha >= min_alpha; NaN if there are none, which drops the Gaussian.
+        # Alpha >= min_alpha up to this number of standard deviations. If it is NaN, the Gaussian is dropped.
         sigmas = (2 * (opacities / settings.min_alpha).log()).sqrt().clamp(max=settings.radius_sigmas)
         radii = (sigmas[:, None] * (torch.stack([a, c], 1) / unit[:, None]).sqrt()).ceil()
     else:
@@ -141,15 +141,16 @@ def project(
 
 
 def camera_depths(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, " m"]:
-    """Return the distance of every mean along the camera's axis, rounded as in gsplat."""
+    """Return the depth of every mean along the viewing axis, rounded as in gsplat."""
     return _camera_axis(means, camera.world_to_camera.to(means.device)[2])
 
 
 def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float[Tensor, " m"]:
-    """Return one camera coordinate of all means, rounded as CUDA rounds R p + t: b y, fused + a x, fused + c z, + t.
+    """Return one camera coordinate of all means, rounded as CUDA rounds R p + t.
 
-    The drawing order of overlapping Gaussians at the same distance depends on the last bit. A product of two float32
-    numbers is exact in float64, so rounding its sum once is a fused multiply-add.
+    CUDA rounds b y, adds a x and c z with fused multiply-adds, and then adds t. The last bit decides the drawing order
+    of Gaussians at nearly the same depth. A product of two float32 numbers is exact in float64, so rounding the sum in
+    float64 once gives the result of a fused multiply-add.
     """
     dtype, (x, y, z) = means.dtype, means.double().unbind(1)
     a, b, c, t = row.to(dtype).double()
@@ -160,7 +161,7 @@ def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float
 
 
 def assign_tiles(projected: ProjectedGaussians, width: int, height: int, tile_size: int) -> TileLists:
-    """List, for every tile, the Gaussians whose rectangle touches it."""
+    """Return the lists of the Gaussians whose rectangle touches each tile."""
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     u, v = (projected.means2d / tile_size).unbind(1)
     across, down = (projected.radii / tile_size).unbind(1)
@@ -174,15 +175,15 @@ def assign_tiles(projected: ProjectedGaussians, width: int, height: int, tile_si
     return TileLists(row_offsets(tile, rows * columns), member[order].int())
 
 
-# Reference rasterizer in plain torch: tile by tile, on any device and in any precision.
+# Reference rasterizer in plain torch, for any device and precision.
 #
-# It is slow, and all other backends are tested against it.
+# It processes one tile at a time, and is slow. All other backends are tested against it.
 
 
 def compositing_weights(alpha: Float[Tensor, "p k"], min_transmittance: float) -> Float[Tensor, "p k"]:
-    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) of K Gaussians, nearest first, in P pixels.
+    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) in P pixels of K Gaussians, nearest first.
 
-    A pixel stops before the first Gaussian that would leave `min_transmittance` or less.
+    A pixel stops before the first Gaussian that would reduce its transmittance to `min_transmittance` or less.
 
     >>> compositing_weights(torch.tensor([[0.3, 0.8, 0.5]]), 1e-4)
     tensor([[0.3000, 0.5600, 0.0700]])
@@ -202,7 +203,7 @@ def view_evidence(
     weight_power: int,
     settings: RasterSettings,
 ) -> Entries:
-    """Return the sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 is the unlabeled pixels."""
+    """Return the sums of A_ij ** weight_power by (Gaussian, region) of one view. Region -1 is for unlabeled pixels."""
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for member, (rows, columns), a in _tiles(projected, tiles, labels.shape[1], labels.shape[0], settings):
         weight = torch.where(a > 0, a.double() ** weight_power, 0.0)
@@ -236,7 +237,7 @@ def composite(
 def _tiles(
     projected: ProjectedGaussians, tiles: TileLists, width: int, height: int, settings: RasterSettings
 ) -> Iterator[tuple[Tensor, tuple[slice, slice], Tensor]]:
-    """Yield the K Gaussians, the pixels as slices of the image, and A_ij [pixels, K] of every tile with Gaussians."""
+    """Yield the K Gaussians, the pixels as slices of the image, and A_ij [pixels, K] of every nonempty tile."""
     size, device, dtype = settings.tile_size, projected.means2d.device, projected.means2d.dtype
     across = -(-width // size)
     bounds = tiles.offsets.tolist()

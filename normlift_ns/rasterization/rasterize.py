@@ -1,4 +1,4 @@
-"""Rasterization of evidence and images by the backend that suits a job, and weights along a ray."""
+"""Rasterization of evidence and images with a suitable backend, and compositing weights along a ray."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def view_colors(
     Args:
         means: Centers of the Gaussians.
         coefficients: features_dc and features_rest of a checkpoint, [N, 1 + rest, 3].
-        camera: Camera that views the Gaussians.
-        degree: Degree of the spherical harmonics, with (degree + 1) ** 2 <= K; None: the coefficients are logits.
+        camera: Camera of the image.
+        degree: Degree of the spherical harmonics with (degree + 1) ** 2 <= K, or None if the coefficients are logits.
     """
     if degree is None:
         return torch.sigmoid(coefficients[:, 0])
@@ -45,26 +45,26 @@ def view_colors(
     return (_spherical_harmonics(degree, means - center, coefficients) + 0.5).clamp(min=0)
 
 
-# Table of the rasterization backends, and the choice of one for a job.
+# Choice of a backend.
 
 
 def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
-    """Return a backend and its name; "auto" selects the fastest backend that can do the job.
+    """Return a backend and its name. "auto" selects the fastest backend that supports the job.
 
     Args:
         name: Name of the backend, or "auto".
-        job: Inputs of the call.
+        job: Scene and options.
 
     Raises:
-        ValueError: If the name is unknown or the backend cannot do the job.
+        ValueError: If the name is unknown or the backend does not support the job.
     """
     if name == "auto":
         name = _fastest(job)
     if name not in get_args(BackendName):
-        raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
+        raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(get_args(BackendName))}")
     if name == "triton" and not has_triton():
         raise InputError(
-            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
+            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use another backend'
         )
     backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
     backend.check(job)
@@ -80,28 +80,28 @@ def _fastest(job: RasterJob) -> str:
     return "triton" if has_triton() else "gsplat"
 
 
-# Rasterization of evidence (`rasterize_evidence`) and of values (`render`) with a backend.
+# Rasterization of evidence (`rasterize_evidence`) and of values (`render`).
 
 
 ViewProgress = Callable[[int, int | None], None]
 MAX_REGIONS = 2**24
-"""Largest number of regions of a view; memory grows with it, whether or not regions have pixels."""
+"""Largest number of regions of a view. Regions without pixels also take memory."""
 _ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
 
 
 class RasterOptions(TypedDict, total=False):
-    """Keywords of `rasterize_evidence` that define the weights A_ij and their sums."""
+    """Keyword arguments of `rasterize_evidence` that define the weights A_ij and their sums."""
 
     rasterize_mode: RasterizeMode
-    """`rasterize_mode` of splatfacto in the training of the scene (default: classic)."""
+    """splatfacto's `rasterize_mode` in the training of the scene (default: classic)."""
     weight_power: int
-    """Exponent of the summed A_ij. 1: the paper (default). 2: the code of SFS. 0: number of pixels that a Gaussian
-    contributes to."""
+    """Exponent of the summed A_ij (default: 1, as in the paper). SFS's code uses 2. With 0, the sum is the number of
+    pixels that a Gaussian contributes to."""
     settings: RasterSettings | None
     """Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`."""
     dtype: torch.dtype | None
-    """Precision of the computation and of the weights (default: that of the scene). Sums are always taken in float64.
-    """
+    """Precision of the computation and of the weights (default: that of the scene). Sums are always computed in
+    float64."""
 
 
 @check_arguments
@@ -117,28 +117,27 @@ def rasterize_evidence(
 ) -> Evidence:
     """Compute the evidence E_js = sum of A_ij over the pixels i of region s, for all views.
 
-    The weights A_ij are those of the rasterizer that trained the scene, including its cut-offs and its drawing order.
+    The weights A_ij are those of the rasterizer that trained the scene, including its thresholds and drawing order.
 
-    Views are streamed: cameras, labels and num_regions may be generators, and only the entries of a view are kept.
+    Views are streamed. cameras, labels and num_regions may be generators, and only the entries of a view are kept.
 
     Args:
-        scene: N Gaussians. Those with parameters that are not finite or out of range (`GaussianScene.drawable`) are
-            not drawn; they are counted in the result, with a warning.
+        scene: N Gaussians. Gaussians with invalid parameters (see `GaussianScene.drawable`) are not drawn. The result
+            counts them, and a warning reports them.
         cameras: One camera per view.
         labels: One integer tensor [height, width] per view, with region ids 0, 1, … of this view. -1 means unlabeled.
-            -2 means masked: the pixel is not an observation, whatever `lift` does with unlabeled pixels.
-        num_regions: Number of regions (columns, feature rows) per view (default: largest id + 1). Needed if a feature
-            table has rows without pixels.
-        backend: "torch" (reference; any device and precision), "numba" (compiled; CPU), "triton" (fast; GPU, float32),
-            "gsplat" (stock gsplat; GPU, float32, weight_power 1, rules of the installed version or older) or "auto"
-            (the fastest for the device of the scene and the precision).
-        progress: Function called after every view with (views done, number of views or None).
-        options: rasterize_mode, weight_power, settings and dtype; see `RasterOptions`.
+            -2 means masked, and `lift` always ignores such pixels.
+        num_regions: Number of regions per view (default: largest id + 1). Required if the feature table has rows for
+            regions without pixels.
+        backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
+            fast, for float32 on a GPU. "gsplat" is stock gsplat, for float32 on a GPU with weight_power 1 and constants
+            of the installed version or older. "auto" selects the fastest backend that supports device and precision.
+        progress: Callback after every view, with the number of views done and the number of views or None.
+        options: Keyword arguments of `RasterOptions`.
 
     Raises:
-        ValueError: If an option is unknown, labels are not integers or differ from their camera in size, or an id is
-            below -2 or not below its `num_regions`. Also if the iterables have different lengths. The message names
-            the view.
+        ValueError: If an option is unknown, labels have a wrong type or size, an id is out of range, or the iterables
+            have different lengths. The message names the view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
@@ -146,7 +145,7 @@ def rasterize_evidence(
     >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
     >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
     >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[-1]])])
-    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: behind the first one
+    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25 behind the first one
     ([0.5, 0.25], [0.5, 0.25])
     """
     weight_power = options.get("weight_power", 1)
@@ -157,8 +156,8 @@ def rasterize_evidence(
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
-            f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, "
-            "and are not drawn",
+            f"{num_excluded} of {len(scene)} Gaussians are not drawn, because they have parameters that are not finite "
+            "or out of range",
             stacklevel=3,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
@@ -193,7 +192,7 @@ def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpac
     """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
-        ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
+        ValueError: If the name is unknown or the backend does not support the job. The message suggests an alternative.
     """
     return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
@@ -209,12 +208,12 @@ def render(
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Composite values of Gaussians: sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+    """Composite values of Gaussians to sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
 
     Args:
         scene: N Gaussians.
         camera: Camera of the image.
-        values: Colors, relevancies, reliability, …; not premultiplied.
+        values: Values of every Gaussian to composite, such as colors or relevancies, not premultiplied.
         backend: As in `rasterize_evidence`.
         rasterize_mode: As in `rasterize_evidence`.
         settings: As in `rasterize_evidence`.
@@ -236,7 +235,7 @@ def render(
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
     if len(values) != len(scene):
-        raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
+        raise InputError(f"values must have shape [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job)
     with torch.no_grad():
@@ -256,9 +255,9 @@ def render_image(
     Args:
         scene: Scene to render.
         camera: Camera of the image.
-        settings: Constants of the rasterizer, if they differ from the training, for images of another size.
-        mode: rasterize_mode, if it differs from the training.
-        gaussians: Gaussians of the scene on the rendering device (default: on the device of the scene).
+        settings: Constants of the rasterizer (default: those of gsplat 1.4.0).
+        mode: rasterize_mode (default: that of the training).
+        gaussians: Gaussians of the scene on the rendering device (default: those of `scene`).
 
     Returns:
         The image on the CPU.
@@ -282,14 +281,14 @@ def _job(
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
-        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; a scene of {dtype} needs one")
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; pass one for a {dtype} scene")
     return RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
 
 
 def _batches(
     views: Iterator[tuple[Camera, Tensor, int | None]], batch_size: Callable[[Camera], int]
 ) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
-    """Yield batches of consecutive views of one size."""
+    """Yield batches of consecutive views of the same size."""
     for _, group in groupby(views, key=lambda view: (view[0].width, view[0].height)):
         same_size = iter(group)
         for first in same_size:
@@ -305,8 +304,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} ended after {index} views, but more views follow; "
-                    "give one camera, one label map and one count per view"
+                    f"{name} has only {index} items, but there are more views; "
+                    "give one camera, one label map and one number of regions per view"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 
@@ -317,17 +316,19 @@ def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
         raise InputError(f"labels of view {index} must be an integer tensor, got {kind}")
     if tuple(labels.shape) != (camera.height, camera.width):
         raise InputError(
-            f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
-            f"{camera.width} (height x width)"
+            f"labels of view {index} have shape {tuple(labels.shape)}, expected the size of its camera, "
+            f"({camera.height}, {camera.width})"
         )
 
 
 def _check_range(index: int, low: int, high: int, count: int | None) -> int:
     """Check the range of the labels of a view, and return its number of regions."""
     if low < MASKED:
-        raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabeled, -2 masked")
+        raise InputError(
+            f"labels of view {index} contain {low}, expected region ids >= 0, -1 (unlabeled) or -2 (masked)"
+        )
     if count is not None and high >= count:
-        raise InputError(f"labels of view {index} contain region {high}, but num_regions is {count}")
+        raise InputError(f"labels of view {index} contain region {high}, expected ids below num_regions, {count}")
     count = max(high, UNLABELED) + 1 if count is None else count
     if not 0 <= count <= MAX_REGIONS:
         found = f"{short_repr(count)}; number the regions of a view 0, 1, …"
@@ -337,11 +338,13 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
 
 @check_arguments
 class Contributors(NamedTuple):
-    """Gaussians that contribute to P pixels: entries offsets[p] to offsets[p + 1] belong to pixel p, nearest first.
+    """Gaussians that contribute to P pixels.
+
+    Entries offsets[p] to offsets[p + 1] - 1 belong to pixel p, nearest first.
 
     >>> import torch
     >>> result = Contributors(torch.tensor([0, 2, 3]), torch.tensor([4, 7, 4]), torch.tensor([0.5, 0.25, 0.9]))
-    >>> result.gaussian[result.offsets[0] : result.offsets[1]].tolist()  # of the first pixel
+    >>> result.gaussian[result.offsets[0] : result.offsets[1]].tolist()  # for the first pixel
     [4, 7]
     """
 
@@ -349,7 +352,7 @@ class Contributors(NamedTuple):
     gaussian: Int64[Tensor, " m"]
     """Rows of the scene."""
     weight: Float[Tensor, " m"]
-    """Weights A_pj in 0..1; those of a pixel add up to its alpha."""
+    """Weights A_pj in 0..1. The weights of a pixel add up to its alpha."""
 
 
 @check_arguments
@@ -365,14 +368,13 @@ def contributors(
 ) -> Contributors:
     """Return the Gaussians that contribute to pixels, with their compositing weights A_pj (eq. 1 of the paper).
 
-    The weights are exact: each pixel is a region of its own, and its evidence is returned. So the sum of A_pj over the
-    pixels of a region is the region's evidence. The sum over j of A_pj times any value of the Gaussians is the result
-    of `render` in the pixel.
+    The weights are exact, because each pixel is rasterized as a region. The sum of A_pj over the pixels of a region is
+    therefore its evidence. The sum over j of A_pj times the values of the Gaussians is the result of `render`.
 
     Args:
-        scene: N Gaussians; those out of range (`GaussianScene.drawable`) contribute nothing.
+        scene: N Gaussians. Gaussians with invalid parameters (see `GaussianScene.drawable`) do not contribute.
         camera: Camera of the image.
-        pixels: (column, row) from the upper left corner; a pixel may occur twice.
+        pixels: (column, row) from the upper left corner. A pixel may occur several times.
         backend: As in `rasterize_evidence`.
         rasterize_mode: As in `rasterize_evidence`.
         settings: As in `rasterize_evidence`.
@@ -382,7 +384,7 @@ def contributors(
         One list per pixel, in the order of the pixels, on the device of the scene.
 
     Raises:
-        ValueError: If the pixels are not integers or not in the image, or an option is unknown.
+        ValueError: If pixels are not integers or are outside the image, or an option is unknown.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, contributors
@@ -417,32 +419,33 @@ def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
     if len(outside) > 0:
         first = int(outside[0])
         raise InputError(
-            f"pixels[{first}] is {tuple(pixels[first].tolist())}, but the camera has {camera.width} columns and "
-            f"{camera.height} rows, counted from 0"
+            f"pixels[{first}] is {tuple(pixels[first].tolist())}, expected (column, row) in an image of {camera.width} "
+            f"columns and {camera.height} rows, counted from 0"
         )
     return pixels.long()
 
 
-# Compositing weights of Gaussians along a ray, computed in 3D without an image.
+# Compositing weights along a ray, computed in 3D without an image.
 
 
 _MAX_ALPHA, _MIN_ALPHA = 0.999, 1 / 255
-"""Same values as in the rasterizer: alpha is capped, and alpha below one step of a byte is ignored."""
+"""Largest alpha, and smallest alpha that is not ignored, as in the rasterizer."""
 _MIN_SCALE_RATIO = 1e-4
-"""Least ratio of the smallest to the largest standard deviation, so that rays from all sides hit flat Gaussians."""
+"""Smallest ratio of the standard deviations of a Gaussian. Larger ratios are limited, so that rays can hit the edges
+of flat Gaussians."""
 
 
 def ray_weights(
     scene: GaussianScene, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]
 ) -> Float[Tensor, " n"]:
-    """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian for a ray; 0 if the ray misses it.
+    """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian along a ray, or 0 if the ray misses it.
 
-    alpha_j is the opacity times the largest value of the Gaussian along the ray. The distance of this maximum decides
-    the order, nearest first. Nothing is blurred, and the result does not depend on the size of an image.
+    alpha_j is the opacity times the largest value of the Gaussian along the ray. Gaussians are sorted by the distance
+    of this maximum. There is no blur, so the result does not depend on the resolution of an image.
 
     Args:
         scene: N Gaussians.
-        origin: Start of the ray in world units; Gaussians behind it are not hit.
+        origin: Start of the ray in world units. The ray does not hit Gaussians behind it.
         direction: Direction of the ray, of any length > 0.
     """
     out = scene.means.new_zeros(len(scene))
@@ -451,7 +454,7 @@ def ray_weights(
     scales = scales.clamp(min=1e-12).maximum(_MIN_SCALE_RATIO * scales.amax(dim=1, keepdim=True))
     forward = torch.nn.functional.normalize(direction.to(means), dim=0)
     quats = torch.nn.functional.normalize(quats, dim=1)
-    start = to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
+    start = to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along the axes of each Gaussian
     step = to_axes(forward.expand_as(means), quats) / scales
     distance = -(start * step).sum(1) / (step * step).sum(1)
     square = (start + distance[:, None] * step).square().sum(1)
@@ -465,7 +468,7 @@ def ray_weights(
 
 
 def to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
-    """Rotate world vectors into the axes of Gaussians with unit quaternions (w, x, y, z): the inverse rotation."""
+    """Rotate world vectors into the axes of Gaussians with unit quaternions (w, x, y, z)."""
     real, imaginary = quats[:, :1], -quats[:, 1:]
     turn = 2 * torch.linalg.cross(imaginary, vectors)
     return vectors + real * turn + torch.linalg.cross(imaginary, turn)

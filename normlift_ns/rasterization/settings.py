@@ -14,7 +14,7 @@ from normlift_ns.options import GSPLAT_VERSIONS
 @check_arguments
 @dataclass(frozen=True)
 class RasterSettings:
-    """Constants of gsplat's kernels, as splatfacto calls them; the defaults are those of gsplat 1.4.0.
+    """Constants of gsplat's kernels as called by splatfacto, by default those of gsplat 1.4.0.
 
     The gsplat sources are fully_fused_projection_fwd.cu, isect_tiles.cu and rasterize_to_pixels_fwd.cu.
 
@@ -31,30 +31,30 @@ class RasterSettings:
     """
 
     near_plane: float = 0.01
-    """Gaussians with a center nearer than this (world units) are not drawn."""
+    """Smallest depth of the center of a Gaussian that is drawn, in world units."""
     far_plane: float = 1e10
-    """Gaussians with a center farther than this (world units) are not drawn."""
+    """Largest depth of the center of a Gaussian that is drawn, in world units."""
     eps2d: float = 0.3
-    """Added to the diagonal of the projected covariance, in square pixels."""
+    """Blur that is added to the diagonal of the projected covariance, in square pixels."""
     frustum_margin: float = 0.3
     """Margin around the image as a share of half the field of view. The Jacobian is constant outside this margin."""
     min_discriminant: float = 0.01
     """Lower bound of b ** 2 - det in the larger eigenvalue of the projected covariance."""
     min_compensation: float = 0.0
-    """Lower bound of the factor by which antialiasing scales an opacity."""
+    """Lower bound of the factor by which antialiasing scales opacities."""
     per_axis: bool = False
-    """Shape that selects the tiles of a Gaussian. False: a square around its longer axis. True, from gsplat 1.5 on: a
-    rectangle around its extent along each axis of the image, limited to alpha >= `min_alpha`."""
+    """Shape that selects the tiles of a Gaussian. False selects a square with the extent of the longer axis. True, as
+    in gsplat 1.5 and later, selects a rectangle around the pixels in which alpha can reach `min_alpha`."""
     radius_sigmas: float = 3.0
-    """Half side of the square, or greatest half side of the rectangle, in standard deviations."""
+    """Half side of the square, or largest half side of the rectangle, in standard deviations."""
     tile_size: int = 16
-    """Side of a tile in pixels. Gaussians are drawn in whole tiles only, so this changes the result."""
+    """Side of a tile in pixels. Gaussians are drawn only in the tiles that their shape touches."""
     max_alpha: float = 0.999
     """Upper bound of alpha."""
     min_alpha: float = 1 / 255
-    """A pixel skips a Gaussian with a smaller alpha."""
+    """Smallest alpha with which a Gaussian is drawn in a pixel."""
     min_transmittance: float = 1e-4
-    """A pixel stops before the first Gaussian that would leave this or less transmittance."""
+    """Transmittance at which a pixel stops, before the first Gaussian that would reduce it to this value or less."""
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -68,10 +68,10 @@ class RasterSettings:
     @staticmethod
     @check_arguments
     def of_gsplat(version: str) -> RasterSettings:
-        """Return the constants of gsplat 1.4, 1.5 or 1.6; the last is not released yet and may change.
+        """Return the constants of gsplat 1.4, 1.5 or 1.6. Version 1.6 is not released yet and may change.
 
         Args:
-            version: Two or more numbers with dots, such as "1.5" or "1.5.3".
+            version: Version number with at least two parts, such as "1.5" or "1.5.3".
 
         Raises:
             ValueError: If the version is unknown.
@@ -81,7 +81,7 @@ class RasterSettings:
         """
         minor = ".".join(version.split(".")[:2])
         if minor not in GSPLAT_VERSIONS:
-            raise InputError(f"unknown gsplat version {version}, expected one of {', '.join(GSPLAT_VERSIONS)}")
+            raise InputError(f"gsplat version {version} is not supported; choose one of {', '.join(GSPLAT_VERSIONS)}")
         if minor == "1.4":
             return RasterSettings()
         rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)
@@ -90,7 +90,7 @@ class RasterSettings:
     @staticmethod
     @check_arguments
     def recorded(manifest: Mapping[str, Any]) -> RasterSettings:
-        """Return the constants of the `gsplat_rules` in a manifest; without this entry, those of gsplat 1.4.
+        """Return the constants for `gsplat_rules` in a manifest, or those of gsplat 1.4 without this entry.
 
         Raises:
             ValueError: If the recorded version is unknown.

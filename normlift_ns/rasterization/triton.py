@@ -1,4 +1,4 @@
-"""Fast GPU backend with Triton kernels for projection, exact lists of cells, sums and compositing."""
+"""Fast GPU backend, with Triton kernels for projection, cell lists, sums and compositing."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)
-"""Largest width and height in pixels of the cells that have their own lists.
+"""Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians and for more.
 
-With many Gaussians, few pixels of a cell share the same ones, and smaller cells are faster.
+With many Gaussians, smaller cells are faster, because the pixels of a cell have fewer Gaussians in common.
 """
 _MANY = 4_000_000
-"""Number of Gaussians from which on small cells are used."""
+"""Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest number of views in a batch times Gaussians, and of views in a batch.
+"""Largest product of views in a batch and Gaussians, and largest number of views in a batch.
 
-A view takes a byte per Gaussian, and 120 bytes per visible Gaussian.
+A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """
 _SHORT = 2**15
-"""Largest number of cells in a batch that int16 can index, which takes half the time of int32 to sort."""
+"""Largest number of cells in a batch that int16 can index. Sorting int16 takes half the time of int32."""
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not float32 on a GPU, or tiles cannot be divided into cells."""
+    """Raise ValueError if the scene is not float32 on a GPU, or the tile size is not a power of two."""
     size = job.settings.tile_size
     check_gpu("triton", job)
     if size < 1 or size & (size - 1) != 0:
@@ -48,9 +48,9 @@ def project_and_bin(
     """Project the Gaussians into cameras of one size, and list them by cell.
 
     Args:
-        job: Inputs of the call.
+        job: Scene and options.
         cameras: Cameras of one size.
-        cull: See `build_cell_lists`.
+        cull: As in `build_cell_lists`.
     """
     scene, settings = job.scene, job.settings
     rows = [
@@ -69,7 +69,7 @@ def project_and_bin(
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
-    """Return the best number of views of one size in a batch."""
+    """Return the number of views of this camera's size that memory and int16 cell indices allow in a batch."""
     cells = _grid(job, camera).cells
     return max(1, min(_ELEMENTS // max(1, len(job.scene)), (_SHORT - 1) // max(1, cells), _MAX_VIEWS))
 
@@ -81,12 +81,12 @@ def _grid(job: RasterJob, camera: Camera) -> CellGrid:
 
 
 def views_evidence(job: RasterJob, batch: RasterBatch, *, cull: bool = True) -> Entries:
-    """Return the entries of views of one size, rasterized together; bitwise the same on every run.
+    """Return the entries of views of one size, which are bitwise the same on every run.
 
     Args:
-        job: Inputs of the call.
-        batch: Views.
-        cull: See `build_cell_lists`; the entries do not depend on it.
+        job: Scene and options.
+        batch: Views to rasterize together.
+        cull: As in `build_cell_lists`. The entries do not depend on it.
     """
     grid, projected, lists = project_and_bin(job, batch.cameras, cull=cull)
     columns = max(batch.num_regions) + 1

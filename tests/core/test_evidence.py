@@ -103,7 +103,7 @@ def test_columns_and_views_that_do_not_fit_are_refused():
     for change, message in (
         ({"region_view": evidence.region_view[:2]}, r"column .* 0\.\.1"),
         ({"rows": evidence.rows.select_rows(torch.arange(4))}, "one per Gaussian"),
-        ({"rows": replace(evidence.rows, offsets=evidence.rows.offsets[:-1])}, "disagree"),
+        ({"rows": replace(evidence.rows, offsets=evidence.rows.offsets[:-1])}, "rows .*offsets"),
         ({"region_view": evidence.region_view.flip(0)}, "region_view .*non-decreasing"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -50,7 +50,7 @@ def test_scores_equal_their_definition_by_sets(metrics, pairs):
 def test_confusion_works_on_images_and_refuses_unknown_classes(metrics):
     truth = torch.tensor([[0, 1], [1, -1]])
     assert metrics.confusion(truth, truth, 2).tolist() == [[1, 0, 0], [0, 2, 0]]
-    with pytest.raises(ValueError, match=r"predicted holds class 2, expected 0\.\.1"):
+    with pytest.raises(ValueError, match=r"predicted .*class 2, expected 0\.\.1"):
         metrics.confusion(truth, truth + 1, 2)
     assert math.isnan(metrics.class_scores(metrics.confusion(torch.tensor([-1]), torch.tensor([0]), 2)).miou)
 

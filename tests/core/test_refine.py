@@ -217,7 +217,7 @@ def test_what_does_not_fit_is_named():
     with pytest.raises(ValueError, match=r"neighbors.index .*\(60, 5\).*\(60, 36\)"):
         refine(means, u, r, neighbors=nearest_neighbors(means, 5))
     config = RefineConfig(vote="posterior", k=5)
-    for own, told in ((None, "own.*none"), (r[1:], r"n = 60.*\(59,\)")):
+    for own, told in ((None, "own.*None"), (r[1:], r"n = 60.*\(59,\)")):
         with pytest.raises(InputError, match=told):
             refine(means, u, r, config, own=own)
 

@@ -51,7 +51,7 @@ def test_a_vote_refuses_numbers_that_are_none():
         if (vote, name) == ("paper", "own"):  # which it does not read
             assert torch.equal(refine(**given, config=config), expected)
             continue
-        with pytest.raises(ValueError, match=rf"^1 of 40 values of {name} .*{name}\[7\] is "):
+        with pytest.raises(ValueError, match=rf"^1 of 40 values of {name} .*{name}\[7\] = "):
             refine(**given, config=config)
 
 
@@ -77,6 +77,6 @@ def test_a_vote_takes_arrays_of_every_library_and_names_what_is_none(unchecked):
 
 def test_a_vote_of_nobody_says_so():
     for n in (0, 1):
-        with pytest.warns(UserWarning, match=f"with {n} Gaussian"):
+        with pytest.warns(UserWarning, match=f"{n} Gaussian"):
             source = refine(torch.zeros(n, 3), torch.ones(n, 1), torch.ones(n), own=torch.ones(n))
         assert source.tolist() == list(range(n))

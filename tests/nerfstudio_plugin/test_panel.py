@@ -306,8 +306,8 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     ask(panel, "left, left again")
     rows = chosen(pipeline)
     count = int(rows.sum())
-    assert "1 of them are never drawn" in said(panel)
-    assert f"{count} of them are selected by several prompts" in said(panel)
+    assert "1 of the selected Gaussians cannot be drawn" in said(panel)
+    assert f"{count} of the selected Gaussians match several prompts" in said(panel)
     panel.act(Action("Download selection"), client=(browser := Browser()))
     assert f" {count - 1} Gaussians" in said(panel)
     rows[first] = False
@@ -315,7 +315,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     means = np.stack([vertices[axis] for axis in "xyz"], axis=1)
     assert np.array_equal(means, pipeline.model.means.detach()[rows].cpu().numpy())
     faint[:] = -9.0
-    for prompts, message in (("left", "ever drawn"), ("up", "Nothing is selected")):
+    for prompts, message in (("left", "cannot be drawn"), ("up", "Nothing is selected")):
         ask(panel, prompts)
         panel.act(Action("Download selection"), client=browser)
         assert message in said(panel) and len(browser.files) == 1
