@@ -69,7 +69,7 @@ class Inventory:
             ValueError: the inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"number must be that of an object, from 1 to {len(self)}; got {number}")
+            raise InputError(f"There is no object {number}. The inventory has objects 1 to {len(self)}.")
         return self.instance_id == number
 
 

@@ -118,7 +118,7 @@ _NEIGHBORS = 8
 
 @dataclass(frozen=True)
 class SceneObject:
-    """Summary of one object, in scene units. Means are weighted by W_j, the total weight of Gaussian j over all views."""
+    """Summary of one object, in scene units. Means are weighted by W_j, the weight of Gaussian j over all views."""
 
     size: int
     """Number of Gaussians."""
@@ -167,7 +167,7 @@ def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor,
 
 
 def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
-    """Label connected components, with -1 for those that are too small; return the labels and the number of the rest."""
+    """Label connected components, with -1 for those that are too small; return labels and number of components."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
     count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
@@ -688,7 +688,7 @@ def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
 
 
 def _disagreement(norm: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Return the second term of the score without its factor, max(0, log2(median ||f|| / ||f||)); 0 without evidence."""
+    """Return the second term without its factor, max(0, log2(median ||f|| / ||f||)); 0 without evidence."""
     has_evidence = norm > 0
     if not bool(has_evidence.any()):
         return torch.zeros_like(norm)
