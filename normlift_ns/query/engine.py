@@ -113,7 +113,7 @@ class Answer:
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{finding.text!r}: {int(finding.mask.sum()):,}" for finding in self)
-        return f"Answer of {len(self.valid):,} Gaussians, selected {counts}"
+        return f"Answer for {len(self.valid):,} Gaussians; selected: {counts}"
 
     def __getitem__(self, text: str) -> Finding:
         """Return the result for one prompt.

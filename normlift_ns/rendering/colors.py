@@ -1,8 +1,8 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
 Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, so
-that weak matches are less visible. A prompt that contains a color name is drawn in that color. The first of the other
-prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008).
+that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other prompts get colors
+that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors are used up.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def named_color(text: str) -> tuple[float, float, float] | None:
 
 
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
-    """Return a color for each prompt as RGB in 0..1, which is the color that it names or a distinguishable one.
+    """Return a color for each prompt, RGB in 0..1: the color that it names, or else a distinguishable color.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]

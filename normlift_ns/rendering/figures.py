@@ -254,7 +254,7 @@ def _gray(rgb: Tensor) -> Tensor:
 
 
 _PANEL_WIDTH, _THUMBNAIL_WIDTH, _MAX_WIDTH = 640, 420, 4096
-"""Widths in pixels: panel of a figure, panel of a contact sheet, and maximum of a contact sheet."""
+"""Width in pixels of a panel in a figure and of a panel in a contact sheet, and maximum width of a contact sheet."""
 _MAX_SINGLE_ROW = 3
 """Maximum number of panels in a contact sheet with a single row."""
 _MAX_ASPECT = 1.5

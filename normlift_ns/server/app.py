@@ -135,9 +135,11 @@ class Guard:
                 await self._app(scope, _limited(receive), send_with_headers)
         except TimeoutError:
             if not started:
-                await JSONResponse({"error": "The request exceeded the time limit."}, 504, _HEADERS)(
-                    scope, receive, send
-                )
+                await JSONResponse(
+                    {"error": "The request exceeded the time limit. Try fewer prompts or a smaller image."},
+                    504,
+                    _HEADERS,
+                )(scope, receive, send)
         return None
 
 
@@ -311,7 +313,7 @@ class WarmServer:
         try:
             await websocket.accept()
             if self._pages >= MAX_PAGES:
-                return await websocket.close(1013, f"{MAX_PAGES} pages are open, the maximum. Close one of them.")
+                return await websocket.close(1013, f"The limit of {MAX_PAGES} open pages is reached. Close one.")
             self._pages += 1
             try:
                 run = await self.run_of(websocket.path_params["run"])

@@ -83,7 +83,7 @@ class RemoteAnswer:
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{one.text!r}: {one.result.count:,}" for one in self)
-        return f"Answer of {len(self.selected):,} Gaussians, selected {counts}"
+        return f"Answer for {len(self.selected):,} Gaussians; selected: {counts}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +280,8 @@ class RemoteRun:
             matches = [one for one in cameras if view in (one["name"], Path(one["name"]).name, Path(one["name"]).stem)]
         if len(matches) != 1:
             raise InputError(
-                f"view must be the name or index of one of {len(cameras)} training images; {len(matches)} have {view!r}"
+                f"view must be the name or index of one of {len(cameras)} training images; {len(matches)} images match "
+                f"{view!r}"
             )
         found = matches[0]
         pose, K = torch.tensor(found["world_to_camera"]), torch.tensor(found["K"])
@@ -305,7 +306,10 @@ class RemoteRun:
                     status, content = self._exchange(method, path, body)
             except (http.client.HTTPException, OSError) as error:
                 self._close()
-                raise ConnectionError(f"The server at {self.address} does not respond: {error}") from error
+                raise ConnectionError(
+                    f"The server at {self.address} does not respond ({error}). Check the address, or start the server "
+                    "with: ns-normlift-serve"
+                ) from error
         if status != 200:
             raise InputError(f"The server at {self.address} rejected the request: {_reason(content)}")
         return content

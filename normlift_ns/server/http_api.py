@@ -89,7 +89,7 @@ def explain(served: ServedRun, selection: schema.Selection) -> schema.ExplainRes
 
 
 def export(served: ServedRun, request: schema.ExportRequest) -> Content:
-    """Return a file of a selection; of the whole scene if the request selects nothing."""
+    """Return a file of a selection, or of the whole scene if the request selects nothing."""
     state = schema.select_state(served, request)
     whole = request == schema.ExportRequest(format=request.format)
     mask = ~served.space.empty_mask() if whole else state.selection
@@ -193,7 +193,7 @@ ENDPOINTS = (
     Endpoint("objects", "List the objects of a selection with their boxes.", schema.Selection, schema.ObjectsResult,
              objects, slow=False),
     Endpoint("catalog", "List the objects that prompts select, with oriented boxes in scene and capture coordinates, "
-             "and with the images that show them. Takes seconds.", schema.Question, dict[str, Any], catalog),
+             "and with the images that show them. This takes seconds.", schema.Question, dict[str, Any], catalog),
     Endpoint("explain", "Explain a selection by the images that voted for it.", schema.Selection, schema.ExplainResult,
              explain),
     Endpoint("select", "Return the size and position of a selection, or its mask.", schema.SelectRequest,
@@ -204,11 +204,11 @@ ENDPOINTS = (
     Endpoint("save", "Store prompts in the run.", schema.SaveRequest, dict[str, str], save, writes=True),
     Endpoint("floaters", "Find likely floaters, which are Gaussians that are not part of a surface.", None,
              schema.SelectResult, floaters, parameters=("arrays",)),
-    Endpoint("coverage", "Find regions without reliable evidence. Takes seconds.", None, dict[str, Any], coverage_of,
-             parameters=("min_reliability",)),
+    Endpoint("coverage", "Find regions without reliable evidence. This takes seconds.", None, dict[str, Any],
+             coverage_of, parameters=("min_reliability",)),
     Endpoint("features", "Return the unit features [M, D] of the Gaussians start to stop - 1 as a float32 NPY file.",
              None, None, features, parameters=("start", "stop", "refined")),
-    Endpoint("inventory", "List up to 20 main objects of the scene, found without prompts. Takes seconds.", None,
+    Endpoint("inventory", "List up to 20 main objects of the scene, found without prompts. This takes seconds.", None,
              dict[str, Any], inventory),
 )  # fmt: skip
 """Endpoints of `/api/runs/{run}/`."""
@@ -236,7 +236,7 @@ def api_routes(server: Server) -> list[Route]:
     def route(endpoint: Endpoint) -> Route:
         async def handle(request: Request) -> Response:
             if endpoint.writes and not server.may_write(_access(request)):
-                return _json({"error": "Writing needs the access token: Authorization: Bearer TOKEN"}, 403)
+                return _json({"error": "Writing needs the access token in the header Authorization: Bearer TOKEN"}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])
             result = await server.in_thread(lambda: endpoint.work(served, value), slow=endpoint.slow)

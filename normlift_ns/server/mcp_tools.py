@@ -240,7 +240,9 @@ def http_options(server: WarmServer, export_dir: Path | None) -> dict[str, Any]:
             access = dict(scope["headers"]).get(b"authorization", b"").decode("latin-1").removeprefix("Bearer ")
             if server.options.is_local or server.options.knows(access):
                 return await route.app(scope, receive, send)
-            refused = JSONResponse({"error": "MCP needs the access token: Authorization: Bearer TOKEN"}, 401)
+            refused = JSONResponse(
+                {"error": "MCP needs the access token in the header Authorization: Bearer TOKEN"}, 401
+            )
             return await refused(scope, receive, send)
 
     return {"extra_routes": [Route("/mcp", Authorized())], "lifespan": lambda app: mcp.session_manager.run()}

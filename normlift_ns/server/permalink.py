@@ -52,7 +52,7 @@ class PageView(msgspec.Struct, frozen=True):
 
 
 class Link(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A query and a camera."""
+    """Query and camera of a link."""
 
     prompts: str = ""
     clicks: dict[str, Annotated[int, msgspec.Meta(ge=0)]] = {}

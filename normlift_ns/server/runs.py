@@ -118,7 +118,7 @@ class ServedRun:
 
     @cached_property
     def drawn_scene(self) -> GaussianScene:
-        """The drawn Gaussians."""
+        """Scene of the drawn Gaussians."""
         whole, rows = self.run.scene.gaussians, torch.from_numpy(self.rows)
         return GaussianScene(
             *(x.detach().cpu()[rows] for x in (whole.means, whole.quats, whole.scales, whole.opacities))
@@ -291,7 +291,9 @@ class ServedRun:
     def image(self, index: int, max_size: int) -> bytes:
         """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
         if not 0 <= index < len(self.run.scene.train):
-            raise InputError(f"There is no image {index}. The run has {len(self.run.scene.train)} images, from 0.")
+            raise InputError(
+                f"There is no image {index}. The run has {len(self.run.scene.train)} images, numbered from 0."
+            )
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 
     def still(self, codes: Codes, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:

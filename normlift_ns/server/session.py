@@ -343,7 +343,7 @@ class PageSession:
             known = self._run.known(memory.clicks)
             prompts = encode_prompts(line, self._run.read, known)
             rows, query = build_query(self._run.space.field, prompts, self._run.read, **options)
-            self._run.space.answer(query)  # cached for the state
+            self._run.space.answer(query)  # the state gets this answer from the cache
             return lambda state: self._visible(actions.ask(state, rows, query))
 
         await self._start("Searching …", compute, seq)

@@ -31,8 +31,8 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Warning about the prompt, or an empty string. It gives the words that the encoder reads if it ignores others. If
-    the prompt is not found or no Gaussian exceeds the threshold, it gives the verdict and the nearest match."""
+    """Warning about the prompt, or an empty string. The warning lists the words that the encoder uses, if it ignores
+    other words. If the prompt is not found or selects no Gaussian, it describes the nearest match."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
@@ -363,7 +363,7 @@ def add_layer(state: State, name: str) -> State:
     name = clip_text(name, 60)
     layers = tuple(layer for layer in state.layers if layer.name != name)
     if name == "" or len(layers) >= MAX_LAYERS or not bool(state.selection.any()):
-        raise InputError(f"The layer was not saved. It needs a name and a selection, and the limit is {MAX_LAYERS}.")
+        raise InputError(f"A layer needs a name and a selection, and the maximum number of layers is {MAX_LAYERS}.")
     return replace(state, layers=(*layers, Layer(name, state.selection)), action=f"Save layer {name}")
 
 
@@ -388,5 +388,5 @@ def find_layer(state: State, name: str) -> Layer:
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:
-        raise InputError(f"There is no layer {clip_text(name, 60)!r}.")
+        raise InputError(f"There is no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
     return layer

@@ -82,7 +82,7 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
     ):
         with pytest.raises(InputError):
             wrong()
-    with pytest.raises(OSError, match="127.0.0.1:9"):
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
         connect("127.0.0.1:9")
 
 
