@@ -96,11 +96,7 @@ class QuickRun:
 
     @cached_property
     def text_encoder(self) -> LazyTextEncoder:
-        """Text encoder of the run.
-
-        Raises:
-            ValueError, FileNotFoundError: for the reasons of `text_encoder_for`.
-        """
+        """Text encoder of the run; access raises the errors of `text_encoder_for`."""
         return text_encoder_for(self, self.device, text_cache_folder(self.run_dir))
 
     def ask(self, texts: Sequence[str], **rules: Any) -> Answer:

@@ -264,10 +264,7 @@ class RemoteRun:
 
     @check_arguments
     def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
-        """Store the prompts of an answer in the run.
-
-        This needs the access token unless the server listens on localhost only.
-        """
+        """Store the prompts of an answer in the run; needs the access token unless the server is local."""
         return json.loads(self._post("save", {"question": answer.question, "replace": replace}))["stored"]
 
     @check_arguments

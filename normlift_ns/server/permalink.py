@@ -103,8 +103,7 @@ def write_link(link: Link) -> str:
     text = "q=" + base64.urlsafe_b64encode(msgspec.json.encode(link)).decode().rstrip("=")
     if len(text) > MAX_LINK_LENGTH:
         raise InputError(
-            f"The link to these prompts has {len(text):,} characters; the maximum is {MAX_LINK_LENGTH:,}. "
-            "Use fewer or shorter prompts."
+            f"The link has {len(text):,} characters; the maximum is {MAX_LINK_LENGTH:,}. Use fewer or shorter prompts."
         )
     return text
 

@@ -235,9 +235,7 @@ class ServedRun:
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
-                raise InputError(
-                    f"{name}: this scene has no Gaussian {gaussian:,}, so the link is for another scene. Click again."
-                )
+                raise InputError(f"{name}: there is no Gaussian {gaussian:,}. The link is for another scene.")
         rows = self.space.field.directions(torch.tensor(list(clicks.values()), dtype=torch.long)).cpu().numpy()
         return {**self.stored(), **{name: row for name, row in zip(clicks, rows) if np.any(row)}}
 
