@@ -1,1 +1,1 @@
-"""Analysis of a lifted run: objects and their catalog, and explanations of selections."""
+"""Analysis of a lifted run: objects, catalogs, inventories, floaters and explanations of selections."""

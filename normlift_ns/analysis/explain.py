@@ -9,7 +9,7 @@ the unit feature of region s::
     C_inter = ||sum_v S_v|| / sum_v ||S_v||    and norm, C_intra, N_eff, R as in `core.lift`
 
 The disagreement 1 - C_inter is the sum over images of ||S_v|| (1 - a_v) / sum_v ||S_v||. The images that disagree most
-have the largest terms. A Gaussian that copied the direction of a neighbor counts with that neighbor's evidence.
+have the largest terms. If a Gaussian copied the direction of a neighbor, the neighbor's evidence replaces its own.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class RegionVote:
     weight: float
     """E_s, in pixels."""
     share: float
-    """Fraction of the image's weight, in 0..1."""
+    """Fraction of the image's weight in this region, in 0..1."""
     agreement: float
-    """Cosine between the region's feature and the direction of the selection."""
+    """Cosine of the region's feature to the direction of the selection."""
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,19 @@ class ViewVote:
     weight: float
     """W_v, in pixels."""
     share: float
-    """Fraction of the weight of all images, in 0..1."""
+    """Fraction of the weight of all images in this image, in 0..1."""
     agreement: float
     """a_v, in -1..1."""
     disagreement: float
-    """Fraction of the total disagreement, in 0..1; 0 if all images agree."""
+    """Fraction of the total disagreement from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
-    """Regions by descending weight, until at most a tenth of the image's weight is left."""
+    """Regions by descending weight; together they have at least 90 % of the image's weight."""
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Why:
-    """Explanation of a selection: the votes of all images, and how well they agree.
+    """Explanation of a selection: votes of all images and their agreement.
 
     >>> import torch
     >>> from normlift_ns import Evidence
@@ -100,15 +100,15 @@ class Why:
     gaussians: int
     """Number of selected Gaussians."""
     copied: int
-    """Number of those that copied a neighbor's direction, and count with its evidence."""
+    """Number of selected Gaussians that copied the direction of a neighbor."""
     norm: float
     c_intra: float
     c_inter: float
     n_eff: float
     reliability: float
-    """R of the selection, treated as one Gaussian like the four numbers above."""
+    """R of the selection. This and the four numbers above treat the selection as one Gaussian."""
     views: tuple[ViewVote, ...]
-    """Votes by descending weight; images without weight are left out."""
+    """Votes of the images with weight > 0, by descending weight."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
@@ -133,7 +133,7 @@ class Why:
 
     @property
     def sentence(self) -> str:
-        """The words, and the fraction of the selection that copied the direction of a neighbor."""
+        """`words`, with the fraction of the selection that copied the direction of a neighbor."""
         if self.copied == 0:
             return self.words
         return f"{self.words} {self.copied / self.gaussians:.0%} of the selection copied the direction of a neighbor."
@@ -166,18 +166,18 @@ def explain_selection(
     Args:
         features: one unit row per column (region) of the evidence.
         selected: True for the selected Gaussians.
-        source: for each Gaussian, the index of the one whose direction it has, from `refine`; None if all have their
-            own.
+        source: index of the Gaussian from which each Gaussian has its direction, from `refine`; None if all Gaussians
+            have their own.
         beta, unlabeled: as in `lift`.
     Raises:
         ValueError: nothing is selected, or the numbers of Gaussians or regions differ.
     """
     n = evidence.num_gaussians
     if selected.dtype != torch.bool or selected.shape != (n,):
-        raise InputError(f"the selection must be {n:,} booleans, got {selected.dtype} {tuple(selected.shape)}")
+        raise InputError(f"selected must be {n:,} booleans, got {selected.dtype} {tuple(selected.shape)}")
     rows = selected.to(evidence.rows.offsets.device).nonzero().squeeze(1)
     if len(rows) == 0:
-        raise InputError("nothing is selected; select at least one Gaussian")
+        raise InputError("nothing is selected; select one or more Gaussians")
     origin = rows if source is None else source.to(rows.device).long()[rows]
     joined = _summed(evidence, origin)
     lifted = lift(joined, features, beta=beta, unlabeled=unlabeled)
@@ -190,7 +190,7 @@ def explain_selection(
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of some Gaussians as one row; repeated Gaussians count repeatedly."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; count repeated Gaussians repeatedly."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)
@@ -231,14 +231,14 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
 
 
 _LINE_COLOR = (255, 176, 0)
-"""Orange, which contrasts with the dark rim for people with any color vision."""
+"""Orange, which contrasts with the dark rim for all types of color vision."""
 _OUTSIDE_BRIGHTNESS = 0.45
 _SIDE_PER_LINE_WIDTH = 320
-"""Pixels of the longer image side per pixel of line width."""
+"""Ratio of the longer image side to the line width."""
 
 
 def draw_outlines(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "r h w"]) -> UInt8[Tensor, "h w 3"]:
-    """Darken an image outside all regions, and draw an orange line with a dark rim along the inner edge of each region.
+    """Darken an image outside all masks, and draw an orange line with a dark rim along the inner edge of each mask.
 
     >>> image = torch.full((9, 9, 3), 200, dtype=torch.uint8)
     >>> mask = torch.zeros(1, 9, 9, dtype=torch.bool)
@@ -263,57 +263,59 @@ def _eroded(masks: Bool[Tensor, "r h w"], width: int) -> Bool[Tensor, "r h w"]:
     return max_pool2d(outside[:, None], 2 * width + 1, stride=1)[:, 0] == 0
 
 
-# Votes of a lifted run: evidence, features and regions of the images that it was lifted from.
+# Votes of a lifted run: evidence, features and regions of the lifted images.
 #
 # Runs that store evidence contain the votes; other runs read them from the cache next to the run. Images are read only
-# for figures. Regions and features that need a network to compute are read from the cache, too.
+# for figures. Regions and features from networks are also read from the cache.
 
 
 _FEATURE_TOLERANCE = 1e-3
-"""Largest difference between a stored feature and the same feature computed again."""
+"""Maximum difference between a stored feature and the same feature after recomputation."""
 
 
 class VoteImage(NamedTuple):
-    """One image with its vote for a selection."""
+    """Image with its vote for a selection."""
 
     name: str
     """Path of the image, relative to the dataset."""
     vote: ViewVote
     image: UInt8[Tensor, "h w 3"]
-    """The image, at the resolution of the lift, with outlines of the regions that voted."""
+    """Image at the resolution of the lift, with outlines of the regions that voted."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedVotes:
-    """The votes of all images of a lift."""
+    """Votes of all images of a lift."""
 
     scene: Scene
     field: SemanticField
     cache: Path
-    """Folder of cached 2D features and evidence."""
+    """Folder of the cache of 2D features and evidence."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the images in the order of the lift.
 
         Raises:
-            ValueError: the run does not record them, or the dataset no longer has them.
+            ValueError: the run does not record the names, or the dataset no longer has all images.
         """
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(
-                "the run does not record which images were lifted: it is damaged or from an older version; lift again"
+                "the run does not record the names of the lifted images; it is damaged or from an older version. Lift "
+                "again with: ns-normlift"
             )
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
                 f"{len(missing)} of {len(names)} images of the lift, such as {missing[0]}, are no longer in the "
-                "dataset; restore them, give the path of the dataset with --data, or lift again"
+                "dataset. Restore them, give the path of the dataset with --data, or lift again with: ns-normlift"
             )
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
             raise InputError(
-                f"the run lists {len(names)} images, but its evidence is from {store.evidence.num_views}; lift again"
+                f"the run lists {len(names)} images, but its evidence is from {store.evidence.num_views}. Lift again "
+                "with: ns-normlift"
             )
         return tuple(names)
 
@@ -321,9 +323,9 @@ class RecordedVotes:
         """Explain a selection by the votes of the images; see `explain_selection`.
 
         Args:
-            refined: for a Gaussian that copied a neighbor's direction, count that neighbor's evidence.
+            refined: use the evidence of the neighbor for a Gaussian that copied the direction of this neighbor.
         Raises:
-            ValueError: nothing is selected, or the cache no longer holds the votes.
+            ValueError: nothing is selected, or the votes are no longer in the cache.
         """
         evidence, features = self.table
         source = self.field.source if refined else None
@@ -331,18 +333,18 @@ class RecordedVotes:
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
-        """Yield the image of each vote, with outlines of the regions that voted; images are read one at a time.
+        """Read one image after another, and yield it with outlines of the regions that voted.
 
         Raises:
             FileNotFoundError: an image no longer exists.
-            ValueError: an image has changed, or the cache no longer holds its regions. Features passed from Python
-                always raise this error, because no file has their regions.
+            ValueError: an image has changed, or its regions are no longer in the cache. The regions of features passed
+                from Python are never in the cache.
         """
         for vote in votes:
             block, images = self._observe([vote.view])
             self._check_regions(vote.view, block)
             labels, regions = block.labels[0], block.regions[0]
-            cells = [(regions == region.region).any(dim=0) for region in vote.regions]  # of a region, at any level
+            cells = [(regions == region.region).any(dim=0) for region in vote.regions]  # at all levels
             masks = [(labels >= 0) & inside[labels.clamp(min=0).long()] for inside in cells]
             yield VoteImage(self.names[vote.view], vote, draw_outlines(images[0], torch.stack(masks)))
 
@@ -351,7 +353,7 @@ class RecordedVotes:
         """Evidence of all images, and the feature of every region.
 
         Raises:
-            ValueError: the cache no longer holds the votes.
+            ValueError: the votes are no longer in the cache.
         """
         store = self.field.store
         if isinstance(store, StoredEvidence):
@@ -378,13 +380,13 @@ class RecordedVotes:
         )
         if evidence is None:
             raise InputError(
-                f"{self.cache / 'evidence'} no longer holds the evidence of the lift, and the run stores directions "
-                f"only; {REMEDY}. With --storage evidence the run itself keeps the evidence"
+                f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
+                f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
             )
         return evidence
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
-        """Return the labels, regions and features of some lifted images, and these images at the lift's resolution."""
+        """Return labels, regions and features of some lifted images, and the images at the resolution of the lift."""
         index_of = {name: index for index, name in enumerate(self.scene.train.names)}
         indices, images = [index_of[self.names[view]] for view in views], []
 
@@ -396,7 +398,7 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        """The source of the lift; a network might take minutes to compute results that are not cached."""
+        """Feature source of the lift, without networks: their results come from the cache only."""
 
         def is_quick(part: Any) -> bool:
             return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))
@@ -404,9 +406,9 @@ class RecordedVotes:
         return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
 
     def _check_regions(self, view: int, block: evidence_collection.ViewBatch) -> None:
-        """Raise if an image no longer has the regions that voted."""
+        """Raise if the regions of an image have changed since the lift."""
         if not isinstance(self.field.store, StoredEvidence):
-            return  # cached evidence was looked up by the content of the regions
+            return  # the key of cached evidence includes the content of the regions
         expected = self.field.store.features[self.field.store.evidence.columns_of([view])]
         actual = block.features[0]
         changed = expected.shape != actual.shape
@@ -414,8 +416,8 @@ class RecordedVotes:
             changed = float((expected - actual).abs().max()) > _FEATURE_TOLERANCE
         if changed:
             raise InputError(
-                f"{self.names[view]} no longer has the regions that were lifted: the image, its label map or the "
-                "features have changed since; restore them, or lift again"
+                f"{self.names[view]} no longer has the regions of the lift, because the image, its label map or the "
+                "features have changed. Restore them, or lift again with: ns-normlift"
             )
 
     def _option(self, name: str, kind: type, default: Any) -> Any:
@@ -423,5 +425,7 @@ class RecordedVotes:
         options = self.field.manifest.get("options")
         value = options.get(name, default) if isinstance(options, Mapping) else default
         if not isinstance(value, (int, float) if kind is float else kind):
-            raise InputError(f"the run's manifest is damaged: its option {name} is {value!r:.40}; lift again")
+            raise InputError(
+                f"the run's manifest is damaged: its option {name} is {value!r:.40}. Lift the scene again."
+            )
         return value

@@ -1,17 +1,19 @@
-"""The objects of a scene without prompts: parts whose Gaussians share regions in the images that show them.
+"""Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
-Two neighboring Gaussians that both have a region in an image either share it, which counts 1, or count the similarity
-of the two regions, max(0, 1 - (1 - cos) / (3 s)), where s = 1 - median ||f_j|| is the usual disagreement of the views.
-The affinity of two parts is the mean of these counts over all images and all pairs of neighbors across their border::
+Each image in which two neighboring Gaussians have a region gives this pair a count. The count is 1 if both have the
+same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)), with the usual
+disagreement of the views, s = 1 - median ||f_j||. The affinity of two parts is the mean of the counts over all images
+and all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
-where m is the median number of images per pair. A border is a line on a surface, so parts that touch at a few pairs
-only do not join. From every Gaussian on its own, each part joins the part with the largest affinity if that is the
-larger one, while any affinity is at least 0.95, then 0.9, and so on down to 0.5. This is the ultrametric contour map of
-image segmentation (Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of
-regions in place of edge strengths. Borders that segmentation draws at random differ from image to image and vanish;
-those of objects stay.
+Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
+a surface; it keeps parts apart that touch at few pairs only. Initially, every Gaussian is a part. Each part joins the
+part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
+so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
+Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
+borders of a segmentation differ between images, so their affinity is high; borders of objects are the same in all
+images.
 """
 
 from __future__ import annotations
@@ -33,54 +35,53 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import OBJECT_MIN_GAUSSIANS
 
 MAX_OBJECTS = 20
-"""Largest number of objects in an inventory."""
+"""Maximum number of objects in an inventory."""
 MIN_SHARE = 0.001
-"""Smallest share of an object in the evidence of all images."""
+"""Minimum evidence of an object, as a fraction of the evidence of all images."""
 _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
-"""An image shows a Gaussian if its weight there is at least this times its largest weight in any image."""
+"""Minimum weight of a Gaussian in an image that shows it, as a fraction of its largest weight in any image."""
 _MIN_REGION = 0.25
-"""A Gaussian has the region with its largest weight in an image if that is at least this share; every one of several
-levels has its own share."""
+"""Minimum fraction of a Gaussian's weight in an image that its region must have; the weight includes all levels."""
 _SPREADS = 3.0
-"""Disagreement of two regions, in units of the usual one, at which they count 0."""
+"""Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
-"""Affinities at which parts join, from 0.95 to 0.5."""
+"""Minimum affinities of the successive rounds of joining, from 0.95 to 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inventory:
-    """Objects of a scene, those with the most evidence first: large ones, and ones that many images show."""
+    """Main objects of a scene, by descending evidence: large objects and those that many images show are first."""
 
     instance_id: Int32[Tensor, " n"]
-    """Object of every Gaussian, 1 for the first; 0: none."""
+    """Number of the object of every Gaussian, from 1; 0 for Gaussians without an object."""
     catalog: Catalogue
-    """Box, mean R, number of images and best images of every object. The text is its name: the best word of the
-    vocabulary if the verdict on that is "found", else "object 3"."""
+    """Catalog of the objects. The text of an object is the best word of the vocabulary if the verdict on this word is
+    "found", else a number such as "object 3"."""
 
     def __len__(self) -> int:
         return len(self.catalog.objects)
 
     def mask(self, number: int) -> Bool[Tensor, " n"]:
-        """Return the Gaussians of an object.
+        """Return the mask of the Gaussians of an object.
 
         Raises:
-            ValueError: there is no object of this number.
+            ValueError: the inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"object {number} is not in the inventory, which has objects 1 to {len(self)}")
+            raise InputError(f"There is no object {number}. The inventory has objects 1 to {len(self)}.")
         return self.instance_id == number
 
 
 class ViewRegions(NamedTuple):
-    """Gaussians that one image shows, each with its region, a column of the evidence."""
+    """M Gaussians that an image shows, and the region of each, as a column of the evidence."""
 
     gaussian: Int64[Tensor, " m"]
     region: Int64[Tensor, " m"]
 
 
 class _Borders(NamedTuple):
-    """Pairs of parts that touch, with the sum and the number of the counts across their border."""
+    """Pairs of parts that touch, with the sum and the number of counts across their border."""
 
     first: Int64[np.ndarray, " e"]
     second: Int64[np.ndarray, " e"]
@@ -88,7 +89,7 @@ class _Borders(NamedTuple):
     observed: Float64[np.ndarray, " e"]
 
     def joined(self, part: Int64[np.ndarray, " n"]) -> _Borders:
-        """Return the borders between new parts, where part i becomes `part[i]`."""
+        """Return the borders after joining parts; `part[i]` is the new number of part i."""
         first, second = part[self.first], part[self.second]
         keep = first != second
         low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
@@ -103,12 +104,14 @@ def find_inventory(
     means: Float[Tensor, "n 3"],
     spread: float,
 ) -> Int32[Tensor, " n"]:
-    """Number the objects of a scene, 1 for the one with the most evidence; 0: none.
+    """Find the main objects of a scene; return the number of the object of every Gaussian, 0 for none.
 
-    There are at most 20. An object has at least 20 Gaussians, and at least a thousandth of the evidence of all images.
+    There are at most 20 objects, numbered from 1 by descending evidence. Each has at least 20 Gaussians, and at least a
+    thousandth of the evidence of all images.
 
     Args:
         features: one unit row per column (region) of the evidence.
+        means: centers of the Gaussians.
         spread: 1 - median ||f_j||, the usual disagreement of the views about a Gaussian.
     """
     evidence = evidence.to("cpu")
@@ -124,7 +127,7 @@ def find_inventory(
 
 
 def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
-    """Yield the Gaussians that each image shows, with their regions."""
+    """Yield, for each image, the Gaussians that it shows and their regions."""
     rows, groups, view = evidence.rows, evidence.view_group_offsets, evidence.region_view.long()
     weight, column, gaussian = rows.weight.double(), rows.column.long(), rows.row_index()
     total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
@@ -148,7 +151,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between single Gaussians: every Gaussian and its nearest neighbors."""
+    """Return the borders between every Gaussian and its nearest neighbors, with every Gaussian as a part."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -168,7 +171,7 @@ def _neighbor_borders(
 
 
 def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
-    """Return the counts of pairs of regions of one image: 1 for the same region."""
+    """Return the counts of P pairs of regions of one image, 1 if both are the same region."""
     count = torch.ones(len(one), dtype=torch.float64)
     differs = (one != other).nonzero().squeeze(1)
     key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)
@@ -178,7 +181,7 @@ def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> 
 
 
 def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
-    """Join Gaussians to parts; return the part of each, numbered from 0 without gaps."""
+    """Join Gaussians to parts, and return the part of each Gaussian, numbered from 0 without gaps."""
     part, size = np.arange(num_gaussians), np.ones(num_gaussians)
     images = float(np.median(borders.observed)) if len(borders.observed) > 0 else 0.0
     for level in _LEVELS:
@@ -198,10 +201,10 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins: the one with the largest affinity of the chosen borders, if that is larger.
+    """Return the part that each part joins, which is the larger part with the largest affinity, or itself.
 
-    Ties go to the larger part, then to the one with the smaller index. Equally large parts count as larger if their
-    index is smaller.
+    Only the chosen borders count. Ties go to the larger part, then to the part with the smaller index. Of two equally
+    large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
     target = np.concatenate([borders.second[chosen], borders.first[chosen]])
@@ -241,18 +244,18 @@ def best_words(
     by_chance: float,
     count: int,
 ) -> list[int | None]:
-    """Return the best word of every object; None where many words are as likely to be the best by chance.
+    """Return the index of the best name of every object; None if the best name does not stand out from other words.
 
-    Some words are near to everything. So the cosines of each word are standardized over the scene, and then those of
-    each object over the words beyond the names. The best name must exceed the value that `by_chance` of all pairs of
-    an object and a name would exceed if they were normally distributed. If all words are names, the cosines are
-    standardized over these, and the best one must stay the best.
+    Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
+    those of each object over the words that are not names. If these scores were normally distributed, `by_chance` pairs
+    of an object and a name would exceed the limit. The score of the best name must exceed this limit. If all words are
+    names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
-        directions: of the objects, from `mean_directions`.
+        directions: unit directions of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
         vectors: one unit row per word, names first.
-        by_chance: number of pairs that may exceed the limit; inf: no limit, and the best name need not stay the best.
+        by_chance: number of pairs that may exceed the limit by chance; inf: accept every best name.
         count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T

@@ -1,4 +1,4 @@
-"""Objects in a selection: boxes, connected components, instances, the catalog of all objects, and floaters."""
+"""Objects in a selection: boxes, connected components, instances, catalogs of objects, and floaters."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidenc
 from normlift_ns.rasterization.settings import RasterSettings
 
 BOX_QUANTILES = (0.01, 0.99)
-"""Quantiles of the points along each axis that bound a box."""
+"""Quantiles of the points along each axis at the two faces of a box."""
 _FLAT = 1e-14
 """Ratio of the smallest to the largest variance below which points count as flat."""
 _DIRECTIONS = np.array([
@@ -42,7 +42,7 @@ _DIRECTIONS = np.array([
 
 @dataclass(frozen=True, eq=False)
 class OrientedBox:
-    """A box with arbitrary orientation.
+    """Box with arbitrary orientation.
 
     >>> box = oriented_box(np.array([[x, y, z] for x in (0, 8) for y in (0, 4) for z in (0, 2)], float))
     >>> box.size.round(2).tolist(), box.center.round(2).tolist(), abs(box.axes).round(2).tolist()[0]
@@ -53,7 +53,7 @@ class OrientedBox:
     size: Float64[np.ndarray, " 3"]
     """Edge lengths in descending order."""
     axes: Float64[np.ndarray, "3 3"]
-    """Unit vectors along these edges, one per row, as a right-handed system."""
+    """Unit vectors along the edges, one per row, which form a right-handed system."""
 
     @property
     def corners(self) -> Float64[np.ndarray, "8 3"]:
@@ -78,7 +78,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
         ValueError: there are no points, or some are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"a box needs at least one point, all of them finite; got {len(points)} points")
+        raise InputError(f"a box needs one or more points, all finite; got {len(points)} points")
     axes = _axes(points[_central(points)])
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)
     order = np.argsort(low - high, kind="stable")
@@ -90,7 +90,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
-    """Return a mask of the points that are not an outlier along any direction; of all points if that leaves none."""
+    """Return a mask of the points that are not outliers along any direction; True for all if no such point exists."""
     along = points @ _DIRECTIONS.T
     low, high = np.quantile(along, BOX_QUANTILES, axis=0)
     inside = ((along >= low) & (along <= high)).all(axis=1)
@@ -110,7 +110,7 @@ def _axes(points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "3 3"]:
     return principal.T.copy()
 
 
-# Objects: the connected components of a selection, and a summary of each.
+# Objects, which are connected components of a selection, and their summaries.
 
 
 _NEIGHBORS = 8
@@ -118,24 +118,24 @@ _NEIGHBORS = 8
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object, in units of the scene; means are weighted by W_j, the total weight of Gaussian j over all views."""
+    """Summary of one object, in scene units. Means are weighted by W_j, the weight of Gaussian j over all views."""
 
     size: int
     """Number of Gaussians."""
     centroid: list[float]
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the axis-aligned box of the centers."""
+    """Corners "min" and "max" of the axis-aligned bounding box of the centers."""
     mean_reliability: float
 
 
 @dataclass(frozen=True)
 class Objects:
-    """A selection, divided into objects."""
+    """Objects of a selection."""
 
     gaussians: int
     """Number of selected Gaussians."""
     in_smaller_parts: int
-    """Number of those in components that are too small to be listed."""
+    """Number of selected Gaussians in components that are too small to be listed."""
     objects: list[SceneObject]
     """Objects by descending size."""
 
@@ -148,26 +148,26 @@ def find_objects(
     max_gap: float = OBJECT_MAX_GAP,
     min_gaussians: int = OBJECT_MIN_GAUSSIANS,
 ) -> Objects:
-    """Divide a selection into objects, its connected components.
+    """Divide a selection into objects, which are its connected components.
 
     Args:
         max_gap: as in `connected_components`.
-        min_gaussians: components with fewer Gaussians are counted but not listed.
+        min_gaussians: minimum number of Gaussians in an object, >= 1; smaller components are not listed.
     Raises:
-        ValueError: `min_gaussians` is less than 1, or as in `connected_components`.
+        ValueError: `min_gaussians` is less than 1, or `max_gap` is not positive and finite.
     """
     labels, count = _large_components(means, selected, max_gap, min_gaussians)
     return _objects(field, means, selected, labels + 1, range(1, count + 1))
 
 
 def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor, listed: Iterable[int]) -> Objects:
-    """Summarize the objects that are listed, of those that `ids` numbers; 0 is none."""
+    """Summarize the listed objects; `ids` is the number of the object of every Gaussian, 0 for none."""
     small = int((selected & (ids == 0)).sum())
     return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
 def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
-    """Return `connected_components` with -1 for those that are too small, and the number of the others."""
+    """Label connected components, with -1 for those that are too small; return labels and number of components."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
     count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
@@ -188,7 +188,7 @@ def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"
 
 
 def evidence_weights(scalars: Scalars, rows: Bool[Tensor, " n"]) -> Float64[Tensor, " m"]:
-    """Return W_j of some Gaussians as shares of their sum; equal shares if none has evidence."""
+    """Return W_j of the M Gaussians in `rows`, normalized to a sum of 1; equal weights if none has evidence."""
     weight = scalars.weight[rows].double() + 1e-12
     return weight / weight.sum()
 
@@ -196,7 +196,7 @@ def evidence_weights(scalars: Scalars, rows: Bool[Tensor, " n"]) -> Float64[Tens
 def connected_components(
     means: Float[Tensor, "n 3"], selected: Bool[Tensor, " n"], *, max_gap: float = OBJECT_MAX_GAP
 ) -> Int32[Tensor, " n"]:
-    """Label each selected Gaussian with its connected component, 0 for the largest; label the others -1.
+    """Label each selected Gaussian with its connected component, 0 for the largest; label other Gaussians -1.
 
     Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `max_gap`
     times the median spacing. The spacing of a selected Gaussian is its distance to the nearest selected one at a
@@ -232,20 +232,20 @@ def connected_components(
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Class and object of every Gaussian: classes are prompts, objects are connected components of a class."""
+    """Class and object of every Gaussian. Classes are prompts; objects are connected components of a class."""
 
     texts: tuple[str, ...]
     class_id: Int32[Tensor, " n"]
-    """Class, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
+    """Class of each Gaussian, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
     instance_id: Int32[Tensor, " n"]
-    """Object, numbered 1, 2, … over all prompts, by descending size within each prompt. 0 for Gaussians without a class
-    or in a component that is too small.
+    """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. 0 for
+    Gaussians without a class or in a component that is too small.
     """
     classes: tuple[int, ...]
-    """Class of each object; the first entry is for object 1."""
+    """Class of each object, starting with object 1."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the names of all classes and objects by id, as plain Python types."""
+        """Return the names of all classes and objects, by id, as plain Python types."""
         sizes = torch.bincount(self.instance_id.long(), minlength=len(self.classes) + 1).tolist()
         return {
             "none": 0,
@@ -258,7 +258,7 @@ class Instances:
 
 
 def best_prompt(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
-    """Return the index of the selected prompt with the largest relevancy, or -1 if none is selected.
+    """Return the index of the prompt with the largest relevancy among those that select the Gaussian; -1 if none does.
 
     Ties go to the first prompt.
 
@@ -284,9 +284,10 @@ def find_instances(
     A Gaussian that several prompts select belongs to the prompt with the highest relevancy.
 
     Args:
+        texts: prompts.
         max_gap, min_gaussians: as in `find_objects`.
     Raises:
-        ValueError: as in `find_objects`.
+        ValueError: for the reasons of `find_objects`.
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
@@ -317,14 +318,13 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 
 
 MIN_VIEW_SHARE = 0.1
-"""An image shows an object if the object's share of the image is at least this times its largest share of any image."""
+"""Minimum area of an object in an image that shows it, as a fraction of its largest area in any image."""
 MIN_WHOLE_FRACTION = 0.95
-"""An image shows the whole object if the fraction of the object inside its frame is at least this times the largest
-such fraction.
+"""Minimum part of an object inside the frame of an image that shows it whole, as a fraction of the largest such part.
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
-"""Longer side, in pixels, of the renders that rank images by object; more resolution does not change the order."""
+"""Longer side, in pixels, of the renders that rank images by object. A higher resolution does not change the order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,10 +364,10 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class CatalogueObject:
-    """One object; docs/objects.md explains every number."""
+    """One object of a catalog; docs/objects.md explains every number."""
 
     id: int
-    """The instance_id of exports."""
+    """Number of the object, the instance_id of exports."""
     text: str
     class_id: int
     gaussians: int
@@ -376,22 +376,22 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of at most three images, those with the whole object first, then by the share of the image it covers."""
+    """Names of up to three images. Images of the whole object come first, then those in which it covers most pixels."""
     capture: Placement
-    """Position in the coordinates of the capture."""
+    """Position and size in the coordinates of the capture."""
     scene: Placement
-    """Position in the coordinates of the Gaussians, which nerfstudio and exported files use."""
+    """Position and size in the coordinates of the Gaussians, which nerfstudio and exported files use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Objects by prompt, and by descending size within each prompt."""
+    """Catalog of objects, ordered by prompt and by descending size."""
 
     objects: tuple[CatalogueObject, ...]
     num_in_small_components: int
     """Number of selected Gaussians in components that are too small to be listed."""
     meters_per_unit: float | None
-    """Meters per unit of the capture. If it is given, `capture` positions are in meters, otherwise in capture units."""
+    """Meters per unit of the capture; None if unknown. If known, `capture` positions are in meters."""
 
     @property
     def unit(self) -> str:
@@ -412,7 +412,9 @@ def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> Similar
     """Return the transform from the coordinates of the Gaussians of a lifted run to those of the capture.
 
     Args:
-        run_dir, identity: as in `capture_transforms`, which also raises the errors.
+        run_dir, identity: as in `capture_transforms`.
+    Raises:
+        ValueError, FileNotFoundError: for the reasons of `capture_transforms`.
     """
     worlds = capture_transforms(run_dir, identity)
     inverses = (SimilarityTransform.inverse_of(world.transform, world.scale) for world in reversed(worlds))
@@ -428,12 +430,13 @@ def make_catalogue(
     meters_per_unit: float | None = None,
     device: str = "cpu",
 ) -> Catalogue:
-    """Summarize every object in a catalog.
+    """Make a catalog of objects.
 
     Args:
+        instances: objects to list.
         capture: transform from the coordinates of the scene to those of the capture.
         meters_per_unit: length of a capture unit in meters, > 0; None if unknown.
-        device: device that renders the objects, to rank images.
+        device: device for the renders that rank images.
     """
     unit = 1.0 if meters_per_unit is None else meters_per_unit
     to_capture = SimilarityTransform(capture.rotation, unit * capture.scale, unit * capture.shift)
@@ -470,9 +473,9 @@ def make_catalogue(
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
-    """Return the share of each image that each object covers, with occlusion.
+    """Return the fraction of each of V images that each of M objects covers, with occlusion.
 
-    The share is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
+    It is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
     count = len(instances.classes)
     if count == 0:
@@ -506,20 +509,21 @@ def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = Non
 
 
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-"""Corner indices of each face of a box, counterclockwise as seen from outside."""
+"""Corner indices of each face of a box, counterclockwise from outside."""
 _GOLDEN_RATIO = 0.618033988749895
 
 
 def write_catalogue(
     catalog: Catalogue, folder: Path, *, question: Mapping[str, Any] | None = None, overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Write the files of a catalog, all or none, and return their paths.
+    """Write all files of a catalog, or none if an error occurs, and return their paths.
 
     The files are objects.json, objects.csv, objects.ply (boxes in the coordinates of the capture) and
     objects_scene.ply (boxes in the coordinates of the Gaussians). docs/objects.md explains them.
 
     Args:
-        question: the query that found the objects, for objects.json.
+        question: query that found the objects, as JSON types; it is written to objects.json.
+        overwrite: replace existing files.
     Raises:
         FileExistsError: a file exists, and `overwrite` is False.
         OSError: a file cannot be written.
@@ -574,7 +578,7 @@ def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
 
 
 def csv_text(text: str) -> str:
-    """Return a text as a cell that no spreadsheet takes for a formula.
+    """Escape a text for a CSV cell, so that spreadsheets do not interpret it as a formula.
 
     >>> csv_text("=1+1"), csv_text("red mug")
     ("'=1+1", 'red mug')
@@ -583,7 +587,7 @@ def csv_text(text: str) -> str:
 
 
 def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterable[OrientedBox]) -> None:
-    """Write a PLY mesh with eight corners and six faces per box; each corner has the ids and color of its object."""
+    """Write a PLY mesh with eight corners and six faces per box. Each corner has the ids and color of its object."""
     from plyfile import PlyData, PlyElement  # noqa: PLC0415 (--help does not need it)
 
     dtype = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
@@ -601,28 +605,28 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
 
 
 def object_color(number: int) -> tuple[int, int, int]:
-    """Return an RGB color in 0..255 that differs from object to object."""
+    """Return an RGB color in 0..255 for an object; consecutive numbers get different hues."""
     angle = 2 * np.pi * _GOLDEN_RATIO * number
     red, green, blue = (round(150 + 100 * float(np.cos(angle - shift))) for shift in (0, 2.094, 4.189))
     return red, green, blue
 
 
-# Detection of floaters: Gaussians in front of the cameras that belong to no surface, left over from training.
+# Detection of floaters: Gaussians in front of the cameras that remain from training and are not part of a surface.
 #
 # The score of a visible Gaussian j is::
 #
 # log2(d_j / (s_j + s'_j)) + 2 max(0, log2(median ||f|| / ||f_j||)) + (1 - o_j)
 #
-# where d_j is the distance to its 8th nearest visible neighbor, and s_j is its largest standard deviation. s'_j is
-# the median of the largest standard deviations of these 8 neighbors. f_j is its mean feature (equation 3 of the
-# paper), and o_j its opacity.
+# Here, d_j is the distance to its 8th nearest visible neighbor, and s_j is its largest standard deviation. s'_j is the
+# median of the largest standard deviations of these 8 neighbors. f_j is its mean feature (equation 3 of the paper), and
+# o_j is its opacity.
 #
-# * The first term is high if the neighbors are too far away to touch, counted in doublings; Gaussians on a surface
-# overlap their neighbors. * The second term is high if views disagree about Gaussian j more than about the rest of
-# the scene. Views see a floater in front of different objects. The term is 0 without evidence. * The third term is
-# high for transparent Gaussians.
+# * The first term is high if the neighbors are too far away to touch. Gaussians on a surface overlap their neighbors.
+# * The second term is high if the views disagree more about Gaussian j than about the rest of the scene, because a
+#   floater is in front of different objects in different views. The term is 0 without evidence.
+# * The third term is high for transparent Gaussians.
 #
-# docs/honest_answers.md reports detection and false-positive rates, and the variants that did not help.
+# docs/honest_answers.md reports detection rates, false-positive rates and unsuccessful variants.
 
 
 _FLOATER_NEIGHBORS = 8
@@ -647,23 +651,23 @@ class Floaters(NamedTuple):
     """
 
     score: Float[Tensor, " n"]
-    """Higher for more likely floaters; -inf for Gaussians that are never rendered."""
+    """Score, higher for more likely floaters; -inf for Gaussians that the renderer never draws."""
     mask: Bool[Tensor, " n"]
     """True if the score is above the limit."""
 
 
 def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOATER_THRESHOLD) -> Floaters:
-    """Score each Gaussian by how likely it is a floater.
+    """Score the Gaussians of a scene, with a higher score for more likely floaters.
 
     Args:
-        scalars: per-Gaussian numbers from a lift of the scene.
+        scalars: scalars of the Gaussians from a lift of the scene.
         limit: score above which a Gaussian is a likely floater.
     Raises:
         ValueError: the scalars have a different number of Gaussians, or the limit is not finite.
     """
     limit = check_number("floater_threshold", limit)
     if len(scalars.norm) != len(scene):
-        raise InputError(f"the lift has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
+        raise InputError(f"scalars has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
     rows = (scene.drawable & (scene.opacities >= MIN_OPACITY)).nonzero().squeeze(1)
     score = torch.full((len(scene),), -torch.inf, device=scene.means.device)
     if len(rows) > 1:
@@ -674,7 +678,7 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 
 
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
-    """Return the first term, log2(d / (s + s'))."""
+    """Return the first term of the score, log2(d / (s + s'))."""
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)
     size = scene.scales[rows].float().amax(dim=1)
@@ -684,7 +688,7 @@ def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
 
 
 def _disagreement(norm: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Return the second term without its weight, max(0, log2(median ||f|| / ||f||)); 0 without evidence."""
+    """Return the second term without its factor, max(0, log2(median ||f|| / ||f||)); 0 without evidence."""
     has_evidence = norm > 0
     if not bool(has_evidence.any()):
         return torch.zeros_like(norm)

@@ -1,1 +1,1 @@
-"""Queries of a semantic field: prompts, relevancy, thresholds and answers."""
+"""Queries of a semantic field: prompts, relevancies, thresholds and answers."""

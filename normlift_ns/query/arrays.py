@@ -1,4 +1,4 @@
-"""Fast, query-only access to a lifted run: it opens in a second, because it needs neither torch nor nerfstudio.
+"""Fast, query-only access to a lifted run, without torch and nerfstudio. A run opens in about a second.
 
 Cosines equal those of `SemanticField.query` up to rounding of float32 sums (1e-6).
 """
@@ -26,11 +26,11 @@ from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
 _BLOCK_ELEMENTS = 2**21
-"""Number of elements converted to float32 at a time, few enough for a processor's cache."""
+"""Number of elements to convert to float32 at a time, which fits into a processor's cache."""
 
 
 class ArrayField(FieldArrays):
-    """Semantic field of NumPy arrays: `SemanticField` for queries without torch."""
+    """Semantic field as NumPy arrays, for queries without torch; see `SemanticField`."""
 
     @property
     def scalars(self) -> SimpleNamespace:
@@ -38,19 +38,19 @@ class ArrayField(FieldArrays):
         return SimpleNamespace(**{name: self.arrays[name] for name in SCALAR_NAMES})
 
     def valid(self, *, refined: bool = True) -> Bool[np.ndarray, " n"]:
-        """Return a mask of the Gaussians with a direction, as `SemanticField.valid`."""
+        """Return a mask of the Gaussians with a direction, as `SemanticField.valid` does."""
         mask = self.arrays["norm"] > 0
         return mask[self.arrays["source"]] if refined else mask
 
     def null_levels(self, *, refined: bool = True) -> Float[np.ndarray, "n levels"]:
-        """Return the null levels, as `SemanticField.null_levels`."""
+        """Return the null levels, as `SemanticField.null_levels` does."""
         level = self.arrays.get("null_level")
         if level is None:
             return np.zeros((len(self.arrays["norm"]), 0), np.float32)
         return (level[self.arrays["source"]] if refined else level)[:, None]
 
     def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Float32[np.ndarray, "n q"]:
-        """Return the cosines of `SemanticField.query`.
+        """Return the cosine of every Gaussian's direction to Q vectors, as `SemanticField.query` does.
 
         Raises:
             ValueError: the vectors have a different dimension than the field.
@@ -58,8 +58,8 @@ class ArrayField(FieldArrays):
         arrays, dimension = self.arrays, int(self.manifest["dimension"])
         if text_vectors.shape[1] != dimension:
             raise InputError(
-                f"text embeddings must be [Q, {dimension}] like the features of the field, got {text_vectors.shape}; "
-                "use the encoder of these features"
+                f"text embeddings must be [Q, {dimension}] like the features of the field, got {text_vectors.shape}. "
+                "Use the encoder of these features."
             )
         vectors = text_vectors.astype(np.float64)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -83,28 +83,30 @@ class ArrayField(FieldArrays):
 
 @dataclass(frozen=True, eq=False)
 class QuickRun:
-    """The semantic field of a run as NumPy arrays, and its text encoder."""
+    """Semantic field of a run as NumPy arrays, and its text encoder."""
 
     run_dir: Path
-    """The run directory."""
+    """Run directory."""
     field: ArrayField
-    """The field; its arrays include `means`, the centers of the Gaussians."""
+    """Semantic field, whose arrays include `means`, the centers of the Gaussians."""
     manifest: Mapping[str, Any]
-    """The manifest of the field, with the text encoder that the user chose."""
+    """Manifest of the field, with the text encoder that the user chose."""
     device: str = "cpu"
-    """Device of the text encoder's network, if it needs one."""
+    """Device for the network of the text encoder."""
 
     @cached_property
     def text_encoder(self) -> LazyTextEncoder:
-        """The text encoder; raises the errors of `text_encoder_for`."""
+        """Text encoder of the run; access raises the errors of `text_encoder_for`."""
         return text_encoder_for(self, self.device, text_cache_folder(self.run_dir))
 
     def ask(self, texts: Sequence[str], **rules: Any) -> Answer:
-        """Run a query for some prompts. The arrays of the answer are NumPy arrays.
+        """Run a query. The arrays of the answer are NumPy arrays.
 
         Args:
-            texts: the prompts.
-            rules: keyword arguments of `make_query`, which also raises the errors.
+            texts: prompts.
+            rules: keyword arguments of `make_query`.
+        Raises:
+            ValueError: for the reasons of `make_query`.
         """
         question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)
@@ -118,18 +120,18 @@ def open_quick(
     text_embeddings: Path | None = None,
     prompt_template: str | None = None,
 ) -> QuickRun | None:
-    """Open the field of a lifted run; return None if its files alone do not determine the scene.
+    """Open the field of a lifted run; return None if its files do not determine the centers of the Gaussians.
 
-    Runs of version 0.1 do not store Gaussian centers, and other runs may hold a checkpoint that the lift did not write.
-    Such runs need `means`.
+    Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. Such
+    runs need `means`.
 
     Args:
         load_config: path of the run's config.yml.
         means: centers of the Gaussians, from a scene that `open_run` has matched with the field.
-        device: device of the text encoder's network.
+        device: device for the network of the text encoder.
         text_embeddings, prompt_template: as in `open_run`.
     Raises:
-        FileNotFoundError, ValueError: the run has no semantic field, or is damaged.
+        FileNotFoundError, ValueError: the run has no semantic field, or its files are damaged.
     """
     run_dir = Path(os.path.abspath(load_config)).parent
     check_run(run_dir)

@@ -1,6 +1,6 @@
 """Queries of a semantic field: relevancy and selection of every Gaussian for each prompt, with summary numbers.
 
-One implementation serves fields of torch tensors on any device (`SemanticField`), and fields of NumPy arrays for the
+The same code works for fields of torch tensors on any device (`SemanticField`), and for fields of NumPy arrays on the
 command line (`query.arrays.ArrayField`). This module does not need torch.
 """
 
@@ -35,11 +35,11 @@ _CENTRAL = (0.05, 0.95)
 
 
 class QueryField(HasManifest, Protocol):
-    """A semantic field of N Gaussians that queries can run on: see `SemanticField`."""
+    """Interface of a semantic field of N Gaussians for queries; see `SemanticField`."""
 
     @property
     def scalars(self) -> Any:
-        """Scalars per Gaussian, at least `reliability` and `weight`, as in `core.lift.Scalars`."""
+        """Scalars per Gaussian, including `reliability` and `weight` of `core.lift.Scalars`."""
         ...
 
     def valid(self, *, refined: bool = True) -> Any:
@@ -51,7 +51,7 @@ class QueryField(HasManifest, Protocol):
         ...
 
     def null_levels(self, *, refined: bool = True) -> Any:
-        """Return the null level of every Gaussian as one column, or no column."""
+        """Return the null level of every Gaussian as one column; without null levels, return an array of no columns."""
         ...
 
 
@@ -59,7 +59,7 @@ class QueryField(HasManifest, Protocol):
 class Answer:
     """Result of a query with Q prompts. `answer["fox"]` is the result for one prompt; see `Finding`.
 
-    Its arrays are those of the field: torch tensors on its device, or NumPy arrays on the command line.
+    Arrays are torch tensors on the device of the field, or NumPy arrays on the command line.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -77,15 +77,15 @@ class Answer:
     question: Query
     field: SemanticField
     means: Float[Tensor, "n 3"]
-    """Centers of the Gaussians, in units of the scene."""
+    """Centers of the Gaussians, in scene units."""
     relevancy: Float[Tensor, "n q"]
     valid: Bool[Tensor, " n"]
     """True for Gaussians that have a direction."""
     selected: Bool[Tensor, "n q"]
-    """True for Gaussians that are valid, above the threshold and reliable enough; none for a prompt that is
-    probably not in the scene, if the query is gated."""
+    """True for Gaussians that are valid, above the threshold and reliable enough. If the query is gated, False for
+    prompts that are probably not in the scene."""
     verdicts: tuple[Verdict | None, ...]
-    """The verdict on each prompt, whatever it selects."""
+    """Verdict on each prompt, independent of its selection."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -94,12 +94,12 @@ class Answer:
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """Gaussians that any of the prompts selects."""
+        """Mask of the Gaussians that one or more prompts select."""
         return self.selected.any(1)
 
     @property
     def suggested_threshold(self) -> float | None:
-        """One threshold for all prompts, which their relevancies suggest; None if no Gaussian has a direction."""
+        """Suggested threshold for all prompts together; None if no Gaussian has a direction."""
         return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid), suggested_position(self.field))
 
     def __len__(self) -> int:
@@ -113,13 +113,13 @@ class Answer:
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{finding.text!r}: {int(finding.mask.sum()):,}" for finding in self)
-        return f"Answer of {len(self.valid):,} Gaussians, selected {counts}"
+        return f"Answer for {len(self.valid):,} Gaussians; selected: {counts}"
 
     def __getitem__(self, text: str) -> Finding:
         """Return the result for one prompt.
 
         Raises:
-            KeyError: the prompt is not part of the query.
+            KeyError: `text` is not a prompt of the query.
         """
         if text not in self.texts:
             raise KeyError(
@@ -137,7 +137,7 @@ class Answer:
 class Finding:
     """Result of a query for one prompt.
 
-    Positions are in units of the scene, and None if nothing is selected. Means are weighted by W_j, the total weight of
+    Positions are in scene units, and None if no Gaussian is selected. Means are weighted by W_j, the total weight of
     Gaussian j over all views.
 
     >>> import torch
@@ -172,12 +172,12 @@ class Finding:
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """The selected Gaussians."""
+        """Mask of the selected Gaussians."""
         return self.answer.selected[:, self.index]
 
     @property
     def fraction(self) -> float:
-        """Fraction of all Gaussians that is selected, in 0..1."""
+        """Selected fraction of all Gaussians, in 0..1."""
         return self._selection.fraction
 
     @property
@@ -187,7 +187,7 @@ class Finding:
 
     @property
     def extent(self) -> list[float] | None:
-        """Size of the box that holds the central 90 % of the selected centers along each axis."""
+        """Size of the box that contains the central 90 % of the selected centers along each axis."""
         return self._selection.extent
 
     @property
@@ -198,7 +198,7 @@ class Finding:
 
     @cached_property
     def histogram(self) -> Histogram | None:
-        """Histogram of the relevancies, with the threshold; None if no Gaussian has a direction."""
+        """Histogram of the relevancies; None if no Gaussian has a direction."""
         question = self.answer.question
         relevancy, valid = as_numpy(self.relevancy), as_numpy(self.answer.valid)
         return relevancy_histogram(relevancy, valid, question.threshold, suggested_position(self.answer.field))
@@ -210,16 +210,16 @@ class Finding:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """Presence of the prompt in the scene; None if nothing tells whether its cosines are large.
+        """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        A prompt that selects something is at least a weak match.
+        A prompt that selects one or more Gaussians is a weak match or found.
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def read_as(self) -> str | None:
-        """The words of the prompt that count, if the encoder ignores others than articles; None: all count."""
+        """Words of the prompt that the encoder uses; None if it ignores no words except articles."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -227,9 +227,9 @@ class Finding:
 
     @property
     def nearest(self) -> list[float] | None:
-        """Position that is most similar to the prompt, whether selected or not.
+        """Position that is most similar to the prompt, even if no Gaussian is selected there.
 
-        It is the weighted mean of the centers of the one Gaussian in a thousand with the highest relevancy.
+        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy.
         """
         if self.histogram is None:
             return None
@@ -242,7 +242,7 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection (connected components), by descending size."""
+        """Objects of the selection, which are its connected components, by descending size."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
@@ -265,22 +265,22 @@ class Finding:
 class SelectionStats(NamedTuple):
     """Summary numbers of selected Gaussians.
 
-    Positions are in units of the scene, and None if nothing is selected. Means are weighted by W_j, the total weight of
+    Positions are in scene units, and None if no Gaussian is selected. Means are weighted by W_j, the total weight of
     Gaussian j over all views.
     """
 
     fraction: float
-    """Fraction of all Gaussians that is selected, in 0..1."""
+    """Selected fraction of all Gaussians, in 0..1."""
     centroid: list[float] | None
     """Weighted mean of the selected centers, [x, y, z]."""
     extent: list[float] | None
-    """Size of the box that holds the central 90 % of the selected centers along each axis."""
+    """Size of the box that contains the central 90 % of the selected centers along each axis."""
     mean_reliability: float | None
     """Weighted mean of R over the selected Gaussians."""
 
     @staticmethod
     def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:
-        """Summarize a selection, from arrays or tensors of all Gaussians."""
+        """Summarize the Gaussians in `mask`; the arguments are arrays or tensors of all Gaussians."""
         centers, reliability, weight = (as_numpy(x[mask]).astype(np.float64) for x in (means, reliability, weight))
         fraction = len(centers) / len(mask)
         if len(centers) == 0:
@@ -296,10 +296,10 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
 
     Args:
-        means: centers of the Gaussians, as tensor or array like the field.
+        means: centers of the Gaussians, as a tensor or array like those of the field.
     Raises:
-        ValueError: the embeddings have a different dimension than the field, or the rule needs negatives and there are
-            none.
+        ValueError: the embeddings have a different dimension than the field, or the negatives that the rule needs are
+            missing.
     """
     vectors, count = question.embeddings, len(question.embeddings)
     if RELEVANCY_RULES[question.rule].needs_negatives and question.negative_embeddings is not None:
@@ -343,26 +343,26 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 
 # Histogram of the relevancies of one prompt, with a suggested threshold.
 #
-# Let m be the median relevancy of the Gaussians that have a direction, and t their top: the relevancy that one in a
-# thousand exceeds. If more than half of them are at the top, m is the minimum instead, so that a threshold can still
-# separate them.
+# Let m be the median relevancy of the Gaussians that have a direction. Let t be their top, the relevancy that one
+# Gaussian in a thousand exceeds. If more than half of the Gaussians are at the top, m is the minimum instead of the
+# median, so that a threshold can still separate them.
 #
-# The suggested threshold is m + f (t - m), with a fraction f of the encoder. docs/honest_answers.md has its errors, and
-# those of alternatives.
+# The suggested threshold is m + f (t - m), with a fraction f that depends on the encoder. docs/honest_answers.md
+# compares the errors of this threshold and of its alternatives.
 
 
 HISTOGRAM_BINS = 32
 _AT_TOP = 1e-3
-"""The median counts as being at the top if it is closer than this fraction of the range of relevancies."""
+"""Distance from the top, as a fraction of the range of relevancies, below which the median counts as at the top."""
 _EPSILON = 1e-6
-"""Relevancies that differ by less count as equal; if all are equal and positive, the threshold is this far below."""
+"""Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Relevancies of one prompt in bins of equal width, with the threshold within their range.
+    """Histogram of the relevancies of one prompt in bins of equal width, with thresholds.
 
     >>> import numpy as np
     >>> from normlift_ns.query.engine import relevancy_histogram
@@ -373,7 +373,7 @@ class Histogram:
     """
 
     edges: Float[np.ndarray, " bins_plus_1"]
-    """Bin edges; their range includes the threshold and the relevancy of every Gaussian that has a direction."""
+    """Bin edges. Their range includes the threshold and the relevancy of every Gaussian that has a direction."""
     counts: Int64[np.ndarray, " bins"]
     threshold: float
     """Relevancy above which a Gaussian is selected."""
@@ -396,6 +396,7 @@ def relevancy_histogram(
     """Return the histogram of one prompt; None if no Gaussian has a direction.
 
     Args:
+        relevancy: relevancies of all Gaussians.
         valid: True for Gaussians that have a direction.
         threshold: relevancy above which a Gaussian is selected.
         position: as in `suggest_threshold`.
@@ -414,7 +415,7 @@ def relevancy_histogram(
 def draw_histogram(
     counts: Sequence[int] | Int64[np.ndarray, " bins"], low: float, high: float, threshold: float
 ) -> str:
-    """Draw a histogram as one line of text, with one bar per two bins, a logarithmic scale, and | at the threshold.
+    """Draw a histogram as one line of text. Each bar stands for two bins, on a logarithmic scale; | is the threshold.
 
     >>> draw_histogram([500, 0, 50, 0, 0, 0, 0, 5], 0.0, 1.0, 0.5)
     '█▆| ▃'
@@ -427,7 +428,7 @@ def draw_histogram(
 
 
 def suggested_position(field: HasManifest) -> float:
-    """Return the position of suggested thresholds between the median (0) and the top (1), for the field's encoder."""
+    """Return the position of the suggested threshold between median (0) and top (1), for the encoder of the field."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
@@ -438,11 +439,13 @@ def suggest_threshold(
     """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
     Args:
+        relevancy: relevancies of all Gaussians.
+        valid: True for Gaussians that have a direction.
         position: result of `suggested_position`.
 
     >>> suggest_threshold(np.array([[0.0, 0.0], [0.0, 0.1], [0.0, 1.0]]), np.ones(3, bool), 0.6) > 0.5
     True
-    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), 0.5) < 1  # all alike: all are selected
+    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), 0.5) < 1  # equal relevancies are all selected
     True
     """
     values = relevancy[valid].astype(np.float64).ravel()
@@ -453,11 +456,11 @@ def suggest_threshold(
 
 def _suggest(median: float, top: float, position: float) -> float:
     threshold = median + position * (top - median)
-    return min(threshold, top - _EPSILON) if top > 0 else threshold  # if nothing is relevant, select nothing
+    return min(threshold, top - _EPSILON) if top > 0 else threshold  # without relevancy, select nothing
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:
-    """Return the median and the top; the minimum in place of the median if that is at the top."""
+    """Return median and top; if the median is at the top, return the minimum instead of the median."""
     median, top = np.quantile(values, (0.5, TOP_QUANTILE)).tolist()
     least = float(values.min())
     return (least if top - median < _AT_TOP * (top - least) else median), top

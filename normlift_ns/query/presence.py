@@ -1,9 +1,9 @@
-"""Verdict whether a prompt is in the scene. Needs no torch.
+"""Verdicts on the presence of prompts in a scene. This module does not need torch.
 
-Of the best cosine of a prompt, its rank is the share of the null vocabulary whose best cosine is lower. The limits of
-the ranks fix the rate of false answers: one unrelated word in twenty is called found, whatever the encoder. Cosines of
-the color encoder have a meaning of their own, and limits of their own. A field without a null vocabulary, or with one
-of few words, is judged by the lead over the negatives. docs/honest_answers.md has the counts.
+The rank of a prompt is the fraction of the null vocabulary whose best cosine is lower than that of the prompt. The
+limits on the rank fix the rate of false positives: with every encoder, one unrelated word in twenty is "found". The
+color encoder has limits on the cosine instead. Without a null vocabulary of at least 100 words, the verdict depends on
+the relevancy, which compares the prompt with the negatives. docs/honest_answers.md has the counts.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.options import RelevancyRule
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""Found: the best match is what only things in a scene reach. Probably not here: as unrelated words."""
+"""found: the prompt matches better than almost all unrelated words. probably not here: it matches no better than many
+of them."""
 _FOUND_RANK, _WEAK_RANK = 0.95, 0.8
-"""Shares of the null vocabulary that a prompt must outrank."""
+"""Minimum ranks of a prompt for the verdicts "found" and "weak match"."""
 _FEWEST = 100
-"""Number of null words below which a rank says nothing."""
+"""Minimum number of null words for a meaningful rank."""
 
 
 def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
-    """Return the share of the null vocabulary that a prompt outranks, in 0..1; None if the field has too few words."""
+    """Return the fraction of null words with a lower best cosine, in 0..1; None if the field has too few null words."""
     tops = (manifest.get("null_words") or {}).get("tops", ())
     return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST else None
 
@@ -33,11 +34,14 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
 def judge(
     manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
 ) -> Verdict | None:
-    """Return the verdict on a prompt; None if nothing tells whether its cosines are large.
+    """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
 
     Args:
-        manifest, encoder: of the field.
-        top_cosine: cosine that one Gaussian in a thousand exceeds; top: the same of the relevancy.
+        manifest: manifest of the field.
+        encoder: name of the encoder of the field.
+        rule: relevancy rule of the query.
+        top_cosine: cosine that one Gaussian in a thousand exceeds.
+        top: relevancy that one Gaussian in a thousand exceeds.
     """
     kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
     if kind is not None and kind.present_from is not None:

@@ -31,13 +31,13 @@ def as_numpy(array: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A query: Q prompts, their embeddings, and how they select Gaussians. Embeddings may be passed as tensors."""
+    """Query with Q prompts, their embeddings and the settings that select Gaussians. Embeddings may be tensors."""
 
     texts: tuple[str, ...]
     embeddings: Float[np.ndarray, "q d"]
-    """One embedding per prompt, of any norm > 0."""
+    """One embedding per prompt, with any norm > 0."""
     negatives: tuple[str, ...] = ()
-    """Negative prompts, for rules that compare with them."""
+    """Negative prompts, for rules that need them."""
     negative_embeddings: Float[np.ndarray, "b d"] | None = None
     rule: RelevancyRule = "cosine"
     threshold: float = 0.5
@@ -47,13 +47,11 @@ class Query:
     refined: bool = True
     """Use refined features."""
     encoder: str | None = None
-    """Digest of the encoder of the embeddings, see `encoder_digest`; None if unknown."""
+    """Digest of the encoder that computed the embeddings, from `encoder_digest`; None if unknown."""
     suggest_threshold: bool = False
-    """Replace the threshold with the one that the histogram of all relevancies suggests, when the query runs. The query
-    stored in the result has that threshold.
-    """
+    """Use the threshold that the histogram of all relevancies suggests. The query in the answer has this threshold."""
     gated: bool = False
-    """Select nothing for a prompt that is probably not in the scene, unless a threshold was given."""
+    """Select no Gaussian for a prompt that is probably not in the scene."""
 
     def __post_init__(self) -> None:
         for name in ("embeddings", "negative_embeddings"):
@@ -62,7 +60,7 @@ class Query:
                 object.__setattr__(self, name, as_numpy(value))
 
     def settings(self) -> dict[str, Any]:
-        """Return how Gaussians are selected, by the names in the JSON files of commands."""
+        """Return the settings that select Gaussians, with their names in JSON files."""
         return {"relevancy": self.rule, "threshold": self.threshold, "min_reliability": self.min_reliability}
 
 
@@ -81,13 +79,15 @@ def make_query(
     """Encode prompts as a query for a field.
 
     Args:
-        encode: encodes prompts as one embedding each, with an encoder that fits the field.
-        texts: the prompts.
+        field: field to query.
+        encode: function from texts to one embedding each, of an encoder that fits the field.
+        texts: prompts.
         negatives: negative prompts (default: those of the encoder, see `default_rule`).
-        relevancy: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
-        threshold: "auto" is the threshold that the histogram suggests. None is the threshold of the encoder for its own
-            rule, and otherwise that of `RELEVANCY_RULES`. For the rule cosine with an encoder of another rule, None is
-            "auto", because no threshold suits all encoders.
+        relevancy: relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
+            empty, and lerf otherwise.
+        threshold: relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
+            None is the threshold of the encoder for its own rule, and otherwise that of `RELEVANCY_RULES`. For the rule
+            cosine with an encoder of another rule, None is "auto", because no threshold suits all encoders.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:
@@ -135,7 +135,7 @@ def _resolve_negatives(
     if negatives is None:
         return tuple(default.negatives or needed)
     if needed and len(negatives) == 0:
-        raise InputError(f"relevancy {relevancy} compares with negatives, and negatives is empty; name some")
+        raise InputError(f"relevancy {relevancy} needs negatives, but negatives is empty. Give at least one negative.")
     return tuple(negatives)
 
 
@@ -144,7 +144,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
         raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
     if isinstance(negatives, str):
         raise InputError(
-            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
+            f"negatives must be a list of strings, got the single string {negatives!r}. Write [{negatives!r}]."
         )
     if relevancy not in ("auto", *RELEVANCY_RULES):
         raise InputError(f"relevancy must be auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
@@ -152,13 +152,13 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
         raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
 
-# Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.
+# Storage of a query in a run.
 #
-# Stock nerfstudio renders a run with a stored query without a text encoder.
+# nerfstudio's own commands can render a stored query without a text encoder.
 
 
 QUERIES_FILE = "queries.safetensors"
-"""File in the folder of the field, with embeddings as tensors and everything else as JSON in its metadata."""
+"""Name of the file in the folder of the field. It has the embeddings as tensors, and all else as JSON metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
@@ -166,7 +166,7 @@ NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
 
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "form"}):
-    """The JSON in the file's metadata: a `Query` without its embeddings."""
+    """JSON in the metadata of the file, a `Query` without its embeddings."""
 
     texts: Annotated[tuple[NonBlankText, ...], msgspec.Meta(min_length=1)]
     negatives: tuple[NonBlankText, ...]
@@ -179,21 +179,22 @@ class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "for
 
 
 def save_query(folder: Path, question: Query) -> Path:
-    """Write queries.safetensors next to the field, replacing an earlier one, and return its path.
+    """Write queries.safetensors to the folder of a field, replacing an existing file, and return its path.
 
     Raises:
-        ValueError: `load_query` would raise an error for this query.
+        ValueError: the query is not valid, or does not match the field.
         FileNotFoundError: the folder no longer exists.
         OSError: the file cannot be written.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"{folder} no longer exists, so nothing was stored: the run was moved or deleted while it was open. "
-            "Open it again at its new path"
+            f"{folder} no longer exists, so the query was not stored. The run was moved or deleted while it was open. "
+            "Open the run again at its new path."
         )
     if question.suggest_threshold:
         raise InputError(
-            'the query cannot be stored: its threshold is "auto"; run the query, and store that of its answer'
+            'The query cannot be stored because its threshold is "auto". Run the query, and store the query of its '
+            "answer."
         )
     metadata = _Metadata(**{name: getattr(question, name) for name in _Metadata.__struct_fields__})
     rows = zip(_VECTORS, (question.embeddings, question.negative_embeddings))
@@ -202,16 +203,16 @@ def save_query(folder: Path, question: Query) -> Path:
         encoded = msgspec.json.encode(metadata).decode()
         _decode(folder, encoded, arrays)
     except (ValueError, TypeError) as error:
-        raise InputError(f"the query cannot be stored: {error}") from error
+        raise InputError(f"The query cannot be stored: {error}") from error
     save_arrays(folder / QUERIES_FILE, arrays, {_METADATA_KEY: encoded}, overwrite=True)
     return folder / QUERIES_FILE
 
 
 def load_query(folder: Path) -> Query | None:
-    """Load the query stored in the folder of a field; return None if there is none.
+    """Load the query stored in the folder of a field; return None if there is no stored query.
 
     Raises:
-        ValueError: the file is damaged, or does not hold a query.
+        ValueError: the file is damaged, or does not contain a query.
     """
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
@@ -238,14 +239,14 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     if not math.isfinite(metadata.threshold):
         raise InputError(f"the threshold is {metadata.threshold}, expected a finite number")
     if not {"vectors"} <= set(arrays) <= set(_VECTORS):
-        raise InputError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
+        raise InputError(f"it contains {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
     negative = arrays.get("negative_vectors")
     if (negative is None) != (len(metadata.negatives) == 0):
         raise InputError(
             f"it has {len(metadata.negatives)} negatives, but {'no' if negative is None else 'also'} negative_vectors"
         )
     if RELEVANCY_RULES[metadata.rule].needs_negatives and negative is None:
-        raise InputError(f"rule {metadata.rule!r} needs negatives, but it has none")
+        raise InputError(f"the rule {metadata.rule!r} needs negatives, but the file has none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
     _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
     if negative is not None:
@@ -261,11 +262,11 @@ def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:
     size, field_encoder = question.embeddings.shape[1], encoder_digest(manifest)
     if size != manifest["dimension"]:
         raise InputError(
-            f"its vectors have {size} dimensions, but the features of the run have {manifest['dimension']}"
+            f"the vectors have {size} dimensions, but the features of the run have {manifest['dimension']}"
         )
     if question.encoder is not None and field_encoder is not None and question.encoder != field_encoder:
         raise InputError(
-            f"its prompts were encoded by another encoder ({question.encoder}) than that of the run ({field_encoder})"
+            f"the prompts are from another encoder ({question.encoder}) than the features of the run ({field_encoder})"
         )
 
 

@@ -1,16 +1,16 @@
-"""Lifting of SAM 3 masks: each prompt is one region per view, against the rest of the image.
+"""Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
-A Gaussian's relevancy for a prompt is the fraction of its weight inside the masks of the voting views,
+The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views,
 sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
 
-Voting views are chosen in two rounds, because such masks fail for whole views, by missing an object or by confusing it
-with another. In the first round, the views in which the prompt was found vote. In the second round, a view votes if its
-mask agrees with the Gaussians that the first round selected: their weighted intersection over union exceeds one half.
-If this leaves no view in which the prompt was found, the first round counts.
+Masks can be wrong for a whole view, which misses an object or confuses it with another. Two rounds therefore determine
+the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second round, a view votes
+if the weighted intersection over union of its mask and the Gaussians selected in the first round exceeds one half. If
+none of these views has the prompt, the result is that of the first round.
 
 A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
 eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
-two regions per view, "in" and "out", with the features (1, 0) and (0, 1).
+two regions per view, inside and outside, with the features (1, 0) and (0, 1).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_MASK_FRACTION = 0.5
-"""Relevancy above which a Gaussian is selected: more of its weight is inside the masks than outside."""
+"""Fraction of its weight inside the masks above which a Gaussian is selected."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,20 @@ class MaskResult:
     """Result of lifting the masks of one prompt."""
 
     relevancy: Float[Tensor, " n"]
-    """Fraction of each Gaussian's weight inside the masks, in 0..1; 0 for Gaussians that no voting view sees."""
+    """Fraction of each Gaussian's weight inside the masks, in 0..1; 0 for Gaussians without weight in voting views."""
     scalars: Scalars
-    """Numbers of the lift with two regions per view: c_inter is the agreement of the voting views, reliability is R."""
+    """Scalars of the lift with two regions per view. c_inter is the agreement of the voting views."""
     voting_views: Bool[Tensor, " v"]
-    """Views in which the prompt was found and that vote."""
+    """Mask of the voting views in which SAM 3 found the prompt."""
 
     @property
     def is_visible(self) -> Bool[Tensor, " n"]:
-        """Gaussians that have weight in at least one view."""
+        """Mask of the Gaussians that have weight in one or more views."""
         return self.scalars.weight > 0
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """Gaussians with more than half of their weight inside the masks."""
+        """Mask of the Gaussians with more than half of their weight inside the masks."""
         return self.relevancy > MIN_MASK_FRACTION
 
 
@@ -78,9 +78,9 @@ class MaskEvidence:
     """
 
     evidence: Evidence
-    """Evidence whose regions are the cells into which all masks of a view together partition it."""
+    """Evidence of cells; the masks of all prompts together partition each view into these cells."""
     inside: Bool[Tensor, "q s"]
-    """True for the cells inside the masks of each prompt."""
+    """True for the cells inside the mask of each prompt."""
 
     def answer(self, text: int) -> MaskResult:
         """Lift the masks of the prompt with this index."""
@@ -119,19 +119,19 @@ def mask_evidence(
     valid_pixels: Sequence[Bool[Tensor, "h w"] | None] | None = None,
     **options: Any,
 ) -> MaskEvidence:
-    """Rasterize the evidence of the masks of Q prompts, once for all prompts.
+    """Rasterize the evidence of the masks of Q prompts; each view is rasterized once for all prompts.
 
     Args:
-        cameras: one per view.
-        masks: for each view, one mask per prompt; empty if the prompt was not found.
-        valid_pixels: for each view, the pixels to use; None for all.
-        options: rasterize_mode and settings of `rasterize_evidence`.
+        cameras: one camera per view.
+        masks: one mask per view and prompt; empty if the prompt was not found.
+        valid_pixels: mask of the pixels to use in each view; None for all pixels.
+        options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
         ValueError: there are no views, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"expected masks for at least one camera, one set per camera; got {len(masks)} sets for {len(cameras)} "
+            f"masks must have one set per camera, for one or more cameras; got {len(masks)} sets for {len(cameras)} "
             "cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []
@@ -140,7 +140,7 @@ def mask_evidence(
         if view_masks.shape != (len(masks[0]), camera.height, camera.width) or len(view_masks) == 0:
             raise InputError(
                 f"masks of view {index} have shape {tuple(view_masks.shape)}, expected [{max(1, len(masks[0]))}, "
-                f"{camera.height}, {camera.width}]: one per prompt, of the size of the camera"
+                f"{camera.height}, {camera.width}], one mask per prompt with the size of the camera"
             )
         cells, cell_values = joint_partition(view_masks.int())
         pixels = None if valid_pixels is None else valid_pixels[index]
@@ -159,12 +159,12 @@ class SegmentationResult(NamedTuple):
     views: list[str]
     """Names of the images that SAM 3 segmented."""
     found: Bool[Tensor, "q v"]
-    """True if SAM 3 found the prompt in the image."""
+    """True for images in which SAM 3 found the prompt."""
     min_reliability: float = 0.0
     """Minimum R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Return the Gaussians with more than half of their weight inside the masks and enough reliability."""
+        """Return the mask of reliable enough Gaussians with more than half of their weight inside the masks."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 
@@ -173,7 +173,7 @@ class SegmentationResult(NamedTuple):
 
         Args:
             means: centers of the Gaussians.
-            selected: selection of each prompt by another query, to compare with.
+            selected: selections of another query with the same prompts, for comparison.
         """
         return [self._row(text, means, selected[:, text]) for text in range(len(self.answers))]
 
@@ -212,12 +212,12 @@ def query_sam3(
     """Segment evenly spaced training views with SAM 3, and lift the masks.
 
     Args:
-        find_masks: returns SAM 3's mask of each prompt in an image.
-        texts: the prompts.
+        find_masks: function that returns SAM 3's mask of each prompt in an image.
+        texts: prompts.
         views: maximum number of views.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         settings: constants of the rasterizer.
-        device: device to rasterize on.
+        device: device of the rasterizer.
     Raises:
         FileNotFoundError: an image does not exist.
         ValueError: an image is damaged, or a prompt is too long.

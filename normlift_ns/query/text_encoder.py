@@ -1,4 +1,4 @@
-"""Text encoders for a lifted run, chosen by its manifest.
+"""Text encoders for a lifted run, determined by its manifest.
 
 This module needs torch only to encode prompts that are not in the cache.
 """
@@ -25,16 +25,15 @@ from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that determine the encoder or the text embeddings of a field; its manifest records them by their
-names in version 0.2."""
+"""Options that determine the encoder or the text embeddings of a field. The manifest has their names of version 0.2."""
 PRECOMPUTED = "given"
-"""Value in the manifest instead of an encoder name, for features provided by the user."""
+"""Encoder name in the manifest for features provided by the user."""
 _CHOSEN = "texts_chosen"
-"""Key in the manifest of an opened run if the user chose a file of text embeddings that replaces those of the lift."""
+"""Key in the manifest of an open run if the user replaced the text embeddings of the lift with another file."""
 
 
 class DefaultRule(NamedTuple):
-    """Default relevancy rule of an encoder, with negatives and threshold; "auto" is the suggested threshold."""
+    """Default relevancy rule of an encoder, with negatives and threshold. The threshold "auto" is the suggested one."""
 
     rule: RelevancyRule
     negatives: tuple[str, ...]
@@ -46,11 +45,11 @@ _CONTRAST = DefaultRule("contrast", (), 0.5)
 
 
 class HasManifest(Protocol):
-    """A semantic field, as tensors or NumPy arrays."""
+    """Interface of a semantic field, of tensors or NumPy arrays, that has a manifest."""
 
     @property
     def manifest(self) -> Mapping[str, Any]:
-        """The metadata of the field."""
+        """Metadata of the field."""
         ...
 
 
@@ -58,7 +57,7 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
-    """Return the settings that `text_encoder_for` needs, as JSON types, with absolute paths."""
+    """Return the settings for `text_encoder_for` as JSON types, with absolute paths."""
     options = with_encoder(options)
     stored = names_of_0_2(options)
     settings = {key: stored[key] for key in ENCODER_KEYS} | absolute_paths(options)
@@ -67,7 +66,7 @@ def encoder_settings(options: SourceOptions) -> dict[str, Any]:
 
 
 def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
-    """Return the settings that `text_encoder_for` needs for features provided by the user.
+    """Return the settings for `text_encoder_for`, for features provided by the user.
 
     Args:
         text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
@@ -77,7 +76,7 @@ def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
 
 
 def with_text_source(field: FieldT, *, text_embeddings: Path | None = None, template: str | None = None) -> FieldT:
-    """Return the field with a different source of text embeddings.
+    """Return a copy of the field with another source of text embeddings.
 
     Args:
         text_embeddings: file of text embeddings (default: that of the lift).
@@ -98,9 +97,9 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
 
     Args:
         device: device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
-        cache: folder that caches embeddings computed by a network.
+        cache: folder for a cache of embeddings; None: no cache.
     Raises:
-        ValueError: the manifest names no known encoder, or the weights or text embeddings are not those of the lift.
+        ValueError: the encoder is unknown, or its weights or the text embeddings are not those of the lift.
         FileNotFoundError: the weights or text embeddings no longer exist.
     """
     options = _options(field)
@@ -111,16 +110,16 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
                 f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
-                f"{field.manifest['dimension']}; give a file of text vectors from the encoder of these features "
-                "(--text-embeddings)"
+                f"{field.manifest['dimension']}. Give a file of text vectors from the encoder of these features with "
+                "--text-embeddings."
             )
         return vectors
     try:
         kind = encoder_kind(options.encoder)
     except InputError as error:
         raise InputError(
-            f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
-            "a file of text vectors from that encoder (--text-embeddings)"
+            f"The encoder of this run is not available: {error}. Install its package, or give a file of text vectors "
+            "from that encoder with --text-embeddings."
         ) from None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
@@ -131,7 +130,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
 def _cached_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Return a cached text encoder, which loads the network for new prompts and checks that it is that of the lift."""
+    """Return a cached text encoder, which loads the network for new prompts and compares it with that of the lift."""
 
     def network() -> Any:
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (needs torch)
@@ -139,9 +138,9 @@ def _cached_texts(
         encoder = make_encoder(options, choose_device(device))
         if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):
             raise InputError(
-                f"the encoder {options.encoder} is not the one that the run was lifted with, so results would differ: "
-                f"it is {encoder.identity}, expected {dict(recorded)}. Restore its files; or give a file of text "
-                "vectors from the same network with --text-embeddings; or lift again with: ns-normlift"
+                f"The encoder {options.encoder} is not the encoder of the lift, so results would differ. It is "
+                f"{encoder.identity}, expected {dict(recorded)}. Restore its files, give a file of text vectors from "
+                "the same network with --text-embeddings, or lift again with: ns-normlift"
             )
         return encoder
 
@@ -153,13 +152,13 @@ def _cached_texts(
 
 
 def _identity(features: object) -> Mapping[str, Any]:
-    """Return the identity of the encoder that a manifest records with its features; an empty dict if there is none."""
+    """Return the identity of the encoder from the features in a manifest; {} if it is not recorded."""
     identity = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
     return identity if isinstance(identity, Mapping) else {}
 
 
 def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
-    """Return a digest that identifies the encoder of a field; None if the manifest does not record the encoder."""
+    """Return a digest that identifies the encoder of a field; None if its manifest does not record the encoder."""
     features = manifest.get("features")
     if not isinstance(features, Mapping) or len(features) == 0:
         return None
@@ -167,9 +166,9 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 
 
 def _check_vectors(path: Path, expected: object) -> None:
-    """Raise if the content of a file of text embeddings has changed since the lift; this reads the whole file."""
+    """Read a whole file of text embeddings, and raise if its content has changed since the lift."""
     remedy = (
-        "restore the file; or give a file of text vectors from the same network with --text-embeddings; or lift again "
+        "restore the file, give a file of text vectors from the same network with --text-embeddings, or lift again "
         "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
@@ -178,20 +177,20 @@ def _check_vectors(path: Path, expected: object) -> None:
         raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
     if isinstance(expected, str) and (actual := TextEmbeddingFile(path).identity["content"]) != expected:
         raise InputError(
-            f"{path} is not the file that the run was lifted with, so results would differ: its content is {actual}, "
-            f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+            f"{path} is not the file that the lift used, so results would differ. Its content is {actual}, expected "
+            f"{expected}. {remedy[0].upper()}{remedy[1:]}"
         )
 
 
 def _options(field: HasManifest) -> SourceOptions:
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping) or set(stored) != set(ENCODER_KEYS):
-        raise InputError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
+        raise InputError(f"the field's manifest has no valid encoder (found {stored!r}). Lift again with: ns-normlift")
     vectors = stored["text_vectors"]
     if stored["encoder"] == PRECOMPUTED and vectors is None:
         raise InputError(
-            "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
-            "(--text-embeddings), or lift again with texts"
+            "This run was lifted from your own features without text embeddings. Give a file of texts and their "
+            "vectors with --text-embeddings, or lift again with text embeddings."
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
     return SourceOptions.stored({**stored, **placeholder})
@@ -205,7 +204,7 @@ def encoder_name(field: HasManifest) -> str | None:
 
 
 def own_words(field: HasManifest) -> tuple[str, ...]:
-    """Return the words that an inventory names objects by: those of the encoder, or of the file of text embeddings.
+    """Return the words of the encoder's vocabulary or of the file of text embeddings, without default negatives.
 
     Raises:
         ValueError, FileNotFoundError: the file is damaged or does not exist.
@@ -219,10 +218,10 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 
 
 def default_rule(field: HasManifest) -> DefaultRule:
-    """Return the default rule, negatives and threshold of a field's encoder.
+    """Return the default rule, negatives and threshold of queries of a field.
 
-    With a null level it is rule contrast. For an unknown encoder, or a file of text embeddings without the default
-    negatives, the rule is plain cosine.
+    The rule is contrast for a field with a null level. Without it, the rule is cosine for an unknown encoder or a file
+    of text embeddings without the default negatives, and otherwise that of the encoder.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

@@ -1,1 +1,1 @@
-"""Colors, legends and figures of answers."""
+"""Colors, legends and figures of query results."""

@@ -1,8 +1,8 @@
-"""Colors of query results and the legend, the same in every viewer and figure.
+"""Colors and legends of query results, the same in every viewer and figure.
 
-Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, which
-keeps weak matches unobtrusive. A prompt that names a color is drawn in that color. The other prompts get colors that
-are distinguishable with any color vision (Okabe and Ito, 2008), as long as there are enough of these.
+Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, so
+that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other prompts get colors
+that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors are used up.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from normlift_ns.errors import escape_unprintable, truncate_text
 
 Colormap = Literal["viridis", "cividis", "inferno", "magma", "turbo"]
 COLORMAPS: tuple[Colormap, ...] = get_args(Colormap)
-"""Available colormaps, the default first. turbo is offered because it is well known; it is neither perceptually uniform
-nor readable with color blindness.
+"""Available colormaps, the default first. turbo is well known, but neither perceptually uniform nor readable with color
+blindness.
 """
 RELIABILITY_COLORMAP: Colormap = "cividis"
 """Colormap of R, always over the range 0 to 1."""
 MIN_OVERLAY_OPACITY, MAX_OVERLAY_OPACITY = 0.35, 0.9
-"""Opacity over the scene at the lowest and at the highest selected relevancy."""
+"""Opacity over the scene at the lowest and the highest selected relevancy."""
 _OKABE_ITO = ("e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7")
 _MIN_SATURATION = 0.3
-"""Prompts that name a less saturated color are not drawn in it: gray is the color of everything not selected."""
+"""Minimum saturation of a named color for use as the prompt's color, because unselected Gaussians are gray."""
 _MIN_DISTANCE = 0.25
-"""Distance in RGB at which two colors are distinguishable."""
+"""Minimum distance in RGB between two distinguishable colors."""
 
 
 def colormap_rgb(colormap: Colormap) -> Float[Tensor, "256 3"]:
-    """Return the RGB values, in 0..1, of a matplotlib colormap.
+    """Return the 256 colors of a matplotlib colormap, RGB in 0..1.
 
     >>> [round(x, 2) for x in colormap_rgb("viridis")[255].tolist()]
     [0.99, 0.91, 0.14]
@@ -60,7 +60,7 @@ def apply_colormap(
 
     Args:
         scale: relevancies of the first and the last color; relevancies outside this range are clamped.
-        colors: RGB values of a colormap, in 0..1.
+        colors: colors of a colormap, RGB in 0..1.
         min_opacity: opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
 
     >>> apply_colormap(torch.tensor([0.0, 0.5, 1.0]), (0.0, 1.0), colormap_rgb("viridis"))[1]
@@ -71,23 +71,23 @@ def apply_colormap(
 
 
 def named_color(text: str) -> tuple[float, float, float] | None:
-    """Return the first saturated color that a prompt names, as RGB in 0..1; None if it names none.
+    """Return the first saturated color that a prompt names, as RGB in 0..1; None without such a color.
 
-    Color names are those of the XKCD color survey.
+    The color names are those of the XKCD color survey.
 
     >>> [round(255 * x) for x in named_color("a sky blue bowl")]
     [117, 187, 253]
     >>> named_color("the fox"), named_color("white")
     (None, None)
     """
-    table = xkcd_colors()  # each name with a slash has a twin without
+    table = xkcd_colors()  # for every name with a slash, it also has the name without the slash
     codes = (bytes.fromhex(table[name][1:]) for name in find_color_names(text) if name in table)
     colors = ((c[0] / 255, c[1] / 255, c[2] / 255) for c in codes)
     return next((color for color in colors if colorsys.rgb_to_hsv(*color)[1] >= _MIN_SATURATION), None)
 
 
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
-    """Return a color for each prompt, as RGB in 0..1: the color that it names, or one distinguishable from the others.
+    """Return a color for each prompt, RGB in 0..1: the color that it names, or else a distinguishable color.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]
@@ -105,7 +105,7 @@ def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
 
 
 def _distinct(used: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
-    """Return the first of `_candidates` that is distinguishable from the used colors, or the one farthest from them."""
+    """Return the first candidate color that is distinguishable from the used colors, or else the most distant one."""
     if len(used) == 0:
         return _candidates()[0]
     distance = torch.cdist(torch.tensor(_candidates()), torch.tensor(used)).amin(dim=1)
@@ -115,7 +115,7 @@ def _distinct(used: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
 
 @cache
 def _candidates() -> tuple[tuple[float, ...], ...]:
-    """Return Okabe and Ito's colors, then hues spaced by the golden ratio of the color wheel, in four tones."""
+    """Return Okabe and Ito's colors, then hues at golden-ratio steps around the color wheel, in four tones."""
     okabe_ito = (tuple(int(color[i : i + 2], 16) / 255 for i in (0, 2, 4)) for color in _OKABE_ITO)
     tones = ((0.85, 0.95), (0.6, 0.95), (0.85, 0.65), (0.45, 0.75))  # saturation and value
     return (*okabe_ito, *(colorsys.hsv_to_rgb((i * 0.618034) % 1, *tones[i % 4]) for i in range(160)))
@@ -126,7 +126,7 @@ RGB = tuple[float, float, float]
 
 
 def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
-    """Return a color for each prompt: that of the first color name in it, else a distinct one.
+    """Return the colors of `prompt_colors` as tuples.
 
     >>> [tuple(round(x, 2) for x in color) for color in prompt_rgb_tuples(["yellow bowl", "fox"])]
     [(1.0, 1.0, 0.08), (0.9, 0.62, 0.0)]
@@ -134,18 +134,18 @@ def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
     return [(red, green, blue) for red, green, blue in prompt_colors(texts).tolist()]
 
 
-# Legends in images: a color bar with its scale, or the prompts with their colors.
+# Legends in images: a color bar with its scale, or a list of prompts with their colors.
 
 
 MIN_LEGEND_HEIGHT = 160
-"""Image height in pixels below which there is no legend, as in the small images of a moving camera."""
+"""Minimum height in pixels of an image with a legend; the small images of a moving camera have none."""
 _MAX_PROMPTS = 12
 _BACKDROP, _INK = (20, 20, 20), (255, 255, 255)
 _BACKDROP_OPACITY = 0.75
 
 
 def clip_text(text: str, most: int) -> str:
-    """Return a text on one line, shortened to at most `most` characters, with unprintable characters escaped.
+    """Convert a text to one line of at most `most` characters, with unprintable characters escaped.
 
     >>> clip_text("a  red bowl", 8)
     'a red b…'
@@ -155,7 +155,7 @@ def clip_text(text: str, most: int) -> str:
 
 @lru_cache(maxsize=16)
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Return the font of all images, which comes with matplotlib."""
+    """Load matplotlib's DejaVu Sans font, the font of all images, in a size in pixels."""
     from matplotlib import get_data_path  # noqa: PLC0415 (a lift does not need it)
 
     return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
@@ -164,11 +164,12 @@ def load_font(size: int) -> ImageFont.FreeTypeFont:
 def add_color_bar(
     image: Float[Tensor, "h w 3"], colormap: Colormap, scale: tuple[float, float], title: str
 ) -> Float[Tensor, "h w 3"]:
-    """Return an image with a color bar in its lower right corner if there is room for one.
+    """Add a color bar to the lower right corner of an image, if there is enough space.
 
     Args:
         image: RGB in 0..1.
         scale: values of the first and the last color.
+        title: title above the color bar.
     """
     height, width = image.shape[:2]
     tile = None if height < MIN_LEGEND_HEIGHT else _color_bar(colormap, scale, clip_text(title, 28), _font_size(height))
@@ -176,7 +177,7 @@ def add_color_bar(
 
 
 def add_prompt_legend(image: Float[Tensor, "h w 3"], texts: Sequence[str], colors: Float[Tensor, "q 3"]) -> Tensor:
-    """Return an image [H, W, 3] with prompts and their colors in its lower right corner if there is room for them."""
+    """Add prompts and their colors to the lower right corner of an image [H, W, 3], if there is enough space."""
     height, width = image.shape[:2]
     if height < MIN_LEGEND_HEIGHT or len(texts) == 0:
         return image
@@ -192,7 +193,7 @@ def _font_size(height: int) -> int:
 
 
 def _paste(image: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
-    """Return an image with a tile in its lower right corner if a third of the width stays free."""
+    """Paste a tile into the lower right corner of an image, if a third of the image width stays free."""
     rows, columns = tile.shape[:2]
     margin = max(4, rows // 8)
     if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(image):

@@ -1,4 +1,4 @@
-"""Semantic outputs of a render, and figures that show an answer next to the training images."""
+"""Semantic outputs of a render, figures of answers next to training images, and masks."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
 
 _MIN_SPAN = 0.05
-"""Smallest difference between the relevancies at the ends of a color scale."""
+"""Minimum difference between the relevancies at the ends of a color scale."""
 SEGMENTATION_OPACITY = 0.8
 """Opacity of the prompt colors over the scene."""
 
 
 @dataclass(frozen=True)
 class Display:
-    """Scalars that are rendered in addition to the colors, and their color scales.
+    """Scalars to render in addition to the colors, and their color scales.
 
-    Immutable, because the viewer renders in other threads. Q is the number of prompts; without prompts, nothing is
-    selected.
+    The class is immutable because the viewer renders in other threads. Q is the number of prompts; without prompts,
+    nothing is selected.
     """
 
     values: Float[Tensor, "n q_plus_5"]
     """Columns: relevancy of each prompt, relevancy shown in the overlay, selected (0 or 1), selected by any prompt
     (0 or 1), R, N_eff."""
     scale: tuple[float, float]
-    """Relevancies at the two ends of the overlay's colors."""
+    """Relevancies of the first and the last color of the overlay."""
     map_scale: tuple[float, float]
-    """Relevancies at the two ends of the colors in maps of the whole scene."""
+    """Relevancies of the first and the last color of relevancy maps."""
     colormap: colors.Colormap
     """Colormap of the overlay."""
     texts: tuple[str, ...]
@@ -59,9 +59,9 @@ class Display:
     palette: Float[Tensor, "q 3"]
     """Colors of the prompts in the segmentation, RGB in 0..1."""
     shown: int | None = None
-    """Index of the prompt in the overlay; None: the most relevant of all prompts."""
+    """Index of the prompt in the overlay; None for the most relevant prompt at each Gaussian."""
     drawn: Bool[Tensor, " n"] | None = None
-    """Gaussians that are drawn at all; None: all."""
+    """Mask of the Gaussians to draw; None for all."""
     by_hand: bool = False
     """True if the selection was made by hand; the overlay then has a single color."""
 
@@ -87,13 +87,13 @@ def make_display(
     drawn: Bool[Tensor, " n"] | None = None,
     by_hand: bool = False,
 ) -> Display:
-    """Make the display of an answer, on the field's device.
+    """Make the display of an answer on the device of the field.
 
     Args:
-        shown: index of the prompt whose relevancy is in the overlay and whose selection counts; None: all prompts.
-        selection: mask of the selection; None: the selection of the answer.
-        drawn: mask of the Gaussians that are drawn at all; None: all.
-        by_hand: whether `selection` is independent of the answer.
+        shown: index of the only prompt to show (default: all prompts).
+        selection: mask of the selected Gaussians (default: those that the answer selects).
+        drawn: mask of the Gaussians to draw (default: all).
+        by_hand: True if `selection` is independent of the answer.
     """
     scalars = field.scalars
     zeros = torch.zeros_like(scalars.reliability)
@@ -120,19 +120,19 @@ def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float
 
 
 def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w q"]:
-    """Normalize rendered relevancies by opacity; return 0 for pixels that are (almost) empty."""
+    """Divide rendered relevancies by opacity; return 0 for pixels with an opacity of at most 0.05."""
     return torch.where(alpha[:, :, None] > 0.05, values / alpha[:, :, None].clamp(min=1e-6), 0.0)
 
 
 def map_scale(answer: Answer) -> tuple[float, float]:
-    """Return the scale of all maps: from the rule's faintest colored relevancy to the largest of any prompt."""
+    """Return the scale of relevancy maps, from the rule's `display_min` to the largest relevancy of any prompt."""
     peak = color_scale(answer.relevancy[answer.valid].flatten(), answer.question.threshold)[1]
     low = RELEVANCY_RULES[answer.question.rule].display_min
     return low, max(peak, low + _MIN_SPAN)
 
 
 def output_names(texts: tuple[str, ...]) -> list[str]:
-    """Return the name of each prompt's output in a viewer. They are valid file names, since ns-render writes files.
+    """Return unique output names for prompts. They are valid file names, because ns-render uses them as such.
 
     >>> output_names(("sky blue", "sky/blue", "fox"))
     ['relevancy_sky_blue', 'relevancy_sky_blue_2', 'relevancy_fox']
@@ -152,22 +152,22 @@ def render_outputs(
     *,
     named_by_text: bool = False,
 ) -> dict[str, Tensor]:
-    """Return the semantic outputs of one image, each [H, W, 1] or [H, W, 3], the overlay last.
+    """Return the semantic outputs of one image by name, each [H, W, 1] or [H, W, 3], the overlay last.
 
-    Overlay, segmentation and reliability are finished images with legends: the scene in gray under colors of fixed
-    scales. The other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
+    The outputs overlay, segmentation and reliability are color images with legends, on a gray render of the scene. The
+    other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
 
     Args:
-        rgb: rendered scene, 0..1.
+        rgb: rendered scene, RGB in 0..1.
         image: composited `display.values`.
         alpha: opacity of every pixel.
-        named_by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise
-            they are scalars named relevancy_0, relevancy_1, …
+        named_by_text: return relevancies as color images with the names of `output_names`, for a viewer. Otherwise,
+            return them as scalars with the names relevancy_0, relevancy_1, …
     """
     count = display.num_prompts
     pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
     _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
-    opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
+    opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections such as floaters visible
     overlaid, segmented = _over_gray(rgb, colors.prompt_colors([""])[0].to(rgb), opacity), _gray(rgb)
     outputs = {f"relevancy_{i}": image[:, :, i : i + 1] for i in range(count)}
     if count > 0:
@@ -194,10 +194,10 @@ def render_outputs(
 def overlay(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], share: Float[Tensor, "h w 1"]
 ) -> Float[Tensor, "h w 3"]:
-    """Return the scene in gray, with the selection colored by relevancy and more opaque for higher relevancies.
+    """Color the selection by relevancy over the scene in gray; opacity increases with relevancy.
 
     Args:
-        share: selected fraction of each pixel, 0..1.
+        share: selected fraction of each pixel, in 0..1.
     """
     color, opacity = colors.apply_colormap(relevancy, display.scale, colors.colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
@@ -206,7 +206,7 @@ def overlay(
 def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
+    """Color all pixels by relevancy over the scene in gray, from transparent to opaque."""
     ramp = colors.colormap_rgb(display.colormap).to(rgb)
     color, opacity = colors.apply_colormap(relevancy, display.map_scale, ramp, min_opacity=0.0)
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
@@ -218,11 +218,11 @@ def segmentation(
     share: Float[Tensor, "h w 1"],
     palette: Float[Tensor, "q 3"],
 ) -> Float[Tensor, "h w 3"]:
-    """Return the scene in gray, with the selection in the color of the most relevant prompt.
+    """Draw the selection in the color of the most relevant prompt over the scene in gray.
 
     Args:
         labels: index of the most relevant prompt of each pixel.
-        share: selected fraction of each pixel, 0..1.
+        share: selected fraction of each pixel, in 0..1.
         palette: colors of the prompts, RGB in 0..1.
     """
     return _over_gray(rgb, palette[labels], SEGMENTATION_OPACITY * share.clamp(0, 1))
@@ -254,22 +254,22 @@ def _gray(rgb: Tensor) -> Tensor:
 
 
 _PANEL_WIDTH, _THUMBNAIL_WIDTH, _MAX_WIDTH = 640, 420, 4096
-"""Width in pixels of the panels of a figure, of those of a contact sheet, and largest width of a contact sheet."""
+"""Width in pixels of a panel in a figure and of a panel in a contact sheet, and maximum width of a contact sheet."""
 _MAX_SINGLE_ROW = 3
-"""Largest number of panels for which a contact sheet has a single row."""
+"""Maximum number of panels in a contact sheet with a single row."""
 _MAX_ASPECT = 1.5
-"""Largest height of a panel, as a multiple of its width."""
+"""Maximum height of a panel, as a multiple of its width."""
 _MARGIN, _FONT_SIZE = 16, 17
 _BACKGROUND, _TEXT_COLOR, _CAPTION_COLOR = (255, 255, 255), (20, 20, 20), (95, 95, 95)
 
 
 @dataclass(frozen=True)
 class FigureStyle:
-    """Settings that all figures of an answer share."""
+    """Settings shared by all figures of an answer."""
 
     colormap: colors.Colormap
     scale: tuple[float, float]
-    """Relevancies at the ends of the color bar."""
+    """Relevancies at the two ends of the color bar."""
     threshold: float
     """Relevancy above which Gaussians are selected."""
 
@@ -287,17 +287,17 @@ class FigureHeader:
 
     @property
     def title(self) -> str:
-        """The prompt, and the verdict on it."""
+        """The prompt, followed by the verdict if there is one."""
         return colors.clip_text(self.text, 60) + ("" if self.verdict is None else f"   ·   {self.verdict}")
 
     @staticmethod
     def of(finding: Finding) -> FigureHeader:
-        """Summarize the answer to one prompt."""
+        """Make the header for the result of one prompt."""
         mask, scalars = finding.mask, finding.answer.field.scalars
         threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
             peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"nothing is selected above {threshold:g}{peak}", verdict)
+            return FigureHeader(finding.text, f"no Gaussian is selected above {threshold:g}{peak}", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
@@ -315,14 +315,14 @@ def view_figure(
     overlay: UInt8[Tensor, "h w 3"],
     selected: Bool[Tensor, "h w"],
 ) -> Image.Image:
-    """Draw a figure of one view: the training image next to the overlay.
+    """Draw a figure of one view, with the training image next to the overlay.
 
     Args:
         header: title and summary above the figure.
         view: name of the view.
-        image: training image; None: it is not available, and the figure shows the overlay alone.
+        image: training image; None to show only the overlay.
         overlay: rendered overlay of the same view.
-        selected: mask of the selected pixels, which are outlined.
+        selected: mask of the selected pixels, which the figure outlines.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
     panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
@@ -349,7 +349,7 @@ def contact_sheet(
 
 
 def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
-    """Return the overlay, at most `width` wide, with a white line on a black one around the selection."""
+    """Scale the overlay to at most `width` pixels, and outline the selection with a white line on a black line."""
     scale = min(width / overlay.shape[1], _MAX_ASPECT * width / overlay.shape[0])
     size = (max(1, round(scale * overlay.shape[1])), max(1, round(scale * overlay.shape[0])))
     image = Image.fromarray(overlay.cpu().numpy()).resize(size, Image.Resampling.BICUBIC)
@@ -390,7 +390,7 @@ def _page(
 def _draw_color_bar(
     draw: ImageDraw.ImageDraw, page: Image.Image, sheet: FigureStyle, position: tuple[int, int, int]
 ) -> None:
-    """Draw the color bar with the values at its ends and a mark at the threshold.
+    """Draw the color bar with its end values and a mark at the threshold.
 
     Args:
         position: x, y and width in pixels.
@@ -412,13 +412,13 @@ def _draw_color_bar(
     draw.text((x, y + height + 5 + round(1.2 * _FONT_SIZE)), "relevancy", fill=_CAPTION_COLOR, font=typeface)
 
 
-# Figures of answers: training images next to renders of the answer, in the colors of the viewers, and masks.
+# Files of figures and masks.
 
 
 CONTACT_SHEET_PREFIX = "contact_sheet"
-"""Beginning of the file names of contact sheets; those of other figures begin with the name of their view."""
+"""Prefix of the file names of contact sheets; the prefix of other figures is the name of their view."""
 _ZLIB_LEVEL = 4
-"""PIL's default, 6, takes twice as long for files that are 6% smaller."""
+"""Compression level of PNG files; PIL's default, 6, takes twice as long for files that are 6% smaller."""
 
 
 def save_overlays(
@@ -430,14 +430,14 @@ def save_overlays(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG per camera and prompt, and for several cameras one contact sheet per prompt.
+    """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
 
-    Each figure shows the training image next to the rendered scene with the relevancy and the outline of the selection.
-    All figures share one color scale.
+    Each figure shows the training image next to a render with the relevancy and an outline of the selection. All
+    figures share one color scale.
 
     Args:
-        cameras: training cameras by the names for the files, as from `training_cameras`.
-        settings: rasterizer settings; None: those of gsplat 1.4.
+        cameras: training cameras by file name prefix, as from `training_cameras`.
+        settings: rasterizer settings (default: those of gsplat 1.4).
         overwrite: replace existing files.
     Returns:
         Paths of the files.
@@ -451,7 +451,7 @@ def save_overlays(
     counts = Counter(f"{prefix}_{end}" for prefix in prefixes for end in ends)
     duplicates = [name for name, count in counts.items() if count > 1]
     if len(duplicates) > 0:
-        raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
+        raise InputError(f"two figures would have the name {folder / duplicates[0]}. Render the views one at a time.")
     headers = [FigureHeader.of(finding) for finding in answer]
     sheet = FigureStyle(colors.COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
@@ -474,7 +474,7 @@ def save_overlays(
 def _overlays(
     scene: Scene, answer: Answer, camera: Camera, settings: RasterSettings | None
 ) -> list[tuple[UInt8[Tensor, "h w 3"], Tensor]]:
-    """Return, for each prompt, the scene in gray under its relevancy, and the mask of selected pixels [H, W]."""
+    """Return, for each prompt, its relevancy map and the mask [H, W] of the selected pixels."""
     count, display = len(answer.texts), make_display(answer.field, answer)
     values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1)
     image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
@@ -485,7 +485,7 @@ def _overlays(
 
 
 def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
-    """Return the training image of a view, or None if it can no longer be read."""
+    """Return the training image of a view; None if the file is missing or damaged."""
     names = unique_file_names(list(scene.train.names))
     try:
         return scene.train[names.index(view)].image
@@ -494,10 +494,10 @@ def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
 
 
 def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camera]:
-    """Return training cameras by the names for their files.
+    """Return training cameras by unique file name.
 
     Args:
-        names: names as from `unique_file_names`, or image paths with or without suffix (default: three views).
+        names: names from `unique_file_names`, or image paths with or without suffix (default: three views).
     Raises:
         ValueError: a name matches no training image, or several.
     """
@@ -512,11 +512,11 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
         if len(matches) == 0:
             raise InputError(
                 f"--render-views: there is no training image {name!r}. Expected one of {len(images)} names from "
-                f"{unique[0]!r} to {unique[-1]!r}, without suffix; other images are held out for evaluation."
+                f"{unique[0]!r} to {unique[-1]!r}, without suffix. Images held out for evaluation are not available."
             )
         if len(matches) > 1:
             raise InputError(
-                f"--render-views: {len(matches)} training images match {name!r}; choose one of: "
+                f"--render-views: {len(matches)} training images match {name!r}. Choose one of: "
                 f"{', '.join(unique[i] for i in matches)}"
             )
         selected[unique[matches[0]]] = cameras[matches[0]]
@@ -530,15 +530,17 @@ _OUTLINE_FRACTION = 1 / 320
 def save_inventory(
     scene: Scene, inventory: Inventory, path: Path, *, manifest: Mapping[str, Any], overwrite: bool = False
 ) -> str:
-    """Write a PNG of the scene with the outlines and numbers of the objects of an inventory, and names after these.
+    """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects and, of several, the largest share of each.
+    The camera is that of the training image that shows the most objects. Among several such images, the objects cover
+    the largest area in this image.
 
     Args:
-        manifest: of the field, for the rules of the rasterizer.
+        path: file to write.
+        manifest: manifest of the field, with the settings of the rasterizer.
         overwrite: replace an existing file.
     Returns:
-        The name of the training image.
+        Name of the training image.
     Raises:
         FileExistsError: the file exists, and `overwrite` is False.
         OSError: the file cannot be written.
@@ -554,7 +556,7 @@ def save_inventory(
     values = torch.nn.functional.one_hot(inventory.instance_id.long(), count + 1)[:, 1:].to(scene.gaussians.means)
     weights, alpha = render(scene.gaussians, camera, values, rasterize_mode=mode, settings=settings)
     masks = (pixel_relevancy(weights, alpha) > 0.5).permute(2, 0, 1)
-    masks &= (shares[:, view] >= MIN_VIEW_SHARE).to(masks.device)[:, None, None]  # no numbers on specks
+    masks &= (shares[:, view] >= MIN_VIEW_SHARE).to(masks.device)[:, None, None]  # hide objects that are too small here
     drawn = _numbered(image, masks, [item.text for item in inventory.catalog.objects])
     with atomic_file(path, overwrite=overwrite) as draft:
         drawn.save(draft, format="PNG")
@@ -562,7 +564,7 @@ def save_inventory(
 
 
 def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names: Sequence[str]) -> Image.Image:
-    """Draw the outline of every mask, with its number and name where it is widest."""
+    """Draw the outline of every mask, and its number and name at the widest part of the mask."""
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
     canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)
@@ -594,14 +596,14 @@ def write_masks(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG per training image, of its size: 255 for pixels that show the selection, else 0.
+    """Write one PNG mask per training image, of the same size: 255 for pixels that show the selection, 0 for others.
 
-    Either all files are written or none. Objects in front of the selection occlude it. The masks fit images without
-    lens distortion, on which the scene was trained.
+    If an error occurs, no file is written. Objects in front of the selection occlude it. The masks fit the undistorted
+    images of the training.
 
     Args:
-        invert: invert the masks: 255 for pixels that show anything else, or nothing.
-        settings: rasterizer settings; None: those of gsplat 1.4.
+        invert: write 0 for pixels that show the selection, and 255 for others.
+        settings: rasterizer settings (default: those of gsplat 1.4).
         overwrite: replace existing files.
     Returns:
         Paths of the files.
@@ -618,14 +620,14 @@ def write_masks(
 
 
 def mask_files(scene: Scene, folder: Path) -> list[Path]:
-    """Return the paths of the masks of a scene's training images."""
+    """Return the path of the mask of each training image."""
     return [folder / f"{name}.png" for name in unique_file_names(list(scene.train.names))]
 
 
 def view_mask(
     scene: Scene, camera: Camera, selected: Bool[Tensor, " n"], *, settings: RasterSettings | None = None
 ) -> Bool[Tensor, "h w"]:
-    """Return the mask of pixels in which the selection makes up more than half of the opacity."""
+    """Return the mask of the pixels in which the selection contributes more than half of the opacity."""
     values = selected.to(scene.gaussians.means)[:, None]
     image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
     return pixel_relevancy(image, alpha)[:, :, 0] > 0.5

@@ -1,10 +1,10 @@
-"""One warm server for lifted runs: the web page with a session per browser page, an HTTP API, and MCP.
+"""Server that keeps lifted runs in memory for the web page, the HTTP API and MCP.
 
-* `runs`: open runs with everything that their pages share; several of them within a memory limit.
-* `coloring`: one byte per drawn Gaussian and a palette, which color the geometry that a page already has.
-* `protocol`, `permalink`: messages of a page; links that carry a query and a camera.
-* `session`: actions of one page on its state, and messages to the page; `describe`: their content.
-* `schema`, `http_api`: requests and answers of the HTTP API, and its OpenAPI document.
-* `app`, `host_check`: the Starlette application, its checks and limits.
-* `client`: `normlift_ns.connect`. `mcp_tools`: the same verbs for agents.
+* `runs`: open runs with the data that their pages share, within a memory limit.
+* `coloring`: colors of a page as a palette and one byte per drawn Gaussian.
+* `protocol`, `permalink`: messages from a page to the server, and links that store a query and a camera.
+* `session`, `describe`: session of one page, and the content of the messages that it sends to the page.
+* `schema`, `http_api`: request and response types of the HTTP API, its routes and its OpenAPI document.
+* `app`, `host_check`: Starlette application with request checks and limits.
+* `client`, `mcp_tools`: Python client, `normlift_ns.connect`, and MCP tools for agents.
 """

@@ -1,4 +1,4 @@
-"""The Starlette application: pages, sessions and the HTTP API, with checks and limits; and the server that runs it."""
+"""Starlette application for the web page, its sessions and the HTTP API, and the server that runs it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from normlift_ns.server.runs import RunStore, ServedRun, without_paths
 from normlift_ns.server.session import PageLimits, PageSession
 
 PAGE_FOLDER = Path(normlift_ns.__file__).parent / "page"
-"""Folder of the built page."""
+"""Folder of the built web page."""
 BUILD_COMMAND = "python setup.py build_page"
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; img-src 'self' data: blob:; "
@@ -46,18 +46,18 @@ CONTENT_SECURITY_POLICY = (
     "form-action 'none'; frame-ancestors 'none'"
 )
 MAX_BODY = 4 * 2**20
-"""Bytes of the body of a request, and of a message of a page."""
+"""Maximum size of a request body and of a WebSocket message, in bytes."""
 MAX_PAGES = 64
-"""Number of pages that may be open at a time."""
+"""Maximum number of open pages."""
 MAX_CONNECTIONS = 512
 REQUEST_TIMEOUT = 120.0
-"""Seconds after which a request is answered with status 504."""
+"""Maximum duration of a request in seconds; the server then responds with status 504."""
 _BODY_TIMEOUT = 20.0
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _QUICK_THREADS = 4
 _THREADS = max(2, (os.cpu_count() or 2) // 2)
-"""Threads for questions, and for slower work such as explanations; each uses several cores."""
+"""Number of threads for queries, and of threads for slower work such as explanations; each uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -76,7 +76,7 @@ class ServerOptions:
     allowed_hosts: tuple[str, ...] = ()
     read_only: bool = False
     access_token: str = field(default_factory=lambda: secrets.token_urlsafe(18))
-    """Text that requests must know which write into a run, if the server listens on other addresses than localhost."""
+    """Token for requests that write into a run; not required if the server listens on localhost only."""
 
     @property
     def is_local(self) -> bool:
@@ -87,22 +87,22 @@ class ServerOptions:
             return False
 
     def knows(self, access: str) -> bool:
-        """Return whether a text is the access token."""
+        """Return True if `access` is the access token."""
         return secrets.compare_digest(access.encode(), self.access_token.encode())
 
     def may_write(self, access: str) -> bool:
-        """Return whether a request with this access token may write."""
+        """Return True if a request with the token `access` may write into a run."""
         return not self.read_only and (self.is_local or self.knows(access))
 
 
 class Guard:
-    """Middleware that checks Host and Origin, limits bodies and time, and adds security headers."""
+    """ASGI middleware that checks Host and Origin headers, limits body size and duration, and adds security headers."""
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
         self._app, self._names = app, names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one connection."""
+        """Handle one HTTP request or WebSocket connection."""
         if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
         headers = Headers(scope=scope)
@@ -115,7 +115,9 @@ class Guard:
             return await PlainTextResponse(f"403: {refused}\n", 403, _HEADERS)(scope, receive, send)
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > MAX_BODY:
-            response = JSONResponse({"error": f"A request may have at most {MAX_BODY:,} bytes."}, 413, _HEADERS)
+            response = JSONResponse(
+                {"error": f"The request body exceeds the limit of {MAX_BODY:,} bytes."}, 413, _HEADERS
+            )
             return await response(scope, receive, send)
         started = False
 
@@ -133,12 +135,16 @@ class Guard:
                 await self._app(scope, _limited(receive), send_with_headers)
         except TimeoutError:
             if not started:
-                await JSONResponse({"error": "The request took too long."}, 504, _HEADERS)(scope, receive, send)
+                await JSONResponse(
+                    {"error": "The request exceeded the time limit. Try fewer prompts or a smaller image."},
+                    504,
+                    _HEADERS,
+                )(scope, receive, send)
         return None
 
 
 def _limited(receive: Receive) -> Receive:
-    """Return a `receive` that refuses bodies that are too large or come too slowly."""
+    """Wrap `receive`: raise HTTPException if the body is too large, and TimeoutError if it arrives too slowly."""
     total = 0
 
     async def limited() -> Message:
@@ -150,7 +156,7 @@ def _limited(receive: Receive) -> Receive:
         if message["type"] == "http.request":
             total += len(message.get("body", b""))
             if total > MAX_BODY:
-                raise HTTPException(413, f"A request may have at most {MAX_BODY:,} bytes.")
+                raise HTTPException(413, f"The request body exceeds the limit of {MAX_BODY:,} bytes.")
             total = total if message.get("more_body") else -1
         return message
 
@@ -168,11 +174,11 @@ async def _refuse_websocket(scope: Scope, receive: Receive, send: Send, reason: 
 
 
 class WarmServer:
-    """Lifted runs behind one port.
+    """HTTP server of lifted runs, with the web page, its sessions and the HTTP API on one port.
 
     Args:
-        runs: the runs.
-        options: address, and who may write.
+        runs: store of the runs.
+        options: address, port and write access.
     """
 
     def __init__(self, runs: RunStore, options: ServerOptions) -> None:
@@ -193,8 +199,8 @@ class WarmServer:
         """Return the ASGI application.
 
         Args:
-            extra_routes: routes besides those of the page and of the API.
-            lifespan: context of Starlette in which the application runs.
+            extra_routes: routes in addition to those of the page and the API.
+            lifespan: Starlette lifespan context of the application.
         """
         routes = [
             Route("/", self._page), Route("/assets/{path:path}", self._asset), Route("/favicon.ico", _no_icon),
@@ -215,20 +221,20 @@ class WarmServer:
         return Guard(app, accepted_names(self.options.host, self.options.allowed_hosts))
 
     async def run_of(self, name: str) -> ServedRun:
-        """Return an open run, by its id.
+        """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            HTTPException: there is no such run (status 404).
+            HTTPException: no run has this id (status 404).
         """
         if name not in self.runs.ids:
-            raise HTTPException(404, f"There is no run {name[:80]!r}. The runs are: {', '.join(self.runs.ids)}.")
+            raise HTTPException(404, f"There is no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")
         return await anyio.to_thread.run_sync(self.runs.get, name, limiter=self._opening, abandon_on_cancel=True)
 
     async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
-        """Run work in a thread.
+        """Call `work` in a thread, and return its result.
 
         Args:
-            slow: False: the work is not slower than a question.
+            slow: use the threads for slow work; False: use those for queries.
         """
         limiter = self.limits.slow if slow else self.limits.asking
         result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
@@ -238,11 +244,11 @@ class WarmServer:
         return result
 
     def may_write(self, access: str) -> bool:
-        """Return whether a request with this access token may write."""
+        """Return True if a request with the token `access` may write into a run."""
         return self.options.may_write(access)
 
     def offer(self, name: str, content: bytes) -> str:
-        """Keep a file for a download, and return its address; the oldest files are dropped."""
+        """Store a file for download, and return its URL path; delete the oldest files if there are too many."""
         key = secrets.token_urlsafe(16)
         self._downloads[key] = name, content
         while len(self._downloads) > 1 and (
@@ -292,14 +298,14 @@ class WarmServer:
     async def _image(self, request: Request) -> Response:
         run, size = await self.run_of(request.path_params["run"]), request.query_params.get("max_size", "1024")
         if not size.isdecimal() or not 16 <= int(size) <= 4096:
-            raise InputError(f"max_size must be 16 to 4096, got {size[:20]!r}.")
+            raise InputError(f"max_size must be a whole number from 16 to 4096, got {size[:20]!r}.")
         content = await self.in_thread(partial(run.image, request.path_params["index"], int(size)))
         return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
 
     async def _download(self, request: Request) -> Response:
         name, content = self._downloads.get(request.path_params["key"], (None, b""))
         if name != request.path_params["name"]:
-            raise HTTPException(404, "This download is no longer kept; export again.")
+            raise HTTPException(404, "This download has expired. Export the Gaussians again.")
         headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
         return Response(content, headers=headers, media_type="application/octet-stream")
 
@@ -307,7 +313,7 @@ class WarmServer:
         try:
             await websocket.accept()
             if self._pages >= MAX_PAGES:
-                return await websocket.close(1013, f"{MAX_PAGES} pages are open; close one.")
+                return await websocket.close(1013, f"The limit of {MAX_PAGES} open pages is reached. Close one.")
             self._pages += 1
             try:
                 run = await self.run_of(websocket.path_params["run"])
@@ -323,7 +329,7 @@ class WarmServer:
             return None if ended else await _close(websocket, error)
 
     def start(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> int:
-        """Start to serve in a thread, and return the port: that of the options, or the next free one."""
+        """Start the server in a thread, and return its port: `options.port` or, if it is in use, the next free one."""
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
             self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
@@ -335,30 +341,30 @@ class WarmServer:
         return listener.getsockname()[1]
 
     def stop(self) -> None:
-        """Stop to serve."""
+        """Stop the server."""
         if self._server is not None:
             self._server.should_exit = True
 
 
 def _trim_memory() -> None:
-    """Return free memory to the system, of which glibc otherwise keeps hundreds of megabytes between large arrays."""
+    """Return freed memory to the operating system; glibc would keep hundreds of megabytes of it."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
 
 
 async def _close(websocket: WebSocket, error: BaseException) -> None:
-    """Close a connection because of an error, unless it has ended already."""
+    """Close a WebSocket with the message of an error as the reason, unless it is closed already."""
     while isinstance(getattr(error, "exceptions", None), tuple):
         error = error.exceptions[0]  # type: ignore[attr-defined]
     reason = without_paths(describe_error(error)[0]) if not isinstance(error, TimeoutError) else "no greeting"
     try:
         await websocket.close(1008 if isinstance(error, InputError | TimeoutError) else 1011, reason[:120])
-    except RuntimeError:  # it has ended
+    except RuntimeError:  # already closed
         return
 
 
 def _bind(host: str, port: int) -> socket.socket:
-    """Return a socket that listens on the port, or on the next free one."""
+    """Return a socket that listens on `port` or, if it is in use, on the next free port."""
     family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
     for number in [0] if port == 0 else range(port, min(port + 100, 65536)):
         listener = socket.socket(family, kind, protocol)
@@ -370,7 +376,7 @@ def _bind(host: str, port: int) -> socket.socket:
             listener.close()
         else:
             return listener
-    raise InputError(f"--port {port} and the 99 ports after it are in use; give another one.")
+    raise InputError(f"--port {port} and the 99 ports after it are in use. Choose another port.")
 
 
 def _describe_all(runs: Sequence[ServedRun], *, read_only: bool) -> list[dict[str, Any]]:
@@ -386,6 +392,6 @@ async def _http_error(request: Request, error: HTTPException) -> Response:
 
 
 async def _failed(request: Request, error: Exception) -> Response:
-    """Return the message of an error without paths of this machine."""
+    """Return the message of an error as a JSON response, without absolute paths."""
     message, code = describe_error(error)
     return JSONResponse({"error": without_paths(message)}, 400 if code == 1 else 500)

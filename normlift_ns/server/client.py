@@ -1,4 +1,4 @@
-"""Client of a server of lifted runs: `normlift_ns.connect`, with the verbs of `LiftedRun`."""
+"""Python client of the server: `normlift_ns.connect`, and remote runs with methods like those of `LiftedRun`."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from normlift_ns.server.schema import (
 
 _TIMEOUT = 180.0
 _MAX_ANSWER = 2**32
-"""Largest number of bytes of an answer."""
+"""Maximum size of a response in bytes."""
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class RemoteAnswer:
-    """Answer of a server; `answer["fox"]` is the result for one prompt."""
+    """Answer from a server; `answer["fox"]` is the result for one prompt."""
 
     question: Question
     result: QueryResult
@@ -62,7 +62,7 @@ class RemoteAnswer:
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """Gaussians that any of the prompts selects."""
+        """Mask of the Gaussians that one or more prompts select."""
         return self.selected.any(dim=1)
 
     def __len__(self) -> int:
@@ -75,20 +75,20 @@ class RemoteAnswer:
         """Return the result for one prompt.
 
         Raises:
-            KeyError: the prompt is not part of the question.
+            KeyError: `text` is not a prompt of this answer.
         """
         if text not in self.texts:
-            raise KeyError(f"{text!r} is not a prompt of this question; its prompts are {', '.join(self.texts)}")
+            raise KeyError(f"{text!r} is not a prompt of this answer; its prompts are {', '.join(self.texts)}")
         return RemoteFinding(self, self.texts.index(text))
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{one.text!r}: {one.result.count:,}" for one in self)
-        return f"Answer of {len(self.selected):,} Gaussians, selected {counts}"
+        return f"Answer for {len(self.selected):,} Gaussians; selected: {counts}"
 
 
 @dataclass(frozen=True, eq=False)
 class RemoteFinding:
-    """Result for one prompt; `result` has its numbers, as in `Finding`."""
+    """Result for one prompt, like `Finding`; `result` contains its numbers."""
 
     answer: RemoteAnswer
     index: int
@@ -100,7 +100,7 @@ class RemoteFinding:
 
     @property
     def result(self) -> PromptResult:
-        """Numbers: verdict, fraction, centroid, extent, peak, mean reliability, nearest match."""
+        """Verdict, fraction, centroid, extent, peak, mean reliability, nearest match and histogram."""
         return self.answer.result.results[self.index]
 
     @property
@@ -110,7 +110,7 @@ class RemoteFinding:
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """The selected Gaussians."""
+        """Mask of the selected Gaussians."""
         return self.answer.selected[:, self.index]
 
     @property
@@ -120,17 +120,17 @@ class RemoteFinding:
 
 
 Part = RemoteAnswer | RemoteFinding | Bool[Tensor, " n"]
-"""Part of a run: an answer of its server, a finding of one, or a mask."""
+"""Part of a scene: an answer, its result for one prompt, or a mask of the Gaussians."""
 
 
 @dataclass(eq=False, repr=False)
 class RemoteRun:
-    """A lifted run on a server, with the verbs of `LiftedRun`. Methods may be called from any thread.
+    """Lifted run on a server, with methods like those of `LiftedRun`. They may be called from any thread.
 
     >>> from normlift_ns import connect, open_run
     >>> from normlift_ns.server.app import ServerOptions, WarmServer
     >>> from normlift_ns.server.runs import RunStore
-    >>> server = WarmServer(RunStore([config], open_run), ServerOptions(port=0))  # as ns-normlift-serve makes it
+    >>> server = WarmServer(RunStore([config], open_run), ServerOptions(port=0))  # as in ns-normlift-serve
     >>> run = connect(f"http://127.0.0.1:{server.start()}")
     >>> answer = run.ask("red", "yellow")
     >>> answer["red"].verdict, run.render("0001", answer["red"]).shape
@@ -150,7 +150,7 @@ class RemoteRun:
 
     @property
     def info(self) -> dict[str, Any]:
-        """Name, encoder, number of Gaussians, saved prompts and other facts of the run."""
+        """Name, encoder, number of Gaussians, saved prompts and other properties of the run."""
         runs = json.loads(self._get("/api/runs"))["runs"]
         return next(run for run in runs if run["id"] == self.id)
 
@@ -164,11 +164,11 @@ class RemoteRun:
         min_reliability: float = 0.0,
         refined: bool = True,
     ) -> RemoteAnswer:
-        """Compute the relevancy and the selection of every Gaussian for each prompt; as `LiftedRun.ask`.
+        """Compute the relevancy and the selection of every Gaussian for each prompt, as `LiftedRun.ask` does.
 
         Raises:
-            ValueError: the server refuses the question, for instance because the encoder does not know a prompt.
-            OSError: the server does not answer.
+            ValueError: the server rejects the query, for instance because the encoder cannot encode a prompt.
+            OSError: the server does not respond.
         """
         arrays: Arrays = "safetensors"
         settings = (None if negatives is None else list(negatives), relevancy, threshold, min_reliability, refined)
@@ -184,12 +184,12 @@ class RemoteRun:
         return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
 
     def select(self, part: Part | Selection) -> SelectResult:
-        """Return size and position of a selection, such as `Selection(ray=…)`."""
+        """Return the number, center and box of the selected Gaussians, for instance of `Selection(ray=…)`."""
         return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
 
     @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
-        """List the objects of prompts with oriented boxes, as JSON types."""
+        """List the objects that the prompts select, with oriented boxes, as JSON types."""
         return json.loads(self._post("catalog", _selection(part).question))
 
     def inventory(self) -> dict[str, Any]:
@@ -202,18 +202,18 @@ class RemoteRun:
         return msgspec.json.decode(self._post("explain", _selection(part)), type=ExplainResult)
 
     def floaters(self) -> Bool[Tensor, " n"]:
-        """Return the mask of Gaussians that likely belong to no surface."""
+        """Return the mask of likely floaters, which are Gaussians that are not part of a surface."""
         return torch.from_numpy(np.load(io.BytesIO(self._get(self._path("floaters?arrays=npy")))))
 
     @check_arguments
     def coverage(self, min_reliability: float | None = None) -> dict[str, Any]:
-        """Find regions without reliable evidence; the content of `Coverage.to_json`."""
+        """Find regions without reliable evidence, and return the content of `Coverage.to_json`."""
         query = "" if min_reliability is None else f"?min_reliability={min_reliability}"
         return json.loads(self._get(self._path("coverage" + query)))
 
     @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
-        """Return the unit features of the Gaussians from `start` to before `stop`."""
+        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all)."""
         query = f"features?start={start}" + ("" if stop is None else f"&stop={stop}")
         return torch.from_numpy(np.load(io.BytesIO(self._get(self._path(query)))))
 
@@ -221,7 +221,7 @@ class RemoteRun:
     def render(
         self, view: str | int | Camera = 0, found: Part | None = None, *, max_size: int = 2048
     ) -> UInt8[Tensor, "h w 3"]:
-        """Render the scene from a camera, with what is found in color and the rest gray."""
+        """Render the scene from a camera, with the selection `found` in color and everything else in gray."""
         request: dict[str, Any] = {"max_size": max_size}
         if isinstance(view, Camera):
             size = {"width": view.width, "height": view.height}
@@ -235,7 +235,7 @@ class RemoteRun:
 
     @check_arguments
     def export(self, path: str | Path, part: Part | None = None, *, overwrite: bool = False) -> Path:
-        """Write Gaussians to a PLY file on this machine; None: the whole scene.
+        """Write the Gaussians of `part` (default: the whole scene) to a PLY file on this machine.
 
         Raises:
             FileExistsError: the file exists and `overwrite` is False.
@@ -248,7 +248,7 @@ class RemoteRun:
 
     @check_arguments
     def masks(self, folder: str | Path, part: Part, *, overwrite: bool = False) -> list[Path]:
-        """Write a PNG mask for each training image to a folder on this machine, and return the paths."""
+        """Write a PNG mask of `part` for each training image to a folder on this machine, and return the paths."""
         folder = check_path("folder", folder)
         content = msgspec.to_builtins(_selection(part), str_keys=True)
         with zipfile.ZipFile(io.BytesIO(self._post("export", {**content, "format": "masks"}))) as archive:
@@ -264,19 +264,22 @@ class RemoteRun:
 
     @check_arguments
     def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
-        """Store a question in the run; needs the access token unless the server is on this machine."""
+        """Store the prompts of an answer in the run; needs the access token unless the server is local."""
         return json.loads(self._post("save", {"question": answer.question, "replace": replace}))["stored"]
 
     @check_arguments
     def camera(self, view: str | int) -> Camera:
-        """Return the camera of a training image, by its name or index."""
+        """Return the camera of the training image with the name or index `view`."""
         cameras = json.loads(self._get(self._path("cameras")))["cameras"]
         if isinstance(view, int):
             matches = cameras[view : view + 1] if view >= 0 else []
         else:
             matches = [one for one in cameras if view in (one["name"], Path(one["name"]).name, Path(one["name"]).stem)]
         if len(matches) != 1:
-            raise InputError(f"view must be one of {len(cameras)} training images; there are {len(matches)} {view!r}")
+            raise InputError(
+                f"view must be the name or index of one of {len(cameras)} training images; {len(matches)} images match "
+                f"{view!r}"
+            )
         found = matches[0]
         pose, K = torch.tensor(found["world_to_camera"]), torch.tensor(found["K"])
         return Camera(K, pose, found["width"], found["height"])
@@ -296,17 +299,20 @@ class RemoteRun:
                 try:
                     status, content = self._exchange(method, path, body)
                 except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
-                    self._close()  # the server closes connections that are idle
+                    self._close()  # the server closes idle connections
                     status, content = self._exchange(method, path, body)
             except (http.client.HTTPException, OSError) as error:
                 self._close()
-                raise ConnectionError(f"The server at {self.address} does not answer: {error}") from error
+                raise ConnectionError(
+                    f"The server at {self.address} does not respond ({error}). Check the address, or start the server "
+                    "with: ns-normlift-serve"
+                ) from error
         if status != 200:
-            raise InputError(f"The server at {self.address} refuses the request: {_reason(content)}")
+            raise InputError(f"The server at {self.address} rejected the request: {_reason(content)}")
         return content
 
     def _exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Send a request; return the status and the content of the answer."""
+        """Send a request; return the status and the body of the response."""
         headers = {"Content-Type": "application/json"}
         headers |= {"Authorization": f"Bearer {self.access_token}"} if self.access_token else {}
         if self._connection is None:
@@ -336,10 +342,10 @@ def _reason(content: bytes) -> str:
 
 
 def _selection(part: Any) -> Selection:
-    """Return a part of a run as a request.
+    """Return the `Selection` request for a part of a scene.
 
     Raises:
-        ValueError: it is not an answer, a finding, a mask or a `Selection`.
+        ValueError: `part` is not an answer, a finding, a mask or a `Selection`.
     """
     if isinstance(part, RemoteAnswer):
         return Selection(part.question)
@@ -350,21 +356,21 @@ def _selection(part: Any) -> Selection:
     if isinstance(part, Selection):
         return part
     raise InputError(
-        f"part must be an answer of this run, its finding for one prompt, or a mask; got {type(part).__name__}"
+        f"part must be an answer from the server, its result for one prompt, or a mask; got {type(part).__name__}"
     )
 
 
 @check_arguments
 def connect(url: str, run: str | None = None, *, access_token: str = "") -> RemoteRun:
-    """Connect to a run on a server that ns-normlift-serve or ns-normlift-view started.
+    """Connect to a run on a server that was started with ns-normlift-serve or ns-normlift-view.
 
     Args:
         url: address of the server, such as http://localhost:7008.
-        run: id of the run (default: the only one).
-        access_token: token that the server printed, to store prompts from another machine.
+        run: id of the run (default: the only run of the server).
+        access_token: token printed by the server; needed to store prompts from another machine.
     Raises:
-        ValueError: the address is not valid, or the server has no such run.
-        OSError: the server does not answer.
+        ValueError: the address is not valid, or the server does not have this run.
+        OSError: the server does not respond.
 
     >>> try:
     ...     connect("ftp://localhost")
@@ -380,5 +386,5 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
     if run is None and len(ids) == 1:
         remote.id = ids[0]
     if remote.id not in ids:
-        raise InputError(f"run must be one of the runs of this server, {', '.join(ids)}; got {run!r}")
+        raise InputError(f"run must be the id of a run on this server, one of {', '.join(ids)}; got {run!r}")
     return remote

@@ -1,4 +1,4 @@
-"""Colors of a state as one byte per drawn Gaussian, an index into a palette."""
+"""Colors of a state as a palette and one byte per drawn Gaussian, its index in the palette."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from normlift_ns.rendering.figures import map_scale
 from normlift_ns.session.state import State
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
-"""overlay: selected Gaussians in the color of their best prompt, stronger with higher relevancy. prompts: the same in
-full strength. heat: relevancy of all Gaussians by a colormap. reliability: R from 0 to 1. rgb: colors as trained. pca:
-three principal components of the features."""
+"""overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy. prompts: the same at
+full strength. heat: relevancy of all Gaussians in a colormap. reliability: R from 0 to 1. rgb: trained colors. pca:
+three principal components of the features as RGB."""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 NOT_DRAWN = 255
 """Code of Gaussians that are not drawn."""
 BY_HAND_COLOR: RGB = (1.0, 0.75, 0.1)
 _OWN, _GRAY = 0, 1
-"""Codes of the trained color, and of its dimmed gray."""
+"""Codes of the trained color, and of its dimmed gray value."""
 _FIRST, _CODES = 2, 253
-"""The first code that a mode is free to use, and their number."""
+"""First code for the colors of a mode, and the number of these codes."""
 _MIN_SHARE, _FULL_SHARE = 0.45, 0.85
-"""Share of the color over gray at the threshold and at the best match."""
+"""Opacity of a prompt's color over gray, at the threshold and at the best match."""
 _MIN_SPAN = 0.05
 _MIN_LUMINANCE = 0.35
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -34,10 +34,10 @@ _PCA_QUANTILES = (0.02, 0.98)
 
 
 class Codes(NamedTuple):
-    """Colors of all drawn Gaussians."""
+    """Colors of M drawn Gaussians: a palette, and the index of each Gaussian in it."""
 
     palette: list[tuple[int, int, int, float, int]]
-    """Red, green and blue in 0..255, the share of this color, and 1 if it is mixed with gray instead of the own color.
+    """Red, green and blue in 0..255, opacity of this color, and 1 if it is mixed with gray, 0 with the trained color.
     """
     codes: UInt8[np.ndarray, " m"]
 
@@ -46,8 +46,8 @@ def make_codes(state: State, rows: np.ndarray, pca: Float[torch.Tensor, "n 3"] |
     """Return the colors of the drawn Gaussians.
 
     Args:
-        rows: rows of the Gaussians in the scene.
-        pca: three numbers in 0..1 per Gaussian of the scene, for the mode pca.
+        rows: indices of the drawn Gaussians in the scene.
+        pca: principal components of all Gaussians, in 0..1; needed for the color mode pca.
     """
     table: list[tuple[int, int, int, float, int]] = [(0, 0, 0, 0.0, 0), (0, 0, 0, 0.0, 1)]
     codes = np.full(len(rows), _OWN)
@@ -71,12 +71,12 @@ def make_codes(state: State, rows: np.ndarray, pca: Float[torch.Tensor, "n 3"] |
 
 
 def prompt_display_colors(state: State) -> list[RGB]:
-    """Return the colors of the prompts, light enough to stand out from a dark scene."""
+    """Return the colors of the prompts, lightened so that they are visible in a dark scene."""
     return [] if state.answer is None else [_lightened(color) for color in prompt_rgb_tuples(state.answer.texts)]
 
 
 def legend(state: State) -> dict[str, Any] | None:
-    """Return the color scale of a state: values of its ends, label and colors; None if it has none."""
+    """Return the end values, label and colors of the color scale of a state; None if its mode has no scale."""
     if state.color_mode == "reliability":
         low, high, label, colors = 0.0, 1.0, "reliability R", _colormap(RELIABILITY_COLORMAP)
     elif state.answer is None or not state.prompts_select or state.color_mode not in ("overlay", "heat"):
@@ -94,7 +94,7 @@ def legend(state: State) -> dict[str, Any] | None:
 
 
 def overlay_scale(state: State) -> tuple[float, float]:
-    """Return the relevancies of the weakest and the strongest color: the threshold and the best match."""
+    """Return the threshold and the best relevancy, which get the weakest and the strongest color."""
     assert state.answer is not None
     relevancy = _relevancy(state)[state.answer.valid]
     low = state.answer.question.threshold
@@ -102,14 +102,14 @@ def overlay_scale(state: State) -> tuple[float, float]:
 
 
 def heat_scale(state: State) -> tuple[float, float]:
-    """Return the relevancies of the first and the last color of the heat map."""
+    """Return the relevancies that get the first and the last color of the heat map."""
     assert state.answer is not None
     low, high = map_scale(state.answer)
     return low, max(min(1.0, high), low + _MIN_SPAN)
 
 
 def pca_of(directions: Float[torch.Tensor, "m d"]) -> tuple[Float[torch.Tensor, "3 d"], Float[torch.Tensor, "3 2"]]:
-    """Return the three principal components of a sample of directions, and the range of each component."""
+    """Return the three principal axes of a sample of directions, and the 2 % and 98 % quantiles along each axis."""
     centered = directions.double() - directions.double().mean(dim=0)
     _, vectors = torch.linalg.eigh(centered.T @ centered)
     axes = vectors[:, -3:].T.flip(0)
@@ -118,7 +118,7 @@ def pca_of(directions: Float[torch.Tensor, "m d"]) -> tuple[Float[torch.Tensor, 
 
 
 def _prompt_codes(state: State, rows: np.ndarray, table: list[Any], *, full: bool) -> np.ndarray:
-    """Add the colors of the prompts to the table, and return the codes of the selection."""
+    """Append the colors of the prompts to the palette `table`, and return the codes of the drawn Gaussians."""
     selection = _rows(state.selection, rows)
     answer = state.answer if state.prompts_select else None
     table.append((*_bytes(BY_HAND_COLOR), _FULL_SHARE, 1))
@@ -157,7 +157,7 @@ def _colormap(name: Any) -> list[tuple[int, int, int]]:
 
 
 def _lightened(color: RGB) -> RGB:
-    """Mix a dark color with white until its luminance suffices.
+    """Mix a dark color with white so that its luminance is `_MIN_LUMINANCE`.
 
     >>> [round(x, 2) for x in _lightened((0.2, 0.0, 0.25))]
     [0.45, 0.31, 0.48]

@@ -1,4 +1,4 @@
-"""Descriptions of a state, of a Gaussian under the pointer and of votes as JSON types, for pages."""
+"""State of a session, Gaussian under the pointer and explanation of a selection, as JSON types for a page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from normlift_ns.session.state import State
 MAX_OBJECTS = 24
 _MAX_HISTOGRAMS = 8
 _MAX_IMAGES = 3
-"""Number of images of an explanation, of those with the largest weight and of those that disagree most."""
+"""Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
 _IMAGE_SIZE = 480
 _OVER_VIEWS = "Based on about {:.0f} images; {}."
 
@@ -36,7 +36,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     """Return the mask of the visible Gaussians whose centers lie in a region of a view.
 
     Raises:
-        ValueError: the camera is not valid, or there are none.
+        ValueError: the camera is not valid, or the region contains no visible Gaussian.
     """
     camera, scene = value.camera.camera(), served.run.scene
     pixels, inside = project(scene.gaussians.means, camera)
@@ -50,7 +50,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     drawn = state.drawn & served.visible
     mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
     if not bool(mask.any()):
-        raise InputError("There are no visible Gaussians in this region.")
+        raise InputError("There are no visible Gaussians in this region. Draw a larger region.")
     return mask
 
 
@@ -58,8 +58,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     """Return the content of the message `state`, and the listed objects.
 
     Args:
-        rows: rows of the drawn Gaussians.
-        details: list objects and histograms, which takes longer.
+        rows: indices of the drawn Gaussians in the scene.
+        details: include objects and histograms, which takes longer.
     """
     selection, answer, query = state.selection, state.answer, state.query
     content: dict[str, Any] = {
@@ -94,7 +94,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
 
 
 def _prompts_json(state: State) -> list[dict[str, Any]]:
-    """Return a row for each prompt, with its error or with the result for it."""
+    """Return one row per prompt, with its result or its error."""
     answer = state.answer
     colors = prompt_display_colors(state)
     rows = []
@@ -112,7 +112,7 @@ def _prompts_json(state: State) -> list[dict[str, Any]]:
 
 
 def object_json(state: State, number: int, row: ObjectRow) -> dict[str, Any]:
-    """Return a listed object."""
+    """Return a listed object as JSON types."""
     means, answer = state.space.means[row.mask].double(), state.answer
     ends = torch.quantile(means, means.new_tensor([0.01, 0.99]), dim=0).tolist()
     relevancy = None
@@ -128,7 +128,7 @@ def object_json(state: State, number: int, row: ObjectRow) -> dict[str, Any]:
 def describe_hover(
     served: ServedRun, state: State, value: protocol.Ray, objects: Sequence[tuple[int, ObjectRow]]
 ) -> dict[str, Any] | None:
-    """Return what lies under the pointer: the nearest Gaussian with the largest weight; None if there is none."""
+    """Describe the Gaussian with the largest weight on the ray of the pointer; return None if the ray hits none."""
     with suppress(InputError):
         gaussian = actions.pick_gaussian(state, served.weights(value.origin, value.direction))
         position, answer = state.space.means[gaussian].double().cpu(), state.answer
@@ -149,10 +149,10 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the images that voted for the selection, and those that disagree most, as a message.
+    """Return the images with the largest weight and the largest disagreement, as the message `explanation`.
 
     Raises:
-        ValueError: nothing is selected, or the votes are no longer known.
+        ValueError: nothing is selected, or the votes of the images are no longer in the cache.
     """
     with served.reading:
         votes = served.run.votes
@@ -170,7 +170,7 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
-    smoothed = f"{why.copied / why.gaussians:.0%} was smoothed from neighbors"
+    smoothed = f"{why.copied / why.gaussians:.0%} of the Gaussians copied the feature of a neighbor"
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
     return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}

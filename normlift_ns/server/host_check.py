@@ -1,7 +1,7 @@
-"""Check of the Host and Origin headers of a request, which keeps pages of other sites from using a server.
+"""Check of the Host and Origin headers of a request, which blocks pages of other sites.
 
-A browser sends both truthfully: Origin names the page that asks, Host the name in the address that it asks. A name of
-another site that resolves to this machine (DNS rebinding) is therefore noticed too.
+Browsers do not let a page forge these headers: Origin names the site of the page, and Host the requested server. The
+check therefore also detects foreign names that resolve to this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _LOCAL = {"localhost", "127.0.0.1", "::1"}
 
 
 def accepted_names(host: str, allowed_hosts: Sequence[str] = ()) -> frozenset[str]:
-    """Return the names of a server that listens on the address `host`; "" stands for every address of this machine.
+    """Return the host names that a server accepts; "" stands for all addresses of this machine.
 
     Args:
-        host: Address that the server listens on.
-        allowed_hosts: Further names, such as that of a proxy.
+        host: address that the server listens on.
+        allowed_hosts: additional names, such as the name of a proxy.
     Raises:
-        InputError: An allowed host is not the name or address of a machine.
+        ValueError: an entry of `allowed_hosts` is not a host name or address.
 
     >>> sorted(accepted_names("192.168.0.7", ["Splats.example.org"]))
     ['127.0.0.1', '192.168.0.7', '::1', 'localhost', 'splats.example.org']
@@ -37,7 +37,7 @@ def accepted_names(host: str, allowed_hosts: Sequence[str] = ()) -> frozenset[st
         name = _plain(text)
         if name is None:
             raise InputError(
-                f"--allowed-hosts takes names and addresses of machines, such as splats.example.org, without http:// "
+                f"--allowed-hosts must be host names or addresses, such as splats.example.org, without http:// "
                 f"and without a port; got {short_repr(text)}"
             )
         names.add(name)
@@ -48,25 +48,25 @@ def accepted_names(host: str, allowed_hosts: Sequence[str] = ()) -> frozenset[st
 
 
 def refuse_request(hosts: Sequence[str], origins: Sequence[str], names: frozenset[str]) -> str | None:
-    """Return why a request is refused; None: it is accepted.
+    """Return the reason to reject a request; None if the server accepts it.
 
     Args:
-        hosts: Values of the Host headers.
-        origins: Values of the Origin headers; programs other than browsers send none.
-        names: Result of `accepted_names`.
+        hosts: values of the Host headers.
+        origins: values of the Origin headers, which only browsers send.
+        names: result of `accepted_names`.
 
     >>> names = accepted_names("127.0.0.1")
     >>> refuse_request(["localhost:8000"], ["http://localhost:8000"], names)
     >>> refuse_request(["localhost:7008"], ["https://example.org"], names)
-    'A page of https://example.org may not use this server, which is at localhost:7008.'
+    'A page of https://example.org may not use the server at localhost:7008.'
     """
     host = _authority(hosts[0]) if len(hosts) == 1 else None
     if host is None:
-        return "A request needs one Host header with the name or address of this machine."
+        return "The request must have exactly one Host header, with the name or address of this machine."
     if host[0] not in names and not ("" in names and _is_own_address(host[0])):
         return (
-            f"This server does not answer to the name {host[0]}. If it is yours, start the server with --allowed-hosts "
-            f"{host[0]}."
+            f"This server does not accept the host name {host[0]}. If the name is yours, start the server with "
+            f"--allowed-hosts {host[0]}."
         )
     if len(origins) == 0:
         return None
@@ -75,12 +75,12 @@ def refuse_request(hosts: Sequence[str], origins: Sequence[str], names: frozense
     if len(origins) > 1 or page is None or default is None or (page[1] or default, page[0]) != (
         host[1] or default, host[0],
     ):  # fmt: skip
-        return f"A page of {short_repr(origins[0])[1:-1]} may not use this server, which is at {hosts[0]}."
+        return f"A page of {short_repr(origins[0])[1:-1]} may not use the server at {hosts[0]}."
     return None
 
 
 def _authority(text: str) -> tuple[str, int | None] | None:
-    """Return the name in lower case and the port of a Host header; None if it is malformed."""
+    """Return the name, in lower case, and the port of a Host header; None if the header is malformed."""
     match = _AUTHORITY.fullmatch(text.lower())
     if match is None:
         return None
@@ -94,13 +94,13 @@ def _authority(text: str) -> tuple[str, int | None] | None:
 
 
 def _plain(text: str) -> str | None:
-    """Return a name or address without a port in the form that `_authority` gives it; None if it is malformed."""
+    """Return a host name in the form that `_authority` returns; None if it is malformed or includes a port."""
     found = _authority(f"[{text}]" if ":" in text and not text.startswith("[") else text)
     return None if found is None or found[1] is not None else found[0]
 
 
 def _is_own_address(name: str) -> bool:
-    """Return whether an address belongs to this machine, which may then listen on it."""
+    """Return True if `name` is an address of this machine, to which a socket can therefore bind."""
     with contextlib.suppress(OSError, ValueError):
         address = ipaddress.ip_address(name)
         family = socket.AF_INET if address.version == 4 else socket.AF_INET6

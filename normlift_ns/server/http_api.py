@@ -28,43 +28,43 @@ from normlift_ns.server.runs import ServedRun
 from normlift_ns.session.state import State
 
 MAX_FEATURES = 2**17
-"""Largest number of Gaussians of one request for features."""
+"""Maximum number of Gaussians in one request for features."""
 T = TypeVar("T")
 _BINARY = "application/octet-stream"
 
 
 @dataclass(frozen=True)
 class Content:
-    """Answer that is not JSON."""
+    """Response that is not JSON."""
 
     body: bytes
     media_type: str = _BINARY
     name: str | None = None
-    """Name of a file."""
+    """File name for downloads."""
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Endpoint of one run."""
+    """Endpoint of the API for one run."""
 
     path: str
     summary: str
     request: Any
-    """Type of the JSON body; None: the request is a GET."""
+    """Type of the JSON body; None for GET requests."""
     answer: Any
-    """Type of the JSON answer; None: the answer is a file."""
+    """Type of the JSON response; None if the response is a file."""
     work: Callable[[ServedRun, Any], Any]
-    """Computes the answer, a JSON type or `Content`, in a thread. For GET, its second argument is the query."""
+    """Function of the run and the body, or of the run and the URL query; it returns JSON types or `Content`."""
     writes: bool = False
-    """True if it writes into the run, which needs the access token unless the server listens on localhost only."""
+    """True if the endpoint writes into the run, which needs the access token unless the server is local."""
     parameters: tuple[str, ...] = ()
-    """Parameters of the query."""
+    """Names of the URL query parameters."""
     slow: bool = True
-    """False: it is not slower than a question."""
+    """False if the endpoint is as fast as a query."""
 
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
-    """Answer a question."""
+    """Return the answer to a question, with the arrays that the request specifies."""
     result, content = schema.answered(served, request)
     if request.arrays == "none":
         return content
@@ -78,18 +78,18 @@ def objects(served: ServedRun, selection: schema.Selection) -> schema.ObjectsRes
 
 
 def select(served: ServedRun, request: schema.SelectRequest) -> schema.SelectResult | Content:
-    """Select Gaussians."""
+    """Return the size and position of a selection, or its mask as an NPY file."""
     state = schema.select_state(served, request)
     return schema.select_result(served, state) if request.arrays == "none" else npy(state.selection)
 
 
 def explain(served: ServedRun, selection: schema.Selection) -> schema.ExplainResult:
-    """Explain a selection."""
+    """Explain a selection by the images that voted for it."""
     return msgspec.convert(explanation_of(served, schema.select_state(served, selection)), schema.ExplainResult)
 
 
 def export(served: ServedRun, request: schema.ExportRequest) -> Content:
-    """Export a selection."""
+    """Return a file of a selection, or of the whole scene if the request selects nothing."""
     state = schema.select_state(served, request)
     whole = request == schema.ExportRequest(format=request.format)
     mask = ~served.space.empty_mask() if whole else state.selection
@@ -101,7 +101,7 @@ def export(served: ServedRun, request: schema.ExportRequest) -> Content:
 
 
 def render(served: ServedRun, request: schema.RenderRequest) -> Content:
-    """Render a view."""
+    """Render the scene or a selection as JPEG."""
     selection = request.selection
     state = State(served.space) if selection is None else schema.select_state(served, selection)
     if selection is not None:
@@ -111,14 +111,16 @@ def render(served: ServedRun, request: schema.RenderRequest) -> Content:
 
 
 def actions_mode(state: State, mode: str) -> State:
-    """Return the state drawn in a color mode."""
+    """Return the state with another color mode."""
     return schema.replace(state, color_mode=mode)
 
 
 def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
     if request.page_view is not None:
         if not request.page_view.is_valid:
-            raise InputError("page_view must look at another point than its position, and not along up.")
+            raise InputError(
+                "page_view is not valid: look_at must differ from position, and the view must not be parallel to up."
+            )
         return request.page_view.camera(request.max_size)
     camera = served.run.camera(request.view) if request.camera is None else request.camera.camera()
     return camera.downscaled(request.max_size / max(camera.width, camera.height))
@@ -131,7 +133,7 @@ def save(served: ServedRun, request: schema.SaveRequest) -> dict[str, str]:
 
 
 def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
-    """Find Gaussians that likely belong to no surface."""
+    """Return the size and position of the likely floaters, or their mask as an NPY file."""
     return select(served, schema.SelectRequest(floaters=True, arrays="npy" if query.get("arrays") == "npy" else "none"))
 
 
@@ -144,12 +146,12 @@ def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
 
 
 def features(served: ServedRun, query: Any) -> Content:
-    """Return unit features of Gaussians."""
+    """Return the unit features [M, D] of a range of Gaussians as an NPY file."""
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
     if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:
         raise InputError(
-            f"start and stop must be 0 <= start < stop <= {count:,} with at most {MAX_FEATURES:,} rows between them, "
+            f"start and stop must satisfy 0 <= start < stop <= {count:,} and differ by at most {MAX_FEATURES:,}, "
             f"got {start:,} and {stop:,}."
         )
     return npy(
@@ -158,13 +160,13 @@ def features(served: ServedRun, query: Any) -> Content:
 
 
 def inventory(served: ServedRun, query: Any) -> dict[str, Any]:
-    """List the objects of the scene without prompts, with their boxes."""
+    """List the main objects of the scene, found without prompts, with their boxes."""
     with served.reading:
         return served.run.inventory().catalog.to_json()
 
 
 def catalog(served: ServedRun, question: schema.Question) -> dict[str, Any]:
-    """List the objects of prompts with oriented boxes and the images that show them."""
+    """List the objects that prompts select, with oriented boxes and the images that show them."""
     return served.run.catalogue(schema.answer(served, question)).to_json()
 
 
@@ -186,45 +188,45 @@ def _number(name: str, text: str) -> float:
 
 
 ENDPOINTS = (
-    Endpoint("query", "Answer prompts: relevancy and selection of every Gaussian.", schema.QueryRequest,
+    Endpoint("query", "Compute relevancy and selection of every Gaussian for prompts.", schema.QueryRequest,
              schema.QueryResult, query, slow=False),
     Endpoint("objects", "List the objects of a selection with their boxes.", schema.Selection, schema.ObjectsResult,
              objects, slow=False),
-    Endpoint("catalog", "List the objects of prompts with oriented boxes, in the coordinates of the capture too, and "
-             "the images that show them. Takes seconds.", schema.Question, dict[str, Any], catalog),
+    Endpoint("catalog", "List the objects that prompts select, with oriented boxes in scene and capture coordinates, "
+             "and with the images that show them. This takes seconds.", schema.Question, dict[str, Any], catalog),
     Endpoint("explain", "Explain a selection by the images that voted for it.", schema.Selection, schema.ExplainResult,
              explain),
-    Endpoint("select", "Return size and position of a selection, or its mask.", schema.SelectRequest,
+    Endpoint("select", "Return the size and position of a selection, or its mask.", schema.SelectRequest,
              schema.SelectResult, select, slow=False),
     Endpoint("render", "Render the scene, a selection or an object as JPEG.", schema.RenderRequest, None, render),
-    Endpoint("export", "Return a selection as a file: ply, or masks for a ZIP file of images.", schema.ExportRequest,
-             None, export),
+    Endpoint("export", "Return a selection as a file. The format is ply, or masks for a ZIP file of mask images.",
+             schema.ExportRequest, None, export),
     Endpoint("save", "Store prompts in the run.", schema.SaveRequest, dict[str, str], save, writes=True),
-    Endpoint("floaters", "Find Gaussians that likely belong to no surface.", None, schema.SelectResult, floaters,
-             parameters=("arrays",)),
-    Endpoint("coverage", "Find regions without reliable evidence. Takes seconds.", None, dict[str, Any], coverage_of,
-             parameters=("min_reliability",)),
-    Endpoint("features", "Return unit features [M, D] float32 of the Gaussians start to stop, as NPY.", None, None,
-             features, parameters=("start", "stop", "refined")),
-    Endpoint("inventory", "List at most 20 objects of the scene without prompts. Takes seconds.", None, dict[str, Any],
-             inventory),
+    Endpoint("floaters", "Find likely floaters, which are Gaussians that are not part of a surface.", None,
+             schema.SelectResult, floaters, parameters=("arrays",)),
+    Endpoint("coverage", "Find regions without reliable evidence. This takes seconds.", None, dict[str, Any],
+             coverage_of, parameters=("min_reliability",)),
+    Endpoint("features", "Return the unit features [M, D] of the Gaussians start to stop - 1 as a float32 NPY file.",
+             None, None, features, parameters=("start", "stop", "refined")),
+    Endpoint("inventory", "List up to 20 main objects of the scene, found without prompts. This takes seconds.", None,
+             dict[str, Any], inventory),
 )  # fmt: skip
 """Endpoints of `/api/runs/{run}/`."""
 
 
 class Server(Protocol):
-    """Part of `app.WarmServer` that the routes need."""
+    """Interface of `app.WarmServer` for the routes."""
 
     async def run_of(self, name: str) -> ServedRun:
-        """Return an open run, by its id."""
+        """Return the run with the id `name`, and open it if necessary."""
         ...
 
     async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
-        """Run work in a thread."""
+        """Call `work` in a thread, and return its result."""
         ...
 
     def may_write(self, access: str) -> bool:
-        """Return whether a request with this access token may write."""
+        """Return True if a request with the token `access` may write into a run."""
         ...
 
 
@@ -234,7 +236,7 @@ def api_routes(server: Server) -> list[Route]:
     def route(endpoint: Endpoint) -> Route:
         async def handle(request: Request) -> Response:
             if endpoint.writes and not server.may_write(_access(request)):
-                return _json({"error": "This request writes; it needs the access token of the server."}, 403)
+                return _json({"error": "Writing needs the access token in the header Authorization: Bearer TOKEN"}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])
             result = await server.in_thread(lambda: endpoint.work(served, value), slow=endpoint.slow)
@@ -259,7 +261,7 @@ def api_routes(server: Server) -> list[Route]:
 
 
 def _access(request: Request) -> str:
-    """Return the access token of a request: "Authorization: Bearer TOKEN"."""
+    """Return the access token of a request, from the header "Authorization: Bearer TOKEN"."""
     return request.headers.get("authorization", "").removeprefix("Bearer ")
 
 
@@ -273,7 +275,7 @@ def openapi(endpoints: Sequence[Endpoint]) -> dict[str, Any]:
     schemas, components = msgspec.json.schema_components(types, ref_template="#/components/schemas/{name}")
     by_type = {repr(kind): schema_of for kind, schema_of in zip(types, schemas)}
     run = {"name": "run", "in": "path", "required": True, "schema": {"type": "string"}}
-    error = {"description": "The request is not valid; `error` says why.", "content": _body({"type": "object"})}
+    error = {"description": "The request is not valid; `error` is the reason.", "content": _body({"type": "object"})}
     paths: dict[str, Any] = {
         "/api/runs": {"get": {"summary": "List the runs.", "responses": {"200": {"description": "Runs"}}}}
     }

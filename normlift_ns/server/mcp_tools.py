@@ -1,4 +1,4 @@
-"""Tools and resources of the Model Context Protocol for lifted runs; needs the package mcp."""
+"""MCP (Model Context Protocol) tools and resources for lifted runs; needs the package mcp."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ try:
     from mcp.types import ToolAnnotations
     from pydantic import Field
 except ImportError as error:
-    raise InputError(f"--mcp needs the package mcp ({error}); run: pip install 'normlift-ns[mcp]'") from None
+    raise InputError(f"--mcp needs the package mcp ({error}). Install it: pip install 'normlift-ns[mcp]'") from None
 
 from starlette.responses import JSONResponse
 from starlette.routing import Route
@@ -35,14 +35,14 @@ from normlift_ns.server.protocol import decode
 from normlift_ns.server.runs import ServedRun, without_paths
 
 _INSTRUCTIONS = """Search trained 3D scenes (Gaussian splats with semantics) by text.
-Start with list_runs. Prompts are short nouns such as "red mug"; each run has an encoder that knows certain words, and
-answers say which words it does not know. A verdict tells whether a prompt is in the scene: found, weak match or
-probably not here. list_objects counts and places objects; render shows them; explain shows the photos that are the
-evidence. Positions are in units of the scene."""
+Start with list_runs. Prompts are short nouns such as "red mug". Some encoders accept only certain words; the error for
+another prompt lists the unknown words. The verdict on a prompt is found, weak match or probably not here. list_objects
+counts and locates objects, render draws them, and explain returns the training images that support a match. Positions
+are in scene units."""
 _READS = ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
 _WRITES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 _MAX_RESULT = 60_000
-"""Largest number of characters of a result."""
+"""Maximum number of characters in a result."""
 
 Run = Annotated[str, Field(description="Id of the run, from list_runs")]
 Prompts = Annotated[list[str], Field(description="Short nouns or phrases to search for", max_length=16)]
@@ -51,35 +51,35 @@ Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class Tools:
-    """Tools of some runs; the docstring of a method is the description that agents read."""
+    """MCP tools for lifted runs. The docstring of each method is its description for agents."""
 
     def __init__(self, server: WarmServer, export_dir: Path | None) -> None:
         self._server, self._export_dir = server, export_dir
 
     def list_runs(self) -> str:
-        """List the scenes that can be searched, with their encoders, sizes, saved prompts and example prompts."""
+        """List the available scenes, with their encoders, sizes, saved prompts and example prompts."""
         return _text([self._facts(name) for name in self._server.runs.ids])
 
     def find(self, run: Run, prompts: Prompts) -> str:
-        """Search a scene for prompts. Returns for each prompt a verdict (found, weak match, probably not here), the
-        number of Gaussians, the position and size of what matches, the highest relevancy (0..1), and the position of
-        the nearest match."""
+        """Search a scene for prompts. The result for each prompt has a verdict (found, weak match, probably not here),
+        and the number of selected Gaussians with their position and size. It also has the highest relevancy (0..1) and
+        the position of the nearest match."""
         rows = msgspec.to_builtins(schema.answered(self._run(run), _question(prompts))[1])
         for row in rows["results"]:
             row.pop("histogram")
         return _text(rows)
 
     def list_objects(self, run: Run, prompts: Prompts) -> str:
-        """List and count the separate objects that match prompts, the largest first, each with number, box (min and
-        max corner), center, number of Gaussians and strength of evidence. Without prompts, list the main objects of the
-        scene, which takes up to a minute."""
+        """List and count the separate objects that match prompts, the largest first. Each object has a number, a box
+        (min and max corner), a center, a number of Gaussians and the strength of its evidence. Without prompts, list
+        the main objects of the scene, which takes up to a minute."""
         if len(prompts) == 0:
             return _text(self.inventory(run))
         return _text(schema.objects_result(schema.select_state(self._run(run), _selection(prompts, None))))
 
     def explain(self, run: Run, prompts: Prompts, object_number: ObjectNumber = None) -> list[Any]:
-        """Explain why a scene matches prompts: how many photos agree, with up to three photos in which the regions that
-        are the evidence are outlined."""
+        """Explain why a scene matches prompts. The result is the agreement of the training images, and up to three of
+        these images with outlines around the supporting regions."""
         result = http_api.explain(self._run(run), _selection(prompts, object_number))
         images = [Image(data=_data(vote.url), format="jpeg") for vote in result.support if vote.url is not None]
         facts = msgspec.to_builtins(result)
@@ -90,14 +90,14 @@ class Tools:
     def render(
         self,
         run: Run,
-        view: Annotated[str | int, Field(description="Name or index of a training photo whose camera to use")] = 0,
+        view: Annotated[str | int, Field(description="Name or index of the training image whose camera to use")] = 0,
         prompts: Prompts = [],  # noqa: B006 (read only)
         object_number: ObjectNumber = None,
-        isolate: Annotated[bool, Field(description="Draw only what matches")] = False,
+        isolate: Annotated[bool, Field(description="Draw only the matches")] = False,
         mode: ColorMode = "overlay",
     ) -> Image:
-        """Render a scene as an image. With prompts, what matches is highlighted; with object_number, the camera looks
-        at that object."""
+        """Render a scene as an image. Matches of prompts are highlighted. With object_number, the camera looks at that
+        object."""
         served = self._run(run)
         chosen = _selection(prompts, object_number) if len(prompts) > 0 else None
         look_at = None if chosen is None or object_number is None else _view_of(served, chosen)
@@ -105,11 +105,12 @@ class Tools:
         return Image(data=http_api.render(served, request).body, format="jpeg")
 
     def find_floaters(self, run: Run) -> str:
-        """Count the Gaussians of a scene that likely belong to no surface, and say where they are."""
+        """Return the number, center and box of the likely floaters of a scene. Floaters are Gaussians that are not part
+        of a surface."""
         return _text(http_api.floaters(self._run(run), {}))
 
     def measure(self, run: Run, start: Point, end: Point) -> str:
-        """Measure the distance of two positions (scene units), also in units of the original capture. Take positions
+        """Measure the distance between two positions in scene units and in units of the original capture. Use positions
         from the centers and boxes of list_objects."""
         distance = float(np.linalg.norm(np.subtract(start, end)))
         scale = self._run(run).run.to_capture.scale
@@ -120,12 +121,12 @@ class Tools:
         run: Run,
         prompts: Prompts,
         object_number: ObjectNumber = None,
-        format: Annotated[str, Field(description="ply, or masks for a ZIP file of images")] = "ply",
+        format: Annotated[str, Field(description="ply, or masks for a ZIP file of mask images")] = "ply",
     ) -> str:
-        """Write what matches prompts, or one object of it, to a new file in the export folder of the server; returns
-        the name of the file. No file is ever replaced."""
+        """Write the Gaussians that match prompts, or one object of them, to a new file in the export folder of the
+        server, and return the file name. Existing files are never replaced."""
         if self._export_dir is None:
-            raise InputError("This server exports no files; start it with --export-dir.")
+            raise InputError("This server does not export files. Start it with --export-dir.")
         request = schema.ExportRequest(_question(prompts), object=object_number, format=format)
         content = http_api.export(self._run(run), request)
         name = Path(content.name or "selection").name
@@ -135,7 +136,7 @@ class Tools:
         return _text({"file": path.name, "bytes": len(content.body)})
 
     def inventory(self, run: str) -> dict[str, Any]:
-        """Return the main objects of a scene."""
+        """Return the main objects of a scene as JSON types."""
         served = self._run(run)
         return served.cached(b"inventory", lambda: http_api.inventory(served, {}))
 
@@ -149,10 +150,10 @@ class Tools:
 
 
 def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
-    """Return the MCP server of some runs.
+    """Return an MCP server for the runs of a server.
 
     Args:
-        export_dir: folder below which the tool export writes; None: there is no such tool.
+        export_dir: folder that the tool export writes to; None: do not offer this tool.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
     tools = Tools(server, export_dir)
@@ -174,7 +175,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
 
 
 def _guarded(server: WarmServer, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a coroutine function that runs a function in a thread; its errors name no paths of this machine."""
+    """Return a coroutine function that calls `function` in a thread and removes absolute paths from its errors."""
 
     @wraps(function)
     async def run(**arguments: Any) -> Any:
@@ -195,7 +196,7 @@ def _selection(prompts: list[str], number: int | None) -> schema.Selection:
 
 
 def _view_of(served: ServedRun, selection: schema.Selection) -> Any:
-    """Return a camera that looks at an object from where nothing occludes it."""
+    """Return a camera that looks at an object from a position without occlusion."""
     state = schema.select_state(served, msgspec.structs.replace(selection, object=None))
     return served.view_of(schema.find_object(state, selection.object or 1), None, served.space.empty_mask() == 0)
 
@@ -207,9 +208,9 @@ def _data(url: str) -> bytes:
 
 
 def _text(content: Any) -> str:
-    """Return JSON, bounded in length and with numbers of few digits."""
+    """Encode content as JSON with four significant digits, cut off after `_MAX_RESULT` characters."""
     text = msgspec.json.encode(_rounded(msgspec.to_builtins(content))).decode()
-    return text if len(text) <= _MAX_RESULT else text[:_MAX_RESULT] + " … (cut off: ask for fewer prompts)"
+    return text if len(text) <= _MAX_RESULT else text[:_MAX_RESULT] + " … (cut off; use fewer prompts)"
 
 
 def _rounded(content: Any) -> Any:
@@ -221,25 +222,27 @@ def _rounded(content: Any) -> Any:
 
 
 def serve_stdio(server: WarmServer, export_dir: Path | None) -> None:
-    """Speak MCP on standard input and output until the agent closes it."""
+    """Serve MCP on standard input and output until the agent closes them."""
     anyio.run(make_mcp(server, export_dir).run_stdio_async)
 
 
 def http_options(server: WarmServer, export_dir: Path | None) -> dict[str, Any]:
-    """Return the arguments of `WarmServer.start` with which it also speaks MCP at /mcp."""
+    """Return the arguments of `WarmServer.start` that add the MCP endpoint /mcp."""
     mcp = make_mcp(server, export_dir)
     unchecked = TransportSecuritySettings(enable_dns_rebinding_protection=False)  # `app.Guard` checks all requests
     app = mcp.streamable_http_app(json_response=True, stateless_http=True, transport_security=unchecked)
     (route,) = [one for one in app.routes if isinstance(one, Route) and one.path == "/mcp"]
 
     class Authorized:
-        """The endpoint; from other machines, it takes requests with the access token only."""
+        """Endpoint /mcp, which requires the access token unless the server listens on localhost only."""
 
         async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
             access = dict(scope["headers"]).get(b"authorization", b"").decode("latin-1").removeprefix("Bearer ")
             if server.options.is_local or server.options.knows(access):
                 return await route.app(scope, receive, send)
-            refused = JSONResponse({"error": "This server needs its access token: Authorization: Bearer TOKEN"}, 401)
+            refused = JSONResponse(
+                {"error": "MCP needs the access token in the header Authorization: Bearer TOKEN"}, 401
+            )
             return await refused(scope, receive, send)
 
     return {"extra_routes": [Route("/mcp", Authorized())], "lifespan": lambda app: mcp.session_manager.run()}

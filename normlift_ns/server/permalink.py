@@ -1,4 +1,4 @@
-"""Greeting of a page, and links that carry a query and a camera."""
+"""Greeting of a page, and links that store a query and a camera."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from normlift_ns.session.prompts import join_prompts
 from normlift_ns.session.state import State
 
 MAX_LINK_LENGTH = 6000
-"""Maximum number of characters of a link; servers refuse lines of 8 KB."""
+"""Maximum number of characters in a link; web servers reject request lines longer than 8 KB."""
 Finite = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
 Place = tuple[Finite, Finite, Finite]
 Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 
 
 class PageView(msgspec.Struct, frozen=True):
-    """Camera of a page, in the units of the scene."""
+    """Camera of a page, in scene units."""
 
     position: Place
     look_at: Place
@@ -37,7 +37,7 @@ class PageView(msgspec.Struct, frozen=True):
 
     @property
     def is_valid(self) -> bool:
-        """True if the camera looks at another point than its own position, and not along its vertical."""
+        """True if `look_at` differs from `position` and the viewing direction is not parallel to `up`."""
         ahead = np.subtract(self.look_at, self.position)
         return bool(np.linalg.norm(np.cross(ahead, self.up)) > 0)
 
@@ -52,13 +52,13 @@ class PageView(msgspec.Struct, frozen=True):
 
 
 class Link(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A query and a camera."""
+    """Query and camera of a link."""
 
     prompts: str = ""
     clicks: dict[str, Annotated[int, msgspec.Meta(ge=0)]] = {}
-    """Clicked Gaussians by the names of their prompts."""
+    """Indices of clicked Gaussians, by the prompt texts that stand for the clicks."""
     threshold: Finite | None = None
-    """Threshold chosen by the user; None: the default one."""
+    """Threshold that the user chose; None for the default."""
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     look: str = "overlay"
     """Color mode."""
@@ -69,19 +69,19 @@ class Greeting(msgspec.Struct, frozen=True):
     """First message of a page."""
 
     token: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
-    """Random text that the tab keeps, by which a page that is loaded again gets its session back."""
+    """Random text stored in the browser tab; it identifies the session after a reload."""
     link: Annotated[str, msgspec.Meta(max_length=MAX_LINK_LENGTH)] = ""
-    """Query of the address of the page, with or without the question mark."""
+    """Query string of the page's URL, with or without the question mark."""
     webgl: bool = True
     access: Annotated[str, msgspec.Meta(max_length=200)] = ""
-    """Access token of the server, which allows to write; see `app.ServerOptions`."""
+    """Access token for writing; see `app.ServerOptions`."""
 
 
 def link_of(state: State, clicks: Mapping[str, int], view: PageView | None) -> Link:
     """Return the link to a state and a camera.
 
     Args:
-        clicks: clicked Gaussians by the names of their prompts.
+        clicks: indices of clicked Gaussians, by the prompt texts that stand for the clicks.
     """
     query = state.query
     if query is None:
@@ -92,7 +92,7 @@ def link_of(state: State, clicks: Mapping[str, int], view: PageView | None) -> L
 
 
 def write_link(link: Link) -> str:
-    """Return a link as the query of an address.
+    """Encode a link as the query string of a URL.
 
     Raises:
         ValueError: the link is too long.
@@ -102,15 +102,17 @@ def write_link(link: Link) -> str:
     """
     text = "q=" + base64.urlsafe_b64encode(msgspec.json.encode(link)).decode().rstrip("=")
     if len(text) > MAX_LINK_LENGTH:
-        raise InputError(f"A link to these prompts has {len(text):,} characters; browsers take {MAX_LINK_LENGTH:,}.")
+        raise InputError(
+            f"The link has {len(text):,} characters; the maximum is {MAX_LINK_LENGTH:,}. Use fewer or shorter prompts."
+        )
     return text
 
 
 def read_link(query: str) -> Link | None:
-    """Return the link in the query of an address; None if it holds none.
+    """Decode the link in the query string of a URL; return None if there is no link.
 
     Raises:
-        ValueError: the link is cut off or damaged.
+        ValueError: the link is truncated or damaged.
     """
     text = next((part[2:] for part in query.removeprefix("?").split("&") if part.startswith("q=")), None)
     if text is None:
@@ -118,4 +120,4 @@ def read_link(query: str) -> Link | None:
     try:
         return msgspec.json.decode(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)), type=Link)
     except (binascii.Error, ValueError, RecursionError) as error:
-        raise InputError(f"The link of this page cannot be read ({error}); copy it again.") from error
+        raise InputError(f"The link of this page cannot be read ({error}). Copy the whole link again.") from error

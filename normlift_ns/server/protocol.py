@@ -1,4 +1,4 @@
-"""Messages of a page to the server: every action with the type of its value."""
+"""Messages from a page to the server: actions and the types of their values."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Row = tuple[Finite, Finite, Finite, Finite]
 
 
 class Message(msgspec.Struct, frozen=True):
-    """Message of a page."""
+    """Message from a page."""
 
     action: str
     value: msgspec.Raw = msgspec.Raw(b"null")
     seq: int = 0
-    """Number of the message, which all answers to it repeat."""
+    """Number of the message; responses repeat it."""
 
 
 class Ask(msgspec.Struct, frozen=True):
-    """Question: prompts separated by commas."""
+    """Line of prompts, separated by commas, and negative prompts."""
 
     line: Text
     negatives: Texts | None = None
@@ -47,25 +47,25 @@ class CameraValue(msgspec.Struct, frozen=True):
     height: Side
 
     def camera(self) -> Camera:
-        """Return the camera; raises ValueError if it is not valid."""
+        """Return the camera; raise ValueError if it is not valid."""
         return Camera(torch.tensor(self.K), torch.tensor(self.world_to_camera), self.width, self.height)
 
 
 class Ray(msgspec.Struct, frozen=True):
-    """Ray in the units of the scene."""
+    """Ray in scene units."""
 
     origin: Place
     direction: Place
 
 
 class Pick(Ray, frozen=True):
-    """Click; "like" asks for everything similar to the clicked Gaussian."""
+    """Click on a Gaussian; the mode "like" searches for all similar Gaussians."""
 
     mode: Literal["select", "add", "remove", "like"] = "select"
 
 
 class Region(msgspec.Struct, frozen=True):
-    """Polygon in pixels of a camera."""
+    """Polygon in pixel coordinates of a camera."""
 
     polygon: Points
     camera: CameraValue
@@ -73,7 +73,7 @@ class Region(msgspec.Struct, frozen=True):
 
 
 class Brush(msgspec.Struct, frozen=True):
-    """Trace of a brush in pixels of a camera."""
+    """Brush stroke in pixel coordinates of a camera."""
 
     points: Points
     radius: Annotated[float, msgspec.Meta(gt=0, le=2000)]
@@ -82,7 +82,7 @@ class Brush(msgspec.Struct, frozen=True):
 
 
 class ObjectAction(msgspec.Struct, frozen=True):
-    """Selection of a listed object."""
+    """Listed object to select, add or remove."""
 
     id: Count
     mode: Mode = "select"
@@ -96,19 +96,19 @@ class Target(msgspec.Struct, frozen=True):
 
 
 class Save(msgspec.Struct, frozen=True):
-    """Storage of prompts in the run, instead of or in addition to those stored there."""
+    """Request to store prompts in the run; `replace` deletes the prompts that are already stored."""
 
     replace: bool = False
 
 
 class LayerName(msgspec.Struct, frozen=True):
-    """Layer."""
+    """Name of a layer."""
 
     name: Text
 
 
 class LayerVisibility(LayerName, frozen=True):
-    """Layer to show or hide."""
+    """Name of a layer to show or hide."""
 
     visible: bool
 
@@ -121,7 +121,7 @@ class Export(msgspec.Struct, frozen=True):
 
 
 class Still(msgspec.Struct, frozen=True):
-    """Image of what the page shows, rendered by the server."""
+    """Request for an image of the current view, rendered by the server."""
 
     max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -145,37 +145,37 @@ VALUES: dict[str, Any] = {
     "grow": _Step, "object": ObjectAction, "go_to": Target, "save_prompts": Save | None,
     "layer_visible": LayerVisibility, "export": Export, "camera": PageView, "still": Still,
 }  # fmt: skip
-"""Types of the values, by action."""
+"""Type of the value of each action."""
 
 
 def read_message(text: str | bytes) -> Message:
-    """Return a message of a page.
+    """Decode a message from a page.
 
     Raises:
-        ValueError: it is not a valid message.
+        ValueError: `text` is not a valid message.
     """
     return decode(text, Message)
 
 
 def read_value(message: Message) -> Any:
-    """Return the value of a message.
+    """Decode the value of a message.
 
     Raises:
-        ValueError: there is no such action, or its value is not valid.
+        ValueError: the action is unknown, or its value is not valid.
     """
     if message.action not in VALUES:
-        raise InputError(f"There is no action {message.action[:40]!r}.")
+        raise InputError(f"The server does not support the action {message.action[:40]!r}. Reload the page.")
     kind = VALUES[message.action]
     return None if kind is Any else decode(message.value, kind)
 
 
 def decode(text: str | bytes | msgspec.Raw, kind: Any) -> Any:
-    """Decode JSON of a type.
+    """Decode JSON to the type `kind`.
 
     Raises:
-        ValueError: it is not valid.
+        ValueError: the JSON is malformed or does not match the type.
     """
     try:
         return msgspec.json.decode(text, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"The server does not understand this request: {error}.") from error
+        raise InputError(f"The request is not valid: {error}.") from error

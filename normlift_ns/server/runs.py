@@ -1,4 +1,4 @@
-"""Open runs with everything that their pages share, and a store of several runs within a memory limit."""
+"""Open runs with the data that their pages share, and a store that keeps several runs within a memory limit."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, State
 
 MAX_MEMORIES = 64
-"""Number of pages that are remembered after they were closed."""
+"""Maximum number of closed pages whose sessions are kept."""
 _MAX_RESULTS, _MAX_RESULT_BYTES = 256, 2**26
-"""Number and size of the results of a run that are kept."""
+"""Maximum number and total size in bytes of the cached results of a run."""
 _SAMPLE = 4096
 _NUM_EXAMPLES, _NUM_CANDIDATES = 4, 24
 _BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray")
@@ -51,9 +51,9 @@ _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
 _JPEG_QUALITY = 85
 _MEMORY_SHARE = 0.5
-"""Share of the free memory that open runs may take."""
+"""Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()
-"""Held while an image is rendered, because numba's threads do not support two renders at a time."""
+"""Lock for rendering, because numba's threads do not support two renders at the same time."""
 
 
 T = TypeVar("T")
@@ -61,55 +61,55 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class PageMemory:
-    """Session of one page, which is kept when the connection is lost."""
+    """Session of one page, which is kept after the page loses its connection."""
 
     history: History[State]
     line: str = ""
     """Text of the search box."""
     clicks: dict[str, int] = field(default_factory=dict)
-    """Clicked Gaussians by the names of their prompts."""
+    """Indices of clicked Gaussians, by the prompt texts that stand for the clicks."""
     negatives: tuple[str, ...] | None = None
-    """Negative prompts of the next query; None: those of the encoder."""
+    """Negative prompts of the next query; None for those of the encoder."""
     rule: str = "auto"
     min_reliability: float = 0.0
     view: PageView | None = None
     link: str = ""
-    """The last link that was followed or made."""
+    """Link that the page opened or created last."""
     page: object | None = None
-    """The page that shows this session now."""
+    """Open page of this session; None if the page is closed."""
 
 
 @dataclass(eq=False)
 class ServedRun:
-    """An open run, shared by all pages and requests.
+    """Open run, shared by all pages and requests.
 
     Args:
-        max_gaussians: largest number of Gaussians to draw: the most opaque and largest ones.
+        max_gaussians: maximum number of Gaussians to draw; large and opaque ones have priority.
     """
 
     id: str
     run: LiftedRun
     max_gaussians: int
     reading: threading.Lock = field(default_factory=threading.Lock)
-    """Held while the text encoder or the votes are used, so that they are not loaded twice."""
+    """Lock for the text encoder and the votes, so that no two threads load them."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
     _results: OrderedDict[bytes, tuple[Any, int]] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
 
     @cached_property
     def space(self) -> SelectionContext:
-        """The field with the centers of its Gaussians."""
+        """Field of the run with the centers of its Gaussians."""
         return SelectionContext(self.run.field, self.run.scene.gaussians.means.detach())
 
     @cached_property
     def visible(self) -> Bool[torch.Tensor, " n"]:
-        """Mask of the Gaussians that are opaque enough to be seen."""
+        """Mask of the Gaussians that are opaque enough to be visible."""
         gaussians = self.run.scene.gaussians
         return gaussians.drawable & (gaussians.opacities >= MIN_OPACITY)
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Rows of the drawn Gaussians, ascending."""
+        """Indices of the drawn Gaussians in the scene, in ascending order."""
         gaussians, rows = self.run.scene.gaussians, self.visible.nonzero().squeeze(1)
         if len(rows) > self.max_gaussians:
             largest = gaussians.scales[rows].double().topk(2, dim=1).values.prod(dim=1)
@@ -118,7 +118,7 @@ class ServedRun:
 
     @cached_property
     def drawn_scene(self) -> GaussianScene:
-        """The drawn Gaussians."""
+        """Scene of the drawn Gaussians."""
         whole, rows = self.run.scene.gaussians, torch.from_numpy(self.rows)
         return GaussianScene(
             *(x.detach().cpu()[rows] for x in (whole.means, whole.quats, whole.scales, whole.opacities))
@@ -137,7 +137,7 @@ class ServedRun:
 
     @cached_property
     def frame(self) -> tuple[list[float], list[float], float]:
-        """Up direction of the cameras, center of the scene, and the radius that contains most of it."""
+        """Mean up direction of the cameras, center of the scene, and a radius that contains 80 % of it."""
         poses = [camera.world_to_camera.double().cpu().numpy() for camera in self.run.scene.train.cameras]
         up = -np.mean([pose[1, :3] for pose in poses], axis=0) if len(poses) > 0 else np.zeros(3)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
@@ -153,7 +153,7 @@ class ServedRun:
 
     @cached_property
     def first_view(self) -> PageView | None:
-        """The camera of the first training image, looking as far as the scene is away; None without images."""
+        """Camera of the first training image, looking at the median depth of the scene; None without images."""
         cameras = self.run.scene.train.cameras
         if len(cameras) == 0:
             return None
@@ -167,7 +167,7 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Words of the encoder's own vocabulary that are found in the scene, at different places; [] if it has none."""
+        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without vocabulary."""
         color = encoder_name(self.run.field) == "color"
         words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
         if len(words) == 0:
@@ -190,19 +190,19 @@ class ServedRun:
 
     @cached_property
     def pca(self) -> Float[torch.Tensor, "n 3"]:
-        """Three principal components of the features, in 0..1."""
+        """Three principal components of the feature of every Gaussian, in 0..1."""
         axes, ends = pca_of(self.run.field.directions(torch.from_numpy(self.rows[:: 1 + len(self.rows) // _SAMPLE])))
         values = self.run.field.query(axes).double()
         return ((values - ends[:, 0]) / (ends[:, 1] - ends[:, 0]).clamp(min=1e-9)).clamp(0, 1)
 
     @cached_property
     def floaters(self) -> Bool[torch.Tensor, " n"]:
-        """Mask of the Gaussians that likely belong to no surface."""
+        """Mask of the likely floaters, which are Gaussians that are not part of a surface."""
         with self.reading:
             return find_floaters(self.run.scene.gaussians, self.run.field.scalars).mask
 
     def describe(self, *, read_only: bool) -> dict[str, Any]:
-        """Return the facts of the run for `GET /api/runs`."""
+        """Return the properties of the run as JSON types, for `GET /api/runs`."""
         (up, center, radius), drawn = self.frame, len(self.rows)
         return {
             "id": self.id, "name": self.run.scene.name, "encoder": encoder_name(self.run.field) or "",
@@ -212,49 +212,49 @@ class ServedRun:
         }  # fmt: skip
 
     def weights(self, origin: Sequence[float], direction: Sequence[float]) -> Float[torch.Tensor, " n"]:
-        """Return the weights of the Gaussians on a ray."""
+        """Return the compositing weights of all Gaussians on a ray; raise ValueError if the direction is zero."""
         if not any(direction):
             raise InputError("The direction of a ray must not be zero.")
         start, ahead = (torch.tensor(x, dtype=torch.float64) for x in (origin, direction))
         return ray_weights(self.run.scene.gaussians, start, ahead)
 
     def read(self, texts: Sequence[str]) -> Any:
-        """Return the vectors of texts."""
+        """Return the embedding of each text."""
         with self.reading:
             return self.run.texts.rows(texts)
 
     def stored(self) -> dict[str, Any]:
-        """Return the vectors of the prompts that the run stores."""
+        """Return the embeddings of the prompts stored in the run, by text."""
         return {row.text: row.vector for row in prompts_of_query(load_query(self.run.folder / FIELD_FOLDER))}
 
     def known(self, clicks: Mapping[str, int]) -> dict[str, Any]:
-        """Return the vectors that need no encoder: of stored prompts and of clicks.
+        """Return the vectors of stored prompts and of clicks, which do not need an encoder.
 
         Raises:
-            ValueError: a click is on a Gaussian that this scene does not have.
+            ValueError: a click refers to a Gaussian that this scene does not have.
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
-                raise InputError(f"{name}: this scene has no Gaussian {gaussian:,}; the link is for another one.")
+                raise InputError(f"{name}: there is no Gaussian {gaussian:,}. The link is for another scene.")
         rows = self.space.field.directions(torch.tensor(list(clicks.values()), dtype=torch.long)).cpu().numpy()
         return {**self.stored(), **{name: row for name, row in zip(clicks, rows) if np.any(row)}}
 
     def save(self, query: Query | None, *, replaces: bool = False) -> str:
-        """Store prompts in the run; return their number in words."""
+        """Store prompts in the run, and return the number of stored prompts as text; see `store_query`."""
         return store_query(self.run.folder / FIELD_FOLDER, query, replaces=replaces)
 
     def export(self, state: State, mask: Bool[torch.Tensor, " n"], name: str, kind: str) -> tuple[str, bytes, str]:
-        """Return the name and content of a file of Gaussians, and a message; see `selection_bytes`."""
+        """Return the name and content of a file of Gaussians, and a message for the user; see `selection_bytes`."""
         file, content = selection_bytes(self.run.scene, self.run.field, state, mask, name, kind)
         faint = int((mask & ~self.visible).sum())
-        note = f" {faint:,} Gaussians are too faint to be drawn (opacity below 1/255)." if faint > 0 else ""
+        note = f" It also has {faint:,} Gaussians that are too faint to see (opacity below 1/255)." if faint > 0 else ""
         return file, content, f"Downloaded {file} with {int(mask.sum()) - faint:,} Gaussians.{note}"
 
     def cached(self, key: bytes, compute: Callable[[], T], size: Callable[[T], int] = lambda result: 0) -> T:
-        """Return a result of this run by its key; the latest ones are kept.
+        """Return the cached result for a key, and compute it if necessary; the most recently used results are kept.
 
         Args:
-            size: returns the bytes of a result.
+            size: function that returns the size of a result in bytes.
         """
         with self._memory_lock:
             found = self._results.pop(key, None)
@@ -271,15 +271,17 @@ class ServedRun:
     def view_of(
         self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
     ) -> PageView:
-        """Return a camera that looks at an object or a point, from where nothing occludes it.
+        """Return a camera that looks at an object or a point from a position without occlusion.
 
         Args:
-            view: current camera; None: that of the first training image.
+            view: current camera; None for that of the first training image.
             drawn: mask of the Gaussians that are drawn.
+        Raises:
+            ValueError: `view` is None, and the run has no training images.
         """
         view = view or self.first_view
         if view is None:
-            raise InputError("The camera is not known yet; move it, and try again.")
+            raise InputError("The camera of the page is not known yet. Move the camera, and try again.")
         scene = self.run.scene.gaussians
         position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
         return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
@@ -287,11 +289,13 @@ class ServedRun:
     def image(self, index: int, max_size: int) -> bytes:
         """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
         if not 0 <= index < len(self.run.scene.train):
-            raise InputError(f"There is no image {index}; the run has {len(self.run.scene.train)} images.")
+            raise InputError(
+                f"There is no image {index}. The run has {len(self.run.scene.train)} images, numbered from 0."
+            )
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 
     def still(self, codes: Codes, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
-        """Render the drawn Gaussians in the colors of a state, as JPEG."""
+        """Render the drawn Gaussians in the colors of `codes`, as JPEG."""
         scene, rows = self.run.scene, torch.from_numpy(self.rows)
         kept = torch.from_numpy(codes.codes != NOT_DRAWN)
         own = scene.colors(camera).detach().cpu()[rows][kept].clamp(0, 1)
@@ -307,10 +311,10 @@ class ServedRun:
         return to_jpeg((shown.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
 
     def remember(self, token: str, page: object) -> tuple[PageMemory, str]:
-        """Return the session of a token, and the token that the page has from now on.
+        """Return the session of a token, and the token to use from now on.
 
-        A page that is open already, such as the original of a duplicated tab, keeps its session; the new page gets a
-        copy with a token of its own.
+        If another open page uses the token, as after duplicating a tab, the new page gets a copy of the session and a
+        new token.
         """
         with self._memory_lock:
             found = self._memories.get(token)
@@ -328,7 +332,7 @@ class ServedRun:
             return found, token
 
     def warm_up(self) -> None:
-        """Compute what the first page would wait for."""
+        """Compute in advance the data that the first page needs."""
         _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
         view = self.first_view
         if view is not None:
@@ -354,12 +358,13 @@ def to_jpeg(image: UInt8[np.ndarray, "h w 3"], max_size: int | None = None) -> b
 
 
 class RunStore:
-    """Runs by their ids, opened at first use. The least recently used ones are closed if memory becomes scarce.
+    """Store of runs by id. It opens runs at first use, and closes the least recently used ones above a memory limit.
 
     Args:
-        configs: paths of config.yml.
-        open_run: opens one of them.
-        memory_limit: bytes that open runs may take together; None: half of the memory that is free now.
+        configs: paths of the runs' config.yml files.
+        open_run: function that opens the run of a config.yml.
+        max_gaussians: as in `ServedRun`.
+        memory_limit: maximum size of all open runs in bytes (default: half of the free memory).
     """
 
     def __init__(
@@ -389,13 +394,13 @@ class RunStore:
         return [config.absolute().parent for config in self._configs.values()]
 
     def get(self, name: str) -> ServedRun:
-        """Return a run, after opening it if it is not open.
+        """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            ValueError: there is no such run, or it cannot be opened.
+            ValueError: no run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
-            raise InputError(f"There is no run {name!r}. The runs are: {', '.join(self.ids)}.")
+            raise InputError(f"There is no run {name!r}. Choose one of: {', '.join(self.ids)}.")
         with self._locks[name]:
             with self._lock:
                 if name in self._open:
@@ -412,13 +417,13 @@ class RunStore:
 
 
 def _estimated_bytes(run: LiftedRun) -> int:
-    """Return the size of the checkpoint and of the field, which are read into memory, with room for results."""
+    """Estimate the memory of an open run, as twice the size of its checkpoint and field files."""
     files = [run.scene.checkpoint_path, *(run.folder / FIELD_FOLDER).glob("*.safetensors")]
     return 2 * sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _run_ids(configs: Sequence[Path]) -> list[str]:
-    """Return a short unique name for each config, from the names of its experiment and its time stamp."""
+    """Return a short unique id for each config, made of the names of its experiment and time stamp folders."""
     names: list[str] = []
     for config in configs:
         parts = config.absolute().parent.parts
@@ -433,7 +438,7 @@ def _roots() -> tuple[str, ...]:
 
 
 def without_paths(text: str) -> str:
-    """Return a message in which absolute paths are reduced to their last name.
+    """Shorten absolute paths in a message to their last component.
 
     >>> without_paths("/home/me/captures/fox/config.yml is missing; see https://example.org/a/b")
     'config.yml is missing; see https://example.org/a/b'

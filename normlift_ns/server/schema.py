@@ -1,4 +1,4 @@
-"""Requests and answers of the HTTP API."""
+"""Request and response types of the HTTP API."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Arrays = Literal["none", "safetensors"]
 
 
 class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prompts, and how they select Gaussians; as in `LiftedRun.ask`."""
+    """Prompts and settings of a query, as in `LiftedRun.ask`."""
 
     texts: Annotated[list[Prompt], msgspec.Meta(min_length=1, max_length=64)]
     negatives: Annotated[list[Prompt], msgspec.Meta(max_length=64)] | None = None
@@ -40,45 +40,45 @@ class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class QueryRequest(Question, frozen=True, forbid_unknown_fields=True):
-    """Question, with the arrays that the answer contains."""
+    """Question, and the format of the arrays in the response."""
 
     arrays: Arrays = "none"
-    """safetensors: the answer is a safetensors file with `relevancy` [N, Q] float32 and `selected` [N, Q] bool, and the
-    JSON answer in its metadata."""
+    """safetensors: the response is a safetensors file with `relevancy` [N, Q] float32 and `selected` [N, Q] bool, and
+    the JSON response in its metadata."""
 
 
 class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Gaussians: those that prompts select, or one of these: an object, a ray, a region, floaters or a mask."""
+    """Selection of Gaussians by prompts, an object, a ray, a region or a mask, or of the likely floaters."""
 
     question: Question | None = None
-    """Prompts; None: no prompt selects."""
+    """Prompts that select Gaussians; None to select without prompts."""
     prompt: Annotated[int, msgspec.Meta(ge=0)] | None = None
-    """Index of the only prompt that selects."""
+    """Index of the prompt to select by (default: all prompts)."""
     object: Annotated[int, msgspec.Meta(ge=1)] | None = None
-    """Number of an object in the answer of /objects to this question."""
+    """Number of an object to select, from the response of /objects to the same question."""
     ray: Ray | None = None
-    """The object that a ray hits."""
+    """Ray to select the object that it hits."""
     region: Region | None = None
-    """Visible Gaussians inside a polygon in an image."""
+    """Polygon in an image to select the visible Gaussians inside it."""
     floaters: bool = False
-    """Likely floaters."""
+    """Select the likely floaters."""
     mask: Annotated[bytes, msgspec.Meta(max_length=2**22)] | None = None
-    """Mask of all Gaussians as packed bits, the first in the highest bit of the first byte; in base64."""
+    """Mask of all Gaussians as packed bits in base64. The highest bit of the first byte is the first Gaussian."""
     invert: bool = False
     """Select all other Gaussians instead."""
 
 
 class ExportRequest(Selection, frozen=True, forbid_unknown_fields=True):
-    """Selection to export; the answer is a file."""
+    """Selection to export; the response is a file."""
 
     format: Annotated[str, msgspec.Meta(max_length=20)] = "ply"
 
 
 class SelectRequest(Selection, frozen=True, forbid_unknown_fields=True):
-    """Selection whose rows are wanted."""
+    """Selection, and the format of its mask in the response."""
 
     arrays: Literal["none", "npy"] = "none"
-    """npy: the answer is the mask [N] as an NPY file."""
+    """npy: the response is the mask [N] as an NPY file."""
 
 
 class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,11 +86,11 @@ class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     question: Question
     replace: bool = True
-    """False: add its prompts to those stored in the run."""
+    """Replace the prompts stored in the run; False: add the new prompts to them."""
 
 
 class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Image of the scene; the answer is a JPEG file."""
+    """Request for an image of the scene; the response is a JPEG file."""
 
     view: str | int = 0
     """Name or index of a training image."""
@@ -101,12 +101,12 @@ class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     selection: Selection | None = None
     mode: ColorMode = "overlay"
     isolate: bool = False
-    """Draw the selection alone."""
+    """Draw only the selection."""
     max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
 
 
 class Histogram(msgspec.Struct, frozen=True):
-    """Histogram of relevancies, in bins of equal width."""
+    """Histogram of relevancies in bins of equal width, from `low` to `high`."""
 
     low: float
     high: float
@@ -116,7 +116,7 @@ class Histogram(msgspec.Struct, frozen=True):
 
 
 class PromptResult(msgspec.Struct, frozen=True):
-    """Result for one prompt; positions are in units of the scene. See `Finding`."""
+    """Result for one prompt, as in `Finding`; positions are in scene units."""
 
     text: str
     fraction: float
@@ -136,21 +136,21 @@ class QueryResult(msgspec.Struct, frozen=True):
 
     results: list[PromptResult]
     relevancy: str
-    """Rule that computed the relevancies."""
+    """Relevancy rule of the query."""
     threshold: float
     min_reliability: float
     num_gaussians: int
 
 
 class ObjectResult(msgspec.Struct, frozen=True):
-    """Object: a connected part of what a prompt selects. Positions are in units of the scene."""
+    """Object, a connected component of the selection of a prompt. Positions are in scene units."""
 
     id: int
     text: str
     count: int
     center: list[float]
     min: list[float]
-    """Lower corner of the box that holds 98 % of the centers along each axis."""
+    """Lower corner of the box that contains 98 % of the centers along each axis; `max` is its upper corner."""
     max: list[float]
     reliability: float
     views: float
@@ -158,12 +158,13 @@ class ObjectResult(msgspec.Struct, frozen=True):
 
 
 class ObjectsResult(msgspec.Struct, frozen=True):
-    """Objects, by prompt and by descending size."""
+    """Objects, ordered by prompt and by descending size."""
 
     objects: list[ObjectResult]
     left_out: int
-    """Number of further objects."""
+    """Number of objects that are not listed."""
     in_smaller_parts: int
+    """Number of selected Gaussians in components too small to be objects."""
 
 
 class SelectResult(msgspec.Struct, frozen=True):
@@ -177,11 +178,11 @@ class SelectResult(msgspec.Struct, frozen=True):
 
 
 class VoteResult(msgspec.Struct, frozen=True):
-    """Vote of an image."""
+    """Vote of an image for a selection."""
 
     name: str
     url: str | None
-    """The image with the regions that voted, as a data URL."""
+    """Image with outlines of the regions that voted, as a data URL."""
     regions: int
     share: float
     agreement: float
@@ -189,7 +190,7 @@ class VoteResult(msgspec.Struct, frozen=True):
 
 
 class ExplainResult(msgspec.Struct, frozen=True):
-    """Images that voted for a selection."""
+    """Explanation of a selection by the images that voted for it."""
 
     text: str
     agreement: float
@@ -203,10 +204,10 @@ MAX_OBJECTS = 64
 
 
 def make_query(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], Query]:
-    """Encode a question; return its prompts and the query.
+    """Encode a question, and return its prompts and the query.
 
     Raises:
-        ValueError: the encoder does not know a prompt.
+        ValueError: the encoder cannot encode a prompt.
     """
     settings = {"negatives": question.negatives, "relevancy": question.relevancy, "threshold": question.threshold}
     settings |= {"min_reliability": question.min_reliability, "refined": question.refined}
@@ -218,12 +219,12 @@ def make_query(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], 
 
 
 def answer(served: ServedRun, question: Question) -> Answer:
-    """Answer a question."""
+    """Return the answer to a question."""
     return served.space.answer(make_query(served, question)[1])
 
 
 def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
-    """Return the answer to a question, as arrays and as JSON types; the latest ones are cached."""
+    """Return the answer to a question as arrays and as JSON types, from the cache if possible."""
     return served.cached(msgspec.json.encode(question), lambda: _answered(served, question), _answer_size)
 
 
@@ -244,10 +245,10 @@ def query_result(result: Answer) -> QueryResult:
 
 
 def select_state(served: ServedRun, selection: Selection) -> State:
-    """Return a state whose selection is the one described.
+    """Return a state with the requested selection.
 
     Raises:
-        ValueError: it is not valid, or nothing is there.
+        ValueError: the selection is not valid, or its object, ray or region contains no Gaussians.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
@@ -267,14 +268,14 @@ def select_state(served: ServedRun, selection: Selection) -> State:
 
 
 def find_object(state: State, number: int) -> ObjectRow:
-    """Return an object by its number in the list of objects.
+    """Return the object with this number in the list of objects, from 1.
 
     Raises:
-        ValueError: there is no such object.
+        ValueError: the list has no object with this number.
     """
     objects = list_objects(state, max_objects=MAX_OBJECTS).objects
     if number > len(objects):
-        raise InputError(f"There is no object {number}; the selection has {len(objects)} objects.")
+        raise InputError(f"There is no object {number}. The selection has {len(objects)} objects, numbered from 1.")
     return objects[number - 1]
 
 
@@ -284,10 +285,10 @@ def pack_mask(mask: torch.Tensor) -> bytes:
 
 
 def unpack_mask(packed: bytes, count: int) -> torch.Tensor:
-    """Unpack a mask.
+    """Unpack the mask of `count` Gaussians.
 
     Raises:
-        ValueError: it has another length.
+        ValueError: the number of bytes does not match the number of Gaussians.
 
     >>> unpack_mask(pack_mask(torch.tensor([True, False, True])), 3).tolist()
     [True, False, True]
@@ -308,7 +309,7 @@ def objects_result(state: State) -> ObjectsResult:
 
 
 def extent(state: State, mask: torch.Tensor) -> tuple[list[float], list[float]]:
-    """Return the corners of the box that holds 98 % of the centers of some Gaussians along each axis."""
+    """Return the corners of the box that contains 98 % of the selected centers along each axis."""
     low, high = np.quantile(state.space.means[mask].double().cpu().numpy(), (0.01, 0.99), axis=0)
     return low.tolist(), high.tolist()
 
@@ -324,5 +325,5 @@ def select_result(served: ServedRun, state: State) -> SelectResult:
 
 
 def isolated(state: State) -> State:
-    """Return a state that draws its selection alone, in its own colors."""
+    """Return a state that draws only the selection, in trained colors."""
     return replace(actions.show_only(state), color_mode="rgb")

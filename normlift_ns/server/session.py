@@ -1,4 +1,4 @@
-"""One page: its actions on the state, in order, and what the server sends to it."""
+"""Session of one page: it applies the actions of the page in order, and sends messages to the page."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ from normlift_ns.session.prompts import (
 from normlift_ns.session.state import RequestTokens, State
 
 _MAX_PENDING = 256
-"""Number of actions of a page that may wait; a page that sends more is closed."""
+"""Maximum number of waiting actions; the server closes the connection of a page that sends more."""
 _REST = 0.03
-"""Seconds without a change after which objects and histograms are computed."""
+"""Seconds without a change after which the server computes objects and histograms."""
 _GREETING_TIMEOUT = 20.0
 _SPOT = 0.3
-"""Size of what is shown around a position, in radii of the scene."""
+"""Extent of the region around a position to look at, as a multiple of the scene's radius."""
 _SLIDERS = ("threshold", "reliability", "grow")
-"""Actions of which only the last of several waiting ones counts, and which make one step of the history."""
+"""Actions of sliders. Only the last waiting one is applied, and successive ones are merged in the history."""
 _LATEST = ("hover", "still", "camera")
-"""Actions that do not wait for others, and of which only the latest counts."""
+"""Actions that do not wait for other actions; each replaces a waiting one of the same name."""
 
 T = TypeVar("T")
 
@@ -70,7 +70,7 @@ class Latest(Generic[T]):
         self._event.set()
 
     async def take(self) -> T:
-        """Wait for a value, and remove it."""
+        """Wait for a value, remove it from the slot, and return it."""
         while len(self._values) == 0:
             self._event = Event()
             await self._event.wait()
@@ -86,7 +86,7 @@ class PageSocket(Protocol):
     """Connection to a page."""
 
     async def receive_text(self) -> str:
-        """Return the next message; raises an exception when the connection ends."""
+        """Return the next text message; raise an exception when the connection ends."""
         ...
 
     async def send_text(self, data: str) -> None:
@@ -100,18 +100,18 @@ class PageSocket(Protocol):
 
 @dataclass(frozen=True)
 class PageLimits:
-    """Threads that all pages share, and what pages may do."""
+    """Limits on threads, shared by all pages, and functions of the server that sessions call."""
 
     quick: CapacityLimiter
-    """For actions."""
+    """Limit on threads for actions."""
     asking: CapacityLimiter
-    """For questions, the first of which loads the text encoder."""
+    """Limit on threads for queries; the first query loads the text encoder."""
     slow: CapacityLimiter
-    """For explanations, exports and images."""
+    """Limit on threads for explanations, exports and images."""
     may_write: Callable[[str], bool]
-    """Returns whether a page with this access token may store prompts in a run."""
+    """Function that returns True if a page with this access token may store prompts in a run."""
     offer: Callable[[str, bytes], str]
-    """Keeps a file for a download; returns its address."""
+    """Function that stores a file for download and returns its URL path."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ class _Pending:
 class PageSession:
     """Session of one page.
 
-    All actions that change the state run in order, one at a time, in a thread of `limits.quick`. Slow requests run
-    beside them, and their result is applied like an action, unless it is stale.
+    Actions that change the state run one after another in a thread of `limits.quick`. Slow requests run concurrently
+    with them. The result of a slow request is applied like an action, unless a newer request has made it stale.
     """
 
     def __init__(self, served: ServedRun, socket: PageSocket, limits: PageLimits) -> None:
@@ -172,7 +172,7 @@ class PageSession:
         with anyio.fail_after(_GREETING_TIMEOUT):
             first = protocol.read_message(await self._socket.receive_text())
         if first.action != "greet":
-            raise InputError("The first message of a page must be its greeting.")
+            raise InputError('The first message of a page must have the action "greet".')
         greeting = protocol.read_value(first)
         self._memory, token = self._run.remember(greeting.token, self)
         self._read_only = not self._limits.may_write(greeting.access)
@@ -235,7 +235,7 @@ class PageSession:
                 await self._ask_similar(pending)
             elif pending.action != "greet":
                 await self._change(pending)
-        except Exception as error:  # libraries may raise anything; no error may end the session
+        except Exception as error:  # libraries may raise any exception, which must not end the session
             await self._tell(describe_error(error)[0], "error", pending.seq)
 
     def _step(self, pending: _Pending) -> None:
@@ -255,7 +255,7 @@ class PageSession:
 
         def compute() -> State:
             state = change(self._state, *arguments)
-            _ = state.selection  # computed here instead of when it is first sent
+            _ = state.selection  # cached by the state, so that sending it is quick
             return state
 
         state = await self._in_thread(compute, self._limits.quick)
@@ -295,7 +295,7 @@ class PageSession:
 
     def _object(self, number: int) -> ObjectRow:
         if number not in self._objects:
-            raise InputError("This object is no longer listed; choose one of the list.")
+            raise InputError("This object is no longer listed. Choose an object from the current list.")
         return self._objects[number]
 
     def _mask_of(self, ids: Sequence[int] | None) -> Bool[Tensor, " n"] | None:
@@ -306,7 +306,7 @@ class PageSession:
     # Slow requests.
 
     async def _ask(self, pending: _Pending) -> None:
-        """Answer the prompts of the search box, with new negatives or another rule if these were sent."""
+        """Update prompts, negatives or rule from an action, and start the query of the prompts in the search box."""
         memory = self._memory
         if pending.action == "ask":
             memory.line = pending.value.line
@@ -320,7 +320,7 @@ class PageSession:
         return await self._ask_line(pending.seq)
 
     async def _ask_similar(self, pending: _Pending) -> None:
-        """Ask for everything similar to a clicked Gaussian."""
+        """Start a query for all Gaussians similar to the clicked one."""
         memory = self._memory
         pick = partial(self._run.weights, pending.value.origin, pending.value.direction)
         gaussian = actions.pick_gaussian(self._state, await self._in_thread(pick, self._limits.quick))
@@ -343,7 +343,7 @@ class PageSession:
             known = self._run.known(memory.clicks)
             prompts = encode_prompts(line, self._run.read, known)
             rows, query = build_query(self._run.space.field, prompts, self._run.read, **options)
-            self._run.space.answer(query)  # cached for the state
+            self._run.space.answer(query)  # the state gets this answer from the cache
             return lambda state: self._visible(actions.ask(state, rows, query))
 
         await self._start("Searching …", compute, seq)
@@ -358,7 +358,7 @@ class PageSession:
     async def _start(
         self, text: str, compute: Callable[[], Callable[[State], State]], seq: int, done: str = ""
     ) -> None:
-        """Start a slow request; its result is a function that makes the new state of the current one."""
+        """Start a slow request, whose result is a function from the current state to the new state."""
         token = self._tokens.start(text)
 
         async def work() -> None:
@@ -398,7 +398,7 @@ class PageSession:
         row = None if value.object is None else self._object(value.object)
         mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
         if not bool(mask.any()):
-            raise InputError("Nothing is selected; there is nothing to export.")
+            raise InputError("Nothing is selected. Select Gaussians to export first.")
 
         async def work() -> None:
             try:
@@ -414,19 +414,19 @@ class PageSession:
     async def _save(self, pending: _Pending) -> None:
         if self._read_only:
             raise InputError(
-                "This page may not store prompts in the run. Start the server without --read-only and, for pages of "
-                "other machines, open the address with the access token that it prints."
+                "This page may not store prompts in the run. Start the server without --read-only. On another machine, "
+                "open the address with the access token that the server prints."
             )
         replaces = pending.value is not None and pending.value.replace
         store = partial(self._run.save, self._state.query, replaces=replaces)
         count = await self._in_thread(store, self._limits.slow)
-        await self._tell(f"The run stores {count} now.", "done", pending.seq)
+        await self._tell(f"The run now stores {count}.", "done", pending.seq)
 
     async def _go_to(self, pending: _Pending) -> None:
-        """Move the camera to an object or a position: closer, and where nothing occludes it."""
+        """Move the camera close to an object or a position, without occlusion."""
         value = pending.value
         if value.id is None and value.position is None:
-            raise InputError("Name an object or a position to go to.")
+            raise InputError("The action go_to needs the id of an object or a position.")
         spot = LookAtTarget(value.position or (0.0, 0.0, 0.0), _SPOT * self._run.frame[2])
         target = spot if value.id is None else self._object(value.id)
         find = partial(self._run.view_of, target, self._memory.view, self._state.drawn)
@@ -437,17 +437,17 @@ class PageSession:
         place = {"position": view.position, "look_at": view.look_at, "up": view.up, "fov": view.fov}
         await self._send(type="camera", seq=seq, **place)
 
-    # What the page is told.
+    # Outgoing messages.
 
     async def _greet(self, greeting: Greeting, token: str, seq: int) -> None:
-        """Bring back what was lost with the connection, or follow a link."""
+        """Send the restored session to the page, and apply the link in its URL."""
         memory = self._memory
         fresh = memory.view is None and len(memory.history.states) == 1
         link = await self._follow(greeting, seq)
         stored = await self._in_thread(lambda: list(self._run.stored()), self._limits.slow)
         if fresh and len(stored) > 0 and (link is None or not link.prompts):
             memory.line = join_prompts(stored)
-            await self._tell("Saved prompts for this scene: press Ask", "info", seq)
+            await self._tell("This scene has saved prompts. Press Ask to search for them.", "info", seq)
         await self._send(type="token", token=token, link=memory.link, read_only=self._read_only, seq=seq)
         view = memory.view or await self._in_thread(lambda: self._run.first_view, self._limits.slow)
         if view is not None:
@@ -458,7 +458,7 @@ class PageSession:
             await self._ask_line(seq, threshold=link.threshold)
 
     async def _follow(self, greeting: Greeting, seq: int) -> Link | None:
-        """Take clicks, camera and color mode from the link of a page, unless it has followed this link before."""
+        """Apply clicks, camera and color mode from the link in the page's URL, unless the page opened it before."""
         memory, link = self._memory, None
         try:
             link = read_link(greeting.link) if greeting.link != memory.link else None
@@ -473,7 +473,7 @@ class PageSession:
         return link
 
     async def _paint(self) -> None:
-        """Send colors and state after each change, and details after a rest."""
+        """Send colors and state after each change, and details after a pause."""
         while True:
             seq = await self._dirty.take()
             try:
@@ -514,7 +514,7 @@ class PageSession:
             try:
                 describe = partial(describe_hover, self._run, self._state, pending.value, tuple(self._objects.items()))
                 result = await self._in_thread(describe, self._limits.quick)
-            except Exception:  # a hover must never disturb
+            except Exception:  # a hover must not show errors
                 result = None
             empty = dict.fromkeys(("label", "relevancy", "reliability", "object", "position", "distance"))
             await self._send(type="hover", seq=pending.seq, **(result or empty))
@@ -526,7 +526,7 @@ class PageSession:
             try:
                 view = self._memory.view or self._run.first_view
                 if view is None:
-                    raise InputError("The camera of the page is not known yet.")
+                    raise InputError("The camera of the page is not known yet. Move the camera, and try again.")
                 camera = view.camera(pending.value.max_size)
                 draw = partial(self._still, state, camera, pending.value.background)
                 jpeg = await self._in_thread(draw, self._limits.slow)

@@ -31,14 +31,14 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """The words that count, if the encoder ignores others, and the verdict on a prompt that is not found, or a warning
-    that nothing reaches the threshold, with the nearest match; empty otherwise."""
+    """Warning about the prompt, or an empty string. The warning lists the words that the encoder uses, if it ignores
+    other words. If the prompt is not found or selects no Gaussian, it describes the nearest match."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return the diagnostics of the first `max_prompts` prompts that select; none if the selection was made by hand."""
+    """Return diagnostics of the first `max_prompts` prompts that select; () if the selection was made by hand."""
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
@@ -66,13 +66,13 @@ def _warning(finding: Finding, histogram: Histogram) -> str:
     if finding.peak is None or bool(finding.mask.any()):
         return read_as.strip()
     return read_as + (
-        f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
-        f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Use suggested."
+        f"{finding.text}: no Gaussian is above the threshold of {finding.answer.question.threshold:.2f}. "
+        f"The nearest match{position} has relevancy {finding.peak:.2f}. Lower the threshold, or press Use suggested."
     )
 
 
 def threshold_suggestion(state: State) -> float | None:
-    """Return the threshold suggested by the histogram of the prompts that select; None without a suggestion."""
+    """Return the threshold that the relevancies of the selecting prompts suggest; None if there is none."""
     if state.answer is None:
         return None
     result = state.answer if state.shown is None else Finding(state.answer, state.shown)
@@ -80,9 +80,9 @@ def threshold_suggestion(state: State) -> float | None:
 
 
 def carry_threshold(state: State, question: Query) -> Query:
-    """Return a new query with the threshold of the previous one, if both use the same rule.
+    """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    A query that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
+    If `question` uses the suggested threshold, it keeps it unless the user chose the previous threshold.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -101,40 +101,39 @@ def _only_clicks(question: Query) -> bool:
 
 # User actions: each function takes a state and returns a new one, or the same state if nothing changes.
 #
-# An action that is not possible raises ValueError (`InputError`) with a message for the user; the state stays as it
-# was.
+# An action that is not possible raises ValueError (`InputError`) with a message for the user.
 
 
 ClickMode = Literal["select", "add", "remove"]
-"""Effect of a click on the object under it."""
+"""Effect of a click: select the object at this position, add it to the selection, or remove it."""
 MAX_LAYERS = 32
 MAX_GROW_STEPS = 10
-"""Largest number of steps by which a selection can be grown or shrunk."""
+"""Maximum number of steps for growing or shrinking a selection."""
 MIN_THRESHOLD, MAX_THRESHOLD = -0.2, 1.0
 """Range of the threshold slider."""
-FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo brings them back."
+FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo shows them again."
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
-    """Answer a query. Hidden Gaussians stay hidden; selections by click are dropped.
+    """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
-        prompts: all rows, from `pose`.
-        question: the query of these rows, from `pose`.
+        prompts: all rows, from `build_query`.
+        question: query of these rows, from `build_query`.
     Raises:
-        ValueError: the vectors differ in length from the field's.
+        ValueError: the vectors have a different dimension than the field.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
     return _with_suggested_threshold(replace(_unasked(state), prompts=tuple(prompts), query=question, action=did))
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
-    """Answer the same prompts with another rule or other features. Selections by click are kept."""
+    """Apply a query with the same prompts but another rule or other features. Clicked selections are kept."""
     return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
 def _with_suggested_threshold(state: State) -> State:
-    """Apply the suggested threshold if the query asks for it. Invalid queries raise here."""
+    """Apply the suggested threshold if the query asks for it; raise ValueError if the query is not valid."""
     if state.answer is None or state.query is None or not state.query.suggest_threshold:
         return state
     return replace(state, query=state.answer.question)
@@ -146,13 +145,13 @@ def clear(state: State) -> State:
 
 
 def _unasked(state: State) -> State:
-    """Return the state without query and selection."""
+    """Return the state without its query and selection."""
     state = replace(state, prompts=(), query=None, shown=None, prompts_select=True)
     return replace(state, added=None, removed=None, additions=(), grow_steps=0)
 
 
 def set_threshold(state: State, value: float) -> State:
-    """Set the relevancy above which Gaussians are selected, clamped to the range of the slider."""
+    """Set the threshold, the relevancy above which Gaussians are selected; clamp it to the range of the slider."""
     value = min(MAX_THRESHOLD, max(MIN_THRESHOLD, value))
     if state.query is None or value == state.query.threshold:
         return state
@@ -161,19 +160,19 @@ def set_threshold(state: State, value: float) -> State:
 
 
 def use_suggested_threshold(state: State) -> State:
-    """Set the threshold suggested by the relevancies of the prompts that select.
+    """Set the threshold that the relevancies of the selecting prompts suggest.
 
     Raises:
         ValueError: there is no query.
     """
     value = threshold_suggestion(state)
     if value is None:
-        raise InputError("No query yet; there is no threshold to suggest.")
+        raise InputError("There is no query yet, so no threshold can be suggested. Type a prompt and press Ask.")
     return set_threshold(state, value)
 
 
 def set_min_reliability(state: State, value: float) -> State:
-    """Set the reliability R, clamped to 0..1, that Gaussians selected by prompts must have."""
+    """Set the minimum reliability R of Gaussians that prompts select; clamp it to 0..1."""
     value = min(1.0, max(0.0, value))
     if state.query is None or value == state.query.min_reliability:
         return state
@@ -181,13 +180,17 @@ def set_min_reliability(state: State, value: float) -> State:
 
 
 def remove_weak(state: State) -> State:
-    """Remove Gaussians with weak evidence from the selection, including those selected by clicks."""
+    """Remove Gaussians with weak evidence from the selection, including clicked ones."""
     poor = state.selection & (state.space.field.scalars.reliability < WEAK_RELIABILITY)
     return remove(state, poor, "Leave out Gaussians with weak evidence")
 
 
 def show_prompt(state: State, shown: int | None) -> State:
-    """Let only one prompt of the query select; None: all of them."""
+    """Select by only one prompt of the query.
+
+    Args:
+        shown: index of the prompt; None for all prompts.
+    """
     count = 0 if state.query is None else len(state.query.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
         return state
@@ -196,28 +199,29 @@ def show_prompt(state: State, shown: int | None) -> State:
 
 
 def set_color_mode(state: State, name: str) -> State:
-    """Set the color mode in which the viewer draws the state."""
+    """Set the color mode of the viewer."""
     return state if name == state.color_mode else replace(state, color_mode=name, action=f"Draw {name}")
 
 
 def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
-    """Return the index of the Gaussian with the largest weight on a ray, of those drawn that have a direction.
+    """Return the index of the drawn Gaussian with a direction that has the largest weight on a ray.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the ray hits no such Gaussian.
     """
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
     if len(weights) == 0 or not float(weights[index]) > 0:
-        raise InputError("There is nothing with semantics where you clicked.")
+        raise InputError("There is no Gaussian with semantics at this position. Click a visible object.")
     return index
 
 
 def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
-    """Return the mask of the object of a Gaussian.
+    """Return the mask of the object that contains a Gaussian.
 
-    It is what one step added, if the Gaussian is part of that; else the connected component of what the best prompt
-    selects, so that touching objects of other prompts stay apart; else `SelectionContext.object_at`.
+    If an earlier click added the Gaussian, the object consists of all Gaussians that this click added. Else, if a
+    prompt selects the Gaussian, the object is a connected component of the best prompt's selection, which separates
+    touching objects of different prompts. Otherwise, it is the result of `SelectionContext.object_at`.
     """
     for mask in reversed(state.additions):
         if bool(mask[gaussian]):
@@ -232,16 +236,16 @@ def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
 
 
 def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select") -> State:
-    """Select, add or remove the object under a click; see `object_under`.
+    """Select, add or remove the clicked object; see `object_under`.
 
     Args:
-        weights: weights of the Gaussians on the ray, for instance from `rasterization.rasterize.ray_weights`.
+        weights: weights of the Gaussians on the ray of the click, as from `rasterization.rasterize.ray_weights`.
     """
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
 
 def change_objects(state: State, mask: Bool[Tensor, " n"], mode: ClickMode) -> State:
-    """Select an object, add it or remove it; removing it later takes away exactly what this step added."""
+    """Select, add or remove an object. Removing it later removes only the Gaussians that this step added."""
     before = () if mode == "select" else state.additions
     new = mask if mode == "select" else mask & ~state.selection
     changed = change_selection(state, mask, mode, "an object")
@@ -252,17 +256,17 @@ def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, wh
     """Select Gaussians, add them to the selection, or remove them from it.
 
     Args:
-        what: description of the Gaussians.
+        what: description of the Gaussians for the history.
     """
     change = {"select": select, "add": add, "remove": remove}[mode]
     return change(state, mask, f"{mode.capitalize()} {what}")
 
 
 def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
-    """Return the direction of the Gaussian under a click: the vector of a prompt named `click_name(...)`.
+    """Return the direction of the clicked Gaussian, which is the vector of a prompt named `click_name(...)`.
 
     Args:
-        weights: weights of the Gaussians on the ray.
+        weights: weights of the Gaussians on the ray of the click.
     """
     row = torch.tensor([pick_gaussian(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()
@@ -275,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
+    """Add Gaussians to the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -284,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
+    """Remove Gaussians from the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)
@@ -303,45 +307,45 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     Args:
         floaters: mask of the floaters, from `analysis.objects.find_floaters`.
     Raises:
-        ValueError: there are none.
+        ValueError: the mask is empty.
     """
     if not bool(floaters.any()):
-        raise InputError("There are no likely floaters.")
+        raise InputError("The scene has no likely floaters.")
     return select(state, floaters, "Select likely floaters")
 
 
 def resize(state: State, steps: int) -> State:
-    """Set how far the selection is grown (steps > 0) or shrunk (steps < 0), from part to whole, clamped to -10..10."""
+    """Set the number of steps for growing (> 0) or shrinking (< 0) the selection, clamped to -10..10."""
     steps = max(-MAX_GROW_STEPS, min(MAX_GROW_STEPS, int(steps)))
     return state if steps == state.grow_steps else replace(state, grow_steps=steps, action=f"Grow {steps:+d}")
 
 
 def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
-    """Hide Gaussians in addition to those hidden already.
+    """Hide Gaussians in addition to those that are already hidden.
 
     Args:
-        chosen: mask of the Gaussians; None: the selection.
+        chosen: mask of the Gaussians (default: the selection).
     Raises:
         ValueError: the mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. There is nothing to hide.")
+        raise InputError("Nothing is selected. Select the Gaussians to hide first.")
     hidden = chosen if state.hidden is None else state.hidden | chosen
     return replace(state, hidden=hidden, action=f"Hide {int(chosen.sum()):,}")
 
 
 def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
-    """Draw these Gaussians alone, including hidden ones.
+    """Draw only these Gaussians, including hidden ones.
 
     Args:
-        chosen: mask of the Gaussians; None: the selection.
+        chosen: mask of the Gaussians (default: the selection).
     Raises:
         ValueError: the mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. The screen would be blank.")
+        raise InputError("Nothing is selected. Select the Gaussians to isolate first.")
     return replace(state, hidden=~chosen, action=f"Only {int(chosen.sum()):,}")
 
 
@@ -351,7 +355,7 @@ def show_all(state: State) -> State:
 
 
 def add_layer(state: State, name: str) -> State:
-    """Save the selection as a layer, in place of a layer with the same name.
+    """Save the selection as a layer, and replace a layer with the same name.
 
     Raises:
         ValueError: nothing is selected, the name is empty, or there are too many layers.
@@ -359,30 +363,30 @@ def add_layer(state: State, name: str) -> State:
     name = clip_text(name, 60)
     layers = tuple(layer for layer in state.layers if layer.name != name)
     if name == "" or len(layers) >= MAX_LAYERS or not bool(state.selection.any()):
-        raise InputError(f"A layer needs a name and a selection, and there are at most {MAX_LAYERS} layers.")
+        raise InputError(f"A layer needs a name and a selection, and the maximum number of layers is {MAX_LAYERS}.")
     return replace(state, layers=(*layers, Layer(name, state.selection)), action=f"Save layer {name}")
 
 
 def show_layer(state: State, name: str, *, visible: bool) -> State:
-    """Draw the Gaussians of a layer, or do not draw them."""
+    """Show or hide the Gaussians of a layer."""
     layer = find_layer(state, name)
     layers = tuple(replace(one, visible=visible) if one is layer else one for one in state.layers)
     return replace(state, layers=layers, action=f"{'Show' if visible else 'Hide'} layer {name}")
 
 
 def remove_layer(state: State, name: str) -> State:
-    """Remove a layer; its Gaussians are drawn again."""
+    """Remove a layer, and show its Gaussians again."""
     layer = find_layer(state, name)
     return replace(state, layers=tuple(one for one in state.layers if one is not layer), action=f"Remove layer {name}")
 
 
 def find_layer(state: State, name: str) -> Layer:
-    """Return the layer of a name.
+    """Return the layer with this name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no layer has this name.
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:
-        raise InputError(f"There is no layer {clip_text(name, 60)!r}.")
+        raise InputError(f"There is no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
     return layer

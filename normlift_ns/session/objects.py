@@ -1,4 +1,4 @@
-"""Objects of a selection: a row for each, with the values and Gaussians for the buttons of a panel."""
+"""Objects of a selection as rows for a panel, and camera positions that show them."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
 from normlift_ns.session.state import WEAK_RELIABILITY, State
 
 _STRONG = 0.8
-"""R from which on evidence is strong."""
+"""Minimum R of strong evidence."""
 _BY_HAND = "selected by hand"
 _BY_HAND_COLOR = (1.0, 0.75, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectRow:
-    """One object: a connected component of the Gaussians that one prompt selects."""
+    """One object, a connected component of the Gaussians that one prompt selects."""
 
     text: str
     """The prompt."""
     number: int
-    """1 for the largest object of its prompt."""
+    """Number of the object, 1 for the largest object of its prompt."""
     color: RGB
-    """Color of the prompt, for the swatch."""
+    """Color of the prompt, RGB in 0..1."""
     mask: Bool[Tensor, " n"]
-    """Gaussians of the object, for the buttons only, hide and export."""
+    """Mask of the object's Gaussians."""
     size: int
     """Number of Gaussians."""
     reliability: float
@@ -42,40 +42,40 @@ class ObjectRow:
     mean_views: float
     """Mean N_eff, weighted in the same way."""
     center: tuple[float, float, float]
-    """Point that the camera looks at, for the button go to."""
+    """Mean center, weighted in the same way; the camera looks at it."""
     extent: float
-    """Diagonal of the box around the central 90 % of the Gaussian centers, for the button go to."""
+    """Diagonal of the box around the central 90 % of the Gaussian centers."""
 
     @property
     def name(self) -> str:
-        """The prompt and the number. `io.atomic.safe_file_name` makes a file name of it."""
+        """The prompt and the number; `io.atomic.safe_file_name` converts it to a file name."""
         return f"{self.text} {self.number}"
 
     @property
     def evidence(self) -> str:
-        """Strength of the evidence in words, with R and the number of views."""
+        """Strength of the evidence as text, with R and the number of views."""
         grade = "strong" if self.reliability >= _STRONG else "fair" if self.reliability >= WEAK_RELIABILITY else "weak"
         return f"{grade} evidence (R {self.reliability:.2f}, {self.mean_views:.1f} views)"
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectList:
-    """The objects of a selection."""
+    """List of the objects of a selection."""
 
     objects: tuple[ObjectRow, ...]
-    """Listed objects, by prompt, the largest first."""
+    """Listed objects, ordered by prompt and by descending size."""
     left_out: int
-    """Number of objects that are large enough but not listed, because there are too many."""
+    """Number of objects that are not listed because there are too many."""
     in_smaller_parts: int
     """Number of Gaussians in components too small to be objects."""
 
 
 def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
-    """Return the objects that are selected and drawn, of each prompt that selects or of the selection by hand.
+    """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
 
     Args:
-        max_objects: largest number of objects listed; each prompt gets its largest object before any gets a second.
-        min_gaussians: fewest Gaussians of an object; those in smaller components are only counted.
+        max_objects: maximum number of listed objects; the largest object of each prompt has priority.
+        min_gaussians: minimum number of Gaussians in an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
     if answer is None or not state.prompts_select:
@@ -107,27 +107,27 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
     return ObjectRow(text, number + 1, color, mask, size, reliability, views, tuple(center), extent)
 
 
-# Camera positions to look at an object from.
+# Camera positions that show an object.
 
 
 Position = tuple[float, float, float]
 """x, y, z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Mean opacity in front of the object up to which the view counts as clear."""
+"""Maximum mean opacity in front of the object for a clear view."""
 _FILL = 0.8
-"""Share of the height of the image that the extent of an object takes."""
+"""Extent of the object as a fraction of the image height."""
 _SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
-"""Degrees around the vertical and above the current height."""
+"""Angles in degrees around the vertical and above the current height."""
 
 
 @dataclass(frozen=True)
 class LookAtTarget:
-    """Point to look at that is not an object."""
+    """Point to look at, in place of an object."""
 
     center: Position
     extent: float
-    """Size of the region around the point that is to be visible."""
+    """Size of the visible region around the point, in scene units."""
 
 
 def unoccluded_viewpoint(
@@ -140,16 +140,17 @@ def unoccluded_viewpoint(
 ) -> Position:
     """Return the first camera position with a clear view of an object, or the one with the least occlusion.
 
-    Candidates start from the current side of the camera: turned around the vertical, first at its height, then from
-    above. Of an object, several Gaussians must be visible; its own Gaussians do not count as occluders.
+    The first candidate is on the current side of the object. The others are rotations of it around the vertical, first
+    at the current height, then from above. Occlusion is the mean over several Gaussians of the object; its own
+    Gaussians do not count as occluders.
 
     Args:
         target: object or point to look at.
-        scene: Gaussians that may occlude it.
-        drawn: mask of the Gaussians that are drawn; None: all.
+        scene: Gaussians that may occlude the target.
+        drawn: mask of the Gaussians that are drawn (default: all).
         camera_position: current position of the camera.
         up: direction of the vertical.
-        field_of_view: of the camera, in radians.
+        field_of_view: field of view of the camera in radians.
     """
     first = viewpoint(target, camera_position, field_of_view)
     center = torch.tensor(target.center, dtype=torch.float64)
@@ -177,12 +178,12 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return the camera position on the current side of an object from which it fills most of the image.
+    """Return a camera position on the current side of an object, at a distance at which the object fills the image.
 
     Args:
         target: object or point to look at.
         camera_position: current position of the camera.
-        field_of_view: of the camera, in radians.
+        field_of_view: field of view of the camera in radians.
     """
     center = np.asarray(target.center)
     offset = np.asarray(camera_position, float) - center
@@ -198,7 +199,7 @@ def _as_position(point: np.ndarray) -> Position:
 
 
 def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield positions at the same distance around a center, the given one first."""
+    """Yield `position`, then positions around the center at the same distance."""
     offset = position - center
     distance, up = np.linalg.norm(offset), up / max(float(np.linalg.norm(up)), 1e-12)
     along = (offset @ up) * up
@@ -213,7 +214,7 @@ def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Ite
 def _occlusion(
     scene: GaussianScene, position: Float[Tensor, " 3"], center: Float[Tensor, " 3"], margin: float
 ) -> float:
-    """Return the opacity between a position and a center, without the last `margin` in front of the center."""
+    """Return the opacity between a position and a center, excluding the last `margin` in front of the center."""
     direction = center - position
     length = direction.norm().clamp(min=1e-12)
     before = (scene.means.double() - position) @ (direction / length) < length - margin

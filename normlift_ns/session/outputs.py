@@ -23,23 +23,26 @@ from normlift_ns.session.state import State
 
 
 def store_query(folder: Path | None, query: Query | None, *, replaces: bool = False) -> str:
-    """Store prompts in a run, in addition to those stored there or instead of them; return their number in words.
+    """Store prompts in a run, and return the number of stored prompts as text, such as "2 prompts".
 
+    Args:
+        folder: folder of the field.
+        replaces: delete the prompts that the run already stores; False: keep them.
     Raises:
-        ValueError: there is no query or no folder; as `merge_queries`.
+        ValueError: there is no query or no folder, or for the reasons of `merge_queries`.
     """
     if query is None or folder is None:
-        raise InputError("No query yet; there is nothing to save.")
+        raise InputError("There is no query yet, so there are no prompts to save. Type a prompt and press Ask.")
     merged = merge_queries(None if replaces else load_query(folder), query)
     save_query(folder, merged)
     return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"
 
 
 def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], name: str) -> tuple[str, bytes, int]:
-    """Return the name and content of a PLY file of Gaussians, and their number.
+    """Return the name and content of a PLY file of the Gaussians in `mask`, and their number.
 
     Raises:
-        ValueError: none of them is ever drawn.
+        ValueError: the mask has no Gaussian that a renderer draws.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{safe_file_name(name)}.ply"
@@ -50,16 +53,16 @@ def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], nam
 def selection_bytes(
     scene: Scene, field: SemanticField, state: State, mask: Bool[Tensor, " n"], name: str, kind: str = "ply"
 ) -> tuple[str, bytes]:
-    """Return the name and content of a file of Gaussians.
+    """Return the name and content of a file of the Gaussians in `mask`.
 
     Args:
         name: name of the selection.
         kind: name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
     Raises:
-        ValueError: none of the Gaussians is ever drawn, or there is no such exporter.
+        ValueError: the mask has no Gaussian that a renderer draws, or the exporter does not exist.
     """
     if not bool(mask.any()):
-        raise InputError("Nothing is selected; there is nothing to export.")
+        raise InputError("Nothing is selected. Select the Gaussians to export first.")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / safe_file_name(name)
         if kind == "masks":
@@ -70,7 +73,7 @@ def selection_bytes(
             return f"{path.name}_masks.zip", buffer.getvalue()
         exporter = EXPORTERS.load(kind)
         if exporter.suffix == "":
-            raise InputError(f"The format {kind} is a folder of files; choose ply or masks.")
+            raise InputError(f"The format {kind} writes a folder, which cannot be downloaded. Choose ply or masks.")
         path = path.with_name(path.name + exporter.suffix)
         exporter.write(ExportJob(scene, field, mask, state.answer), path)
         return path.name, path.read_bytes()

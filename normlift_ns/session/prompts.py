@@ -1,4 +1,4 @@
-"""Prompts as rows: every text or click with its vector or its error, and the queries made of them."""
+"""Prompts as rows, each a text or a click with its vector or its error, and queries made from these rows."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from normlift_ns.query.text_encoder import HasManifest
 
 MAX_PROMPTS = 64
 CLICK_THRESHOLD = 0.9
-"""Cosine to the direction of a clicked Gaussian above which another one counts as similar."""
+"""Minimum cosine between the directions of a clicked Gaussian and a similar one."""
 _PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
-_CLICK_RULE = "Clicks are compared by cosine; ask them alone, or choose the rule cosine."
+_CLICK_RULE = "Clicks need the rule cosine. Choose the rule cosine, or ask clicks without other prompts."
 EncodeTexts = Callable[[Sequence[str]], Any]
-"""Function from texts to vectors [Q, D], such as `rows` of an encoder. Raises ValueError if it cannot encode a text."""
+"""Function from texts to vectors [Q, D], such as an encoder's `rows`. It raises ValueError if it cannot encode a text.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +32,23 @@ class Prompt:
 
     text: str
     vector: Float[np.ndarray, " d"] | None = None
-    """Vector of the prompt; None if there is an error."""
+    """Vector of the prompt; None if it has an error."""
     error: str = ""
-    """Error message for the user; empty if there is none."""
+    """Error message for the user; empty if there is no error."""
 
     @property
     def is_click(self) -> bool:
-        """True if the prompt is a click on the scene instead of a text."""
+        """True if the prompt stands for a click on the scene."""
         return is_click(self.text)
 
 
 def click_name(number: int) -> str:
-    """Return the prompt text that stands for a click; the direction of the clicked Gaussian is kept under it."""
+    """Return the prompt text that stands for a click; its vector is the direction of the clicked Gaussian."""
     return f"like click {number}"
 
 
 def is_click(text: str) -> bool:
-    """Return whether a prompt text stands for a click.
+    """Return True if a prompt text stands for a click.
 
     >>> is_click(click_name(3)), is_click("like what was clicked"), is_click("click")
     (True, True, False)
@@ -56,7 +57,7 @@ def is_click(text: str) -> bool:
 
 
 def split_prompts(text: str) -> list[str]:
-    """Split prompts at commas, semicolons and line breaks, without duplicates; quotes keep a comma in a prompt.
+    """Split a text into prompts at commas, semicolons and line breaks outside quotes; drop duplicates.
 
     >>> split_prompts('red mug , bowl;;"salt, pepper"; bowl')
     ['red mug', 'bowl', 'salt, pepper']
@@ -76,21 +77,21 @@ def join_prompts(texts: Sequence[str]) -> str:
 
 
 def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
-    """Encode a line of prompts. A text that cannot be encoded gets the encoder's message instead of a vector.
+    """Encode a line of prompts. If a prompt cannot be encoded, its row has the error message of the encoder.
 
     Args:
-        text: prompts as typed.
+        text: prompts as the user typed them.
         read: encoder of texts.
-        known_vectors: vectors by text that need no encoder: those of clicks, and of prompts stored in the run.
+        known_vectors: vectors of clicks and of prompts stored in the run, by text; they need no encoder.
     Raises:
-        ValueError: there are no prompts, or too many.
+        ValueError: the text has no prompts, or more than `MAX_PROMPTS`.
         OSError, MemoryError: the encoder cannot be loaded.
     """
     texts, vectors = split_prompts(text), dict(known_vectors or {})
     if len(texts) == 0:
         raise InputError("Type a prompt, then press Ask.")
     if len(texts) > MAX_PROMPTS:
-        raise InputError(f"{len(texts)} prompts were typed; ask at most {MAX_PROMPTS} at a time.")
+        raise InputError(f"There are {len(texts)} prompts; the maximum is {MAX_PROMPTS} at a time. Remove some.")
     new, errors = [one for one in texts if one not in vectors], {}
     try:
         vectors |= zip(new, read(new) if len(new) > 0 else [])
@@ -98,7 +99,7 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
         for one in new:
             try:
                 if is_click(one):
-                    raise InputError(f"{one!r} is not a click of this session or run; click the scene again.")
+                    raise InputError(f"{one!r} is not a click of this session or run. Click the scene again.")
                 vectors[one] = read([one])[0]
             except ValueError as error:
                 errors[one] = str(error)
@@ -121,15 +122,15 @@ def build_query(
 ) -> tuple[tuple[Prompt, ...], Query]:
     """Build the query of all rows that have a vector.
 
-    Clicks alone are compared by cosine, above the suggested threshold by default; they are in the scene, so the query
-    is not gated. Together with texts, clicks need the rule cosine.
+    A query of clicks alone uses the rule cosine and, by default, the suggested threshold. It is not gated, because a
+    clicked Gaussian is in the scene. A query of clicks and texts requires the rule cosine.
 
     Args:
         read: encoder of the negatives. The other arguments are those of `make_query`.
     Returns:
-        The rows, in which clicks that the rule excludes have an error, and their query.
+        The rows, with an error for each click if the rule is not cosine, and their query.
     Raises:
-        ValueError: no row has a vector; as `make_query`.
+        ValueError: no row has a vector, or for the reasons of `make_query`.
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
@@ -158,27 +159,27 @@ def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, 
 
 
 def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
-    """Return the rows of a query, for instance of the one that a run stores. None: no rows."""
+    """Return the rows of a query, such as the query stored in a run; () for None."""
     if question is None:
         return ()
     return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.embeddings))
 
 
 def merge_queries(stored: Query | None, asked: Query) -> Query:
-    """Merge stored and new prompts into one query; a new prompt replaces a stored one with the same text.
+    """Merge stored and new prompts into one query; a new prompt replaces a stored prompt with the same text.
 
     Args:
-        stored: query of the run; None: the run stores none.
+        stored: query stored in the run; None if it has none.
         asked: query to add.
     Raises:
-        ValueError: the two differ in rule, negatives or features.
+        ValueError: the queries differ in rule, negatives or features.
     """
     if stored is None:
         return asked
     if (stored.rule, stored.negatives, stored.refined) != (asked.rule, asked.negatives, asked.refined):
         raise InputError(
-            f"The run stores {len(stored.texts)} prompts with the rule {stored.rule}. The new prompts use the rule "
-            f"{asked.rule}, other negatives or other features, and cannot be saved with them. Replace the stored "
+            f"The {len(stored.texts)} prompts stored in the run use the rule {stored.rule}. The new prompts use the "
+            f"rule {asked.rule}, other negatives or other features, and cannot be added to them. Replace the stored "
             "prompts, or ask again with the same settings."
         )
     rows = {text: row for query in (stored, asked) for text, row in zip(query.texts, query.embeddings)}

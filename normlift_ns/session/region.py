@@ -1,4 +1,4 @@
-"""Selection of the Gaussians that are visible inside a region of a view: a polygon, or the trace of a brush."""
+"""Selection of the visible Gaussians inside a region of a view, which is a polygon or a brush stroke."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import render
 
 _RENDER_SIZE = 320
-"""Longer side, in pixels, of the view in which visibility is computed."""
+"""Longer side, in pixels, of the render for visibility."""
 _MARGIN = 0.03
 
 
 def inside_polygon(points: Float[np.ndarray, "m 2"], polygon: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " m"]:
-    """Return which points lie inside a polygon, by the even-odd rule.
+    """Return a mask of the points inside a polygon, by the even-odd rule.
 
     >>> square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])
     >>> inside_polygon(np.array([[1.0, 1], [3, 1]]), square)
@@ -35,7 +35,7 @@ def inside_polygon(points: Float[np.ndarray, "m 2"], polygon: Float[np.ndarray, 
 def near_path(
     points: Float[np.ndarray, "m 2"], path: Float[np.ndarray, "k 2"], radius: float
 ) -> Bool[np.ndarray, " m"]:
-    """Return which points are within a distance of a path of straight lines.
+    """Return a mask of the points within a distance `radius` of a path of line segments.
 
     >>> near_path(np.array([[1.0, 0.5], [1, 2]]), np.array([[0.0, 0], [2, 0]]), 1.0)
     array([ True, False])
@@ -49,7 +49,7 @@ def near_path(
 
 
 def project(means: Float[Tensor, "n 3"], camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Return the pixel of every point, and which points lie in front of the camera and in the image."""
+    """Return the pixel coordinates of every point, and a mask of the points in front of the camera and in the image."""
     pose = camera.world_to_camera.double().cpu()
     seen = means.detach().double().cpu() @ pose[:3, :3].T + pose[:3, 3]
     pixels = ((seen @ camera.K.double().cpu().T)[:, :2] / seen[:, 2:].clamp(min=1e-12)).numpy()
@@ -60,10 +60,10 @@ def project(means: Float[Tensor, "n 3"], camera: Camera) -> tuple[Float[np.ndarr
 def visible_gaussians(
     scene: GaussianScene, camera: Camera, drawn: Bool[Tensor, " n"], *, rasterize_mode: RasterizeMode = "classic"
 ) -> Bool[Tensor, " n"]:
-    """Return the mask of the drawn Gaussians in the view that lie on the visible surface, not behind it.
+    """Return the mask of the drawn Gaussians that lie on the visible surface of a view.
 
-    The surface is the mean depth of what the pixel of the center shows. A Gaussian may lie behind it by twice its
-    largest standard deviation, or by 3 % of the depth.
+    The depth of the surface is the mean depth rendered at the pixel of the Gaussian's center. A Gaussian may lie behind
+    the surface by twice its largest standard deviation, or by 3 % of the depth if that is more.
 
     Args:
         drawn: mask of the Gaussians that are drawn.

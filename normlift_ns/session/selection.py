@@ -1,4 +1,4 @@
-"""Selection in space: the field, the centers of its Gaussians, and their neighbor graph."""
+"""Field, centers and neighbor graph of the Gaussians, for selections in space."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from normlift_ns.session.prompts import CLICK_THRESHOLD
 _NEIGHBORS = 8
 _CACHED_ANSWERS = 4
 _MAX_SAMPLES = 4096
-"""Largest number of directions that are averaged."""
+"""Maximum number of directions to average."""
 _FRACTIONS = 11
-"""One more than the number of shrinking steps, so that the last step leaves Gaussians over."""
+"""Number of shrinking steps plus one, so that the last step does not remove all Gaussians."""
 _COSINE_STEP = 0.05
 """Decrease of the minimum cosine per step of growth."""
 
 
 @dataclass(frozen=True, eq=False)
 class SelectionContext:
-    """A field and the centers of its Gaussians. Users can share it: its caches do not change any answer."""
+    """Field and centers of its Gaussians, with caches. Several users can share it."""
 
     field: SemanticField
     means: Float[Tensor, "n 3"]
@@ -45,14 +45,14 @@ class SelectionContext:
         return len(self.means)
 
     def empty_mask(self) -> Bool[Tensor, " n"]:
-        """Return an empty mask."""
+        """Return a mask that is False for all Gaussians."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
 
     def answer(self, question: Query) -> Answer:
-        """Answer a query as `run_query` does; the relevancies of the last four queries are cached.
+        """Return the answer to a query, as `run_query` does; cache the relevancies of the last four queries.
 
         Raises:
-            ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
+            ValueError: the vectors have a different dimension than the field, or negatives are missing.
         """
         negative = None if question.negative_embeddings is None else question.negative_embeddings.tobytes()
         key = (question.texts, question.embeddings.tobytes(), negative, question.rule, question.refined)
@@ -68,14 +68,15 @@ class SelectionContext:
     def similar_to(
         self, vector: Float[Tensor, " d"], least: float = CLICK_THRESHOLD, *, refined: bool = True
     ) -> Bool[Tensor, " n"]:
-        """Return the mask of Gaussians whose cosine to a direction is at least `least`."""
+        """Return the mask of the Gaussians whose cosine to `vector` is at least `least`."""
         cosine = self.field.query(vector[None], refined=refined)[:, 0]
         return (cosine >= least) & self.field.valid(refined=refined)
 
     def object_at(self, gaussian: int, selected: Bool[Tensor, " n"], *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return the mask of the connected object around a Gaussian.
 
-        The object is a component of the selection if the Gaussian is selected, else of all Gaussians similar to it.
+        It is a connected component of the selection if the Gaussian is selected. Otherwise, it is a connected
+        component of all Gaussians similar to this one.
 
         Args:
             gaussian: index of the Gaussian.
@@ -92,11 +93,13 @@ class SelectionContext:
     def grow_or_shrink(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
-        Growing adds Gaussians within as many steps on the graph, and those that are connected to the selection and
-        similar to its mean direction. Their cosine is at least 0.95 at the first step, and 0.05 less at each further
-        step. Shrinking keeps the middle of each connected component: Gaussians within a fraction of the largest graph
-        distance from the middle. The fraction is 10/11 at the first step, and 1/11 less at each further step. The
-        results are nested: more steps of growth never remove a Gaussian, and more steps of shrinking never add one.
+        Growing adds Gaussians within `steps` edges of the selection. It also adds Gaussians that are connected to the
+        selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit decreases
+        by 0.05 with each further step.
+
+        Shrinking keeps the Gaussians of each connected component whose graph distance to its middle is at most a
+        fraction of the largest distance. The fraction is 10/11 for one step, and decreases by 1/11 with each further
+        step. More steps of growing never remove a Gaussian, and more steps of shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected
@@ -150,7 +153,7 @@ class SelectionContext:
 
     @cached_property
     def neighbor_pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of neighbors: the 8 nearest, within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
+        """Pairs of neighbors: the 8 nearest within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
         neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
         last = neighbors.distance[:, -1]
         last = last[last.isfinite()]

@@ -1,4 +1,4 @@
-"""State of a session, its history, and tokens of its requests."""
+"""State of a session, its history, and request tokens."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from normlift_ns.session.selection import SelectionContext
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A saved selection."""
+    """Saved selection with a name."""
 
     name: str
     mask: Bool[Tensor, " n"]
     visible: bool = True
-    """False: its Gaussians are not drawn."""
+    """True if the viewer draws the Gaussians of the layer."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that one user sees, except the camera. Neither the state nor its masks are ever changed.
+    """Immutable state of one user's view, without the camera; its masks are never modified.
 
-    The selection starts with the Gaussians that the prompts select, unless `from_answer` is False. `added` is added to
-    it and `removed` is removed; the result is grown or shrunk.
+    The selection consists of the Gaussians that the prompts select, unless `prompts_select` is False, and of `added`,
+    without `removed`. It is then grown or shrunk by `grow_steps`.
     """
 
     space: SelectionContext
@@ -43,20 +43,20 @@ class State:
     query: Query | None = None
     """Query of the rows without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
-    """Index of the only prompt of the query that selects; None: all of them select."""
+    """Index of the only prompt that selects; None if all prompts of the query select."""
     prompts_select: bool = True
-    """True if the prompts select; False: the selection was made by hand."""
+    """True if the prompts select; False if the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     additions: tuple[Bool[Tensor, " n"], ...] = ()
-    """Gaussians that each added object has added to the selection, the latest last; removing it removes them."""
+    """Masks of the Gaussians that each added object contributed to the selection, in order of addition."""
     grow_steps: int = 0
-    """Number of steps of growth over the neighbor graph; negative: steps of shrinking."""
+    """Number of growing steps over the neighbor graph; a negative number shrinks the selection."""
     hidden: Bool[Tensor, " n"] | None = None
-    """Gaussians that are not drawn."""
+    """Mask of the Gaussians that the user has hidden."""
     layers: tuple[Layer, ...] = ()
     color_mode: str = "rgb"
-    """Color mode; each viewer defines the names."""
+    """Name of the color mode; each viewer defines its own names."""
     colormap: Colormap = "viridis"
     """Colormap of relevancies."""
     action: str = ""
@@ -64,12 +64,12 @@ class State:
 
     @cached_property
     def answer(self) -> Answer | None:
-        """Answer to the query; None without one."""
+        """Answer to the query; None without a query."""
         return None if self.query is None else self.space.answer(self.query)
 
     @cached_property
     def selection_before_resize(self) -> Bool[Tensor, " n"]:
-        """Gaussians selected by prompts and clicks, before growing."""
+        """Mask of the Gaussians selected by prompts and clicks, before growing or shrinking."""
         mask = self.space.empty_mask()
         if self.answer is not None and self.prompts_select:
             mask = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]
@@ -78,12 +78,12 @@ class State:
 
     @cached_property
     def selection(self) -> Bool[Tensor, " n"]:
-        """Selected Gaussians, whether hidden or not."""
+        """Mask of the selected Gaussians, including hidden ones."""
         return self.space.grow_or_shrink(self.selection_before_resize, self.grow_steps, refined=self.refined)
 
     @property
     def drawn(self) -> Bool[Tensor, " n"]:
-        """Gaussians that are neither hidden nor in a hidden layer."""
+        """Mask of the Gaussians that are neither hidden nor in a hidden layer."""
         mask = ~self.space.empty_mask() if self.hidden is None else ~self.hidden
         for layer in self.layers:
             mask = mask if layer.visible else mask & ~layer.mask
@@ -91,12 +91,12 @@ class State:
 
     @property
     def by_hand_suffix(self) -> str:
-        """Suffix for the number of selected Gaussians if the selection was made by hand; empty if prompts select."""
+        """Text after the number of selected Gaussians, for selections made by hand; empty if prompts select."""
         return "" if self.prompts_select else ", by hand"
 
     @property
     def name(self) -> str:
-        """Name for a file of the selection: the prompts that select, or "selection" if none does."""
+        """Name for a file of the selection: the prompts that select, or "selection" without such prompts."""
         if self.query is None or not self.prompts_select:
             return "selection"
         texts = self.query.texts
@@ -115,16 +115,16 @@ class State:
 
     @property
     def warning(self) -> str:
-        """Warning if at least a quarter of the selection has weak evidence, else empty.
+        """Warning if a quarter or more of the selection has weak evidence, else empty.
 
-        `actions.remove_weak` removes the Gaussians in question.
+        `actions.remove_weak` removes the Gaussians with weak evidence.
         """
         if self.weak_fraction < 0.25:
             return ""
         return f"{self.weak_fraction:.0%} of this selection has weak evidence (R < {WEAK_RELIABILITY:g})."
 
     def without_caches(self) -> State:
-        """Return a copy without cached results, for a history. They are computed again when it is shown again."""
+        """Return a copy without cached results, to save memory in a history."""
         return replace(self)
 
 
@@ -148,11 +148,11 @@ class History(Generic[T]):
     """Key of the last step, if successive steps with this key are merged."""
 
     compact: Callable[[T], T] = lambda state: state
-    """Applied to a state when another one becomes current, for instance `State.without_caches`."""
+    """Function applied to the current state before it is replaced, for instance `State.without_caches`."""
 
     @staticmethod
     def of(state: T, *, lean: Callable[[T], T] = lambda state: state) -> History[T]:
-        """Return a history with a single state."""
+        """Return a history with a single state; `lean` is its `compact`."""
         return History((state,), compact=lean)
 
     @property
@@ -161,10 +161,10 @@ class History(Generic[T]):
         return self.states[self.index]
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
-        """Make a new state current, and drop undone ones. The state that is current already adds no step.
+        """Append a new state, make it current, and drop undone states; do nothing if the state is already current.
 
         Args:
-            key: successive steps with the same key are merged into one, such as the drag of a slider.
+            key: key to merge successive steps, such as those of a slider drag; None: do not merge.
         """
         if state is self.now:
             return self
@@ -173,26 +173,26 @@ class History(Generic[T]):
         return History(states, len(states) - 1, key, self.compact)
 
     def undo(self) -> History[T]:
-        """Return to the previous state; the same history if there is none."""
+        """Go back to the previous state; return the same history if there is none."""
         return self.go_to(self.index - 1)
 
     def redo(self) -> History[T]:
-        """Return to the state undone last; the same history if there is none."""
+        """Go forward to the next state; return the same history if there is none."""
         return self.go_to(self.index + 1)
 
     def go_to(self, index: int) -> History[T]:
-        """Make any state of the list current; the same history if the index is out of range."""
+        """Make the state with this index current; return the same history if the index is out of range."""
         if index == self.index or not 0 <= index < len(self.states):
             return self
         return replace(self, states=self._leaned, index=index, key=None)
 
     @property
     def _leaned(self) -> tuple[T, ...]:
-        """The states with `lean` applied to the current one."""
+        """States, with `compact` applied to the current one."""
         return (*self.states[: self.index], self.compact(self.now), *self.states[self.index + 1 :])
 
 
-# Request tokens that discard stale results: a number per user that increases with every request.
+# Request tokens that discard stale results.
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ class RequestToken:
 
 @dataclass
 class RequestTokens:
-    """Tokens of one user. Methods may be called from any thread.
+    """Request tokens of one user. Methods may be called from any thread.
 
     >>> turns = RequestTokens()
     >>> first, second = turns.start("Reading red"), turns.start("Reading blue")
@@ -217,30 +217,30 @@ class RequestTokens:
     _running: RequestToken | None = None
 
     def start(self, description: str) -> RequestToken:
-        """Return a new token; all earlier ones become stale."""
+        """Return a new token, and make all earlier tokens stale."""
         with self._lock:
             self._running = token = RequestToken(description)
             return token
 
     def is_current(self, token: RequestToken) -> bool:
-        """Return whether the result of a request is still wanted."""
+        """Return True if the token is not stale."""
         return self._running is token
 
     def finish(self, token: RequestToken) -> bool:
-        """End a request; return whether its result is still wanted."""
+        """End a request; return True if its token is not stale, so that its result may be used."""
         with self._lock:
             current = self._running is token
             self._running = None if current else self._running
             return current
 
     def cancel(self) -> bool:
-        """Make the running request stale; return whether there was one."""
+        """Make the running request stale; return True if there was one."""
         with self._lock:
             running, self._running = self._running, None
             return running is not None
 
     @property
     def busy(self) -> str:
-        """Description of the running request; empty if there is none."""
+        """Description of the running request; empty if no request is running."""
         running = self._running
         return "" if running is None else running.description

@@ -1,1 +1,1 @@
-"""Web viewer, and the parts that it shares with the panel in nerfstudio's viewer."""
+"""Parts of the panel in nerfstudio's viewer: adapter for viser, widgets and controller."""

@@ -1,4 +1,4 @@
-"""Adapter for viser 0.2.7, which nerfstudio's viewer uses: order of messages, button groups, and keys."""
+"""Adapter for viser 0.2.7, the library of nerfstudio's viewer: order of messages, button groups and keys."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 _MAX_HOLDUP = 0.5
-"""Maximum number of seconds that a message waits for the one before it."""
+"""Maximum number of seconds that a message waits for the previous message."""
 KEYS_SCRIPT = """
 (() => {
   if (window.normlift) return;
@@ -38,15 +38,15 @@ KEYS_SCRIPT = """
   });
 })();
 """
-"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
+"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. viser sends typed text every 50 ms."""
 
 
 def handle_in_order(server: Any) -> None:
-    """Make a server handle messages in the order in which they come.
+    """Make a server handle messages in the order in which they arrive.
 
-    viser 0.2.7 passes each message to one of 32 threads. On a busy machine, the press of a button therefore overtakes
-    the text typed before it, and one of two quick presses is lost. With this function, a message waits until the one
-    before it is handled, but only for a moment if that is slow.
+    viser 0.2.7 passes each message to one of 32 threads. On a busy machine, a button press can therefore overtake the
+    text typed before it, and one of two quick presses is lost. With this function, each message waits until the
+    previous message is handled, but at most half a second.
 
     Args:
         server: viser's server.
@@ -74,7 +74,7 @@ def handle_in_order(server: Any) -> None:
 
 
 def send_in_order(server: Any) -> None:
-    """Make a server send all messages in order, also those within `atomic`.
+    """Make a server send all messages in order, including those within `atomic`.
 
     Args:
         server: viser's server, 0.2.7.
@@ -84,11 +84,11 @@ def send_in_order(server: Any) -> None:
 
 
 def _send_in_order(connection: Any) -> None:
-    """Make a connection send its messages in order, and those within `Page.together` in one go.
+    """Make a connection send its messages in order, and those within `atomic` together at its end.
 
-    viser 0.2.7 passes each message created within its `atomic` to one of 32 threads that serve all pages, where the
-    message waits. A panel of sixty widgets therefore blocks all pages while it is created. Messages can overtake those
-    that wait, two threads can deadlock, and an exception within the context always causes a deadlock.
+    viser 0.2.7 passes each message within its `atomic` to one of 32 threads that serve all pages. The thread is blocked
+    until the context ends, so a panel of sixty widgets blocks all pages while it is created. Later messages can
+    overtake waiting ones, two threads can deadlock, and an exception within the context always causes a deadlock.
     """
     lock, waiting, depth = threading.RLock(), [], [0]
 
@@ -116,12 +116,13 @@ def _send_in_order(connection: Any) -> None:
 
 
 def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
-    """Add a row of buttons to a panel; an empty label takes no room.
+    """Add a row of buttons to a panel; an empty label takes no space.
 
-    viser 0.2.7 ignores the button of a group that was pressed last, and initially the first button.
+    This function works around an error in viser 0.2.7, which ignores the button of a group that was pressed last, and
+    the first button before any press.
 
     Args:
-        pressed: called with the caption of the pressed button and viser's event.
+        pressed: function to call with the caption of the pressed button and viser's event.
     """
     group = gui.add_button_group(label, options)
 
@@ -135,10 +136,10 @@ def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Call
 
 
 def ignore_closed_clients(server: Any) -> None:
-    """Silence tracebacks about messages from a page that was closed before they were handled.
+    """Suppress tracebacks about messages from pages that were closed before viser handled the messages.
 
-    viser 0.2.7 handles messages in another thread. There, it and nerfstudio 1.1.5 look up the page by its number, and
-    viser prints a traceback if the page no longer exists.
+    viser 0.2.7 handles messages in another thread. In this thread, viser and nerfstudio 1.1.5 look up the page by its
+    number, and viser prints a traceback if the page no longer exists.
 
     Args:
         server: viser's server.
@@ -154,7 +155,7 @@ def ignore_closed_clients(server: Any) -> None:
                 if any(type(key) is not int or key in server.get_clients() for key in error.args):
                     raise
 
-        if not inspect.iscoroutinefunction(handle):  # in 1.x it is a coroutine
+        if not inspect.iscoroutinefunction(handle):  # it is one in viser 1.x
             connection._handle_incoming_message = handle_quietly
 
     silence(server._websock_server)

@@ -1,4 +1,4 @@
-"""Controller of a viewer: carries out the actions of a user on the history of states, and runs slow requests."""
+"""Controller of a viewer panel: it applies the actions of a user to the history of states, and runs slow requests."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from normlift_ns.session.prompts import build_query, click_name, encode_prompts
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
-NO_FIELD_MESSAGE = "No semantics yet. They are lifted at the end of training."
+NO_FIELD_MESSAGE = "There are no semantics yet. The lift runs at the end of training."
 _CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "remove"}
 
 
 def _show_prompt(state: State, option: str) -> State:
-    """Let only the prompt of an option of the dropdown select."""
+    """Select by the prompt that belongs to an option of the dropdown, or by all prompts."""
     return actions.show_prompt(state, None if option == ALL_PROMPTS else int(option.split(":", maxsplit=1)[0]) - 1)
 
 
@@ -47,41 +47,43 @@ _CHANGES: dict[Action, Callable[..., State]] = {
     Action.SHOW_PROMPT: _show_prompt,
     Action.REFINED: _use_refined,
 }
-"""Actions that only change the state. Those of sliders and choices take a value, those of objects a row."""
+"""Functions from a state to the next state, by action. Some take a second argument, a value or the row of an object."""
 _UNLOCKED = (Action.ASK, Action.SELECT_FLOATERS, Action.EXPLAIN)
-"""Actions that must not hold the lock, because they are slow or send other actions."""
+"""Actions that must not hold the lock because they are slow or start other actions."""
 
 
 @dataclass(eq=False)
 class Session:
-    """Questions and clicks of one user, kept while the viewer runs."""
+    """Queries and clicks of one user, kept while the viewer runs."""
 
     history: History[State] | None = None
-    """None: there is no field yet."""
+    """History of states; None if there is no field yet."""
     line: str = ""
-    """Text of the prompt box."""
+    """Text in the prompt box."""
     clicks: dict[str, Any] = field(default_factory=dict)
-    """Clicked Gaussians or their directions, by the names of their prompts."""
+    """Clicked Gaussians or their directions, by the prompt texts that stand for the clicks."""
 
 
 class Controller(ABC):
-    """Session of one panel and the actions on it. A viewer derives a class from it.
+    """Base class for the controller of one panel, which applies actions to a session.
 
-    The session changes under the lock only; slow requests are made without it. Methods may be called from any thread.
+    The controller changes the session only while it holds its lock; slow requests run without the lock. Methods may be
+    called from any thread.
 
     Args:
-        explanation: explanation of selections of this session.
+        session: session that the actions change.
+        explanation: explanation of the current selection.
     """
 
     reading_message: str
-    """Shown while prompts are read."""
+    """Message while prompts are encoded."""
     floaters_message = actions.FLOATERS_HINT
-    """Shown when floaters are selected."""
+    """Message after floaters are selected."""
 
     def __init__(self, session: Session, explanation: Explanation) -> None:
         self._session, self._reasons = session, explanation
         self._widgets: Any = None
-        """The `ActionWidgets` of the panel; None without a viewer."""
+        """`ActionWidgets` of the panel; None without a viewer."""
         self._message, self._turns = "", RequestTokens()
         self._lock, self._encoder_lock = RLock(), Lock()
         self._handlers: dict[Action, Callable[[Any, Any], None]] = {
@@ -101,20 +103,20 @@ class Controller(ABC):
 
     @property
     def history(self) -> History[State]:
-        """History of the session; must not be used without a field."""
+        """History of the session; not available before there is a field."""
         return cast("History[State]", self._session.history)
 
     @property
     def state(self) -> State | None:
-        """The state shown now; None without a field."""
+        """Current state; None if there is no field yet."""
         return None if self._session.history is None else self.history.now
 
     def act(self, action: Action, value: Any = None, client: Any = None) -> None:
-        """Carry out an action; the panel shows any error.
+        """Carry out an action, and show any error in the panel.
 
         Args:
-            value: value of a slider, a choice or an object.
-            client: the browser of the user.
+            value: value of a slider or a choice, or row of an object.
+            client: viser's handle of the user's browser.
         """
         self._guard(lambda: self._act(action, value, client))
 
@@ -129,32 +131,33 @@ class Controller(ABC):
         """Make a history current, and show its state.
 
         Args:
-            answered: whether the selection is new and must be visible.
+            message: message to show with it.
+            answered: True if the selection is new and must be visible.
         """
 
     @abstractmethod
     def _update_widgets(self) -> None:
-        """Show message, running work and explanation in the widgets."""
+        """Show the message, the running work and the explanation in the widgets."""
 
     @abstractmethod
     def _start(self, job: Callable[[], None], kind: Action) -> None:
-        """Run a slow job without the lock, here or in another thread."""
+        """Run a slow job without the lock, in this thread or another one."""
 
     @abstractmethod
     def _encode(self, texts: Sequence[str]) -> Any:
-        """Return the vectors of texts. Only one thread at a time calls this."""
+        """Return the embedding of each text; the caller ensures that only one thread at a time calls this method."""
 
     @abstractmethod
     def _known_vectors(self) -> dict[str, Any]:
-        """Return the vectors of prompts that need no encoder: of clicks, and of stored prompts."""
+        """Return the vectors of clicks and of stored prompts, which do not need an encoder."""
 
     @abstractmethod
     def _query_settings(self) -> dict[str, Any]:
-        """Return keyword options of `build_query` for the next query."""
+        """Return the keyword arguments of `build_query` for the next query."""
 
     @abstractmethod
     def _find_floaters(self) -> Bool[Tensor, " n"]:
-        """Return the mask of likely floaters; takes seconds."""
+        """Return the mask of likely floaters, which takes seconds."""
 
     @abstractmethod
     def _wait_for_click(self, action: Action, value: Any, client: Any) -> None:
@@ -177,10 +180,10 @@ class Controller(ABC):
         """Store the prompts in the run."""
 
     def _guard(self, work: Callable[[], None]) -> None:
-        """Call a function; the panel shows any error."""
+        """Call a function, and show any error in the panel."""
         try:
             work()
-        except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
+        except Exception as error:  # encoder libraries may raise any exception, which must not stop the viewer
             self._show_error(error)
 
     def _show_error(self, error: Exception) -> None:
@@ -193,7 +196,7 @@ class Controller(ABC):
             self._handlers[action](value, client)
 
     def _download_object(self, row: ObjectRow | None, client: Any) -> None:
-        """Download an object; None: the selection."""
+        """Download an object, or the selection if `row` is None."""
         state = self.history.now
         mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
         self._download(mask, name, client)
@@ -212,7 +215,7 @@ class Controller(ABC):
         self._show(history)
 
     def _set_prompts(self, line: str) -> None:
-        """Replace the text in the prompt box, which otherwise only the user edits."""
+        """Replace the text in the prompt box."""
         self._session.line = line
         if self._widgets is not None:
             self._widgets.prompts.value = line
@@ -228,13 +231,13 @@ class Controller(ABC):
         self._reasons.clear()
 
     def _ask(self) -> None:
-        """Ask the prompts in the prompt box."""
+        """Start the query of the prompts in the prompt box."""
         if self._widgets is not None:
             self._session.line = self._widgets.prompts.value
         self._run(self.reading_message, partial(self._answer, line=self._session.line))
 
     def _run(self, description: str, task: Callable[[RequestToken], None]) -> None:
-        """Start a slow task; the panel shows its description until it ends."""
+        """Start a slow task, and show its description in the panel until it ends."""
         token = self._turns.start(description)
         self.show_message("")
         self._start(lambda: self._finish(token, task), Action.ASK)
@@ -250,9 +253,9 @@ class Controller(ABC):
             self.show_message(message)
 
     def _answer(self, token: RequestToken, line: str, **settings: Any) -> None:
-        """Show the answer to a query, unless the request is stale."""
+        """Encode prompts and show the answer to their query, unless the request is stale."""
         space, settings, vectors = self.history.now.space, {**self._query_settings(), **settings}, self._known_vectors()
-        with self._encoder_lock:  # so that two threads do not both load the encoder
+        with self._encoder_lock:  # no two threads may load the encoder
             if not self._turns.is_current(token):
                 return
             prompts = encode_prompts(line, self._encode, vectors)
@@ -268,15 +271,15 @@ class Controller(ABC):
         self._show_result(token, lambda state: actions.select_floaters(state, floaters), self.floaters_message)
 
     def _show_result(self, token: RequestToken, result: Callable[[State], State], message: str = "") -> None:
-        """Show the result of a request on the state shown now, unless the request is stale."""
+        """Apply the result of a request to the current state and show it, unless the request is stale."""
         with self._lock:
             if self._turns.is_current(token) and self.state is not None:
-                state = result(self.state)  # any error of it is shown, because the request still runs
+                state = result(self.state)  # before `finish`, so that the caller shows an error
                 if self._turns.finish(token):
                     self._do(state, message, answered=True)
 
     def _explain(self) -> None:
-        """Show the training images behind the selection; the search for them holds no lock."""
+        """Explain the selection by its training images; find them without the lock."""
         state, reasons = self.history.now, self._reasons
         token = reasons.start(state)
         self.show_message("")
@@ -291,15 +294,15 @@ class Controller(ABC):
         self._start(lambda: self._guard(compute), Action.EXPLAIN)
 
     def _click(self, action: Action, weights: Float[Tensor, " n"], message: str = "") -> None:
-        """Select, add or remove the object under a click."""
+        """Select, add or remove the clicked object."""
         self._do(actions.click(self.history.now, weights, _CLICK_MODES[action]), message, answered=True)
 
     def _ask_click(self, clicked: Any, stored: Collection[str]) -> None:
-        """Ask for everything similar to a clicked Gaussian.
+        """Start a query for all Gaussians similar to a clicked one.
 
         Args:
-            clicked: its index or direction, to be kept.
-            stored: names of prompts that must not be used again, in addition to those of other clicks.
+            clicked: index or direction of the clicked Gaussian.
+            stored: prompt texts that are already in use, in addition to those of other clicks.
         """
         with self._lock:
             names = {*self._session.clicks, *stored}

@@ -1,4 +1,4 @@
-"""Actions of users, the widgets that send them, and contents of panels as MDX."""
+"""User actions, the widgets that send them, and the content of panels as MDX."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from normlift_ns.viewer.adapter import add_button_group
 
 
 class Action(Enum):
-    """Action of a user in a viewer. Its value is the caption of its button, if it has one."""
+    """Action of a user in a viewer. The value is the caption of the action's button, if it has a button."""
 
     ASK = "Ask"
     CANCEL = "Cancel"
@@ -59,19 +59,19 @@ class Action(Enum):
 
 
 Act = Callable[[Action, Any, Any], None]
-"""Called with an action, its value, and the browser that sent it."""
+"""Function of an action, its value and the browser that sent it."""
 SLIDERS = (Action.THRESHOLD, Action.RELIABILITY, Action.GROW)
-"""Actions whose successive calls count as one step of the history."""
+"""Actions of sliders, whose successive calls are merged into one step of the history."""
 ALL_PROMPTS = "all prompts"
 
 
 class ActionWidgets:
-    """Widgets that send actions. A viewer derives a class from it, which creates the widgets named here.
+    """Base class for widgets that send actions; a subclass creates the widgets named here.
 
     Args:
         gui: viser's `GuiApi`.
-        act: called with the actions of the user.
-        lock: held while a change is passed to `act`. No other thread can revert it meanwhile.
+        act: function to call with the actions of the user.
+        lock: lock to hold while `act` handles a change, so that no other thread can revert the change.
     """
 
     prompts: Any
@@ -95,7 +95,7 @@ class ActionWidgets:
         if tuple(self.shown.options) != options:
             self._values[Action.SHOW_PROMPT] = ALL_PROMPTS
             self.shown.options = options
-            self._values[Action.SHOW_PROMPT] = self.shown.value  # viser keeps the choice if it is a new option
+            self._values[Action.SHOW_PROMPT] = self.shown.value  # viser keeps the choice if it is among the options
         self._set(Action.SHOW_PROMPT, self.shown, options[0 if state.shown is None else state.shown + 1])
         if state.query is not None:
             threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.query.threshold))
@@ -105,7 +105,7 @@ class ActionWidgets:
         self.remove_weak.visible = state.warning != ""
 
     def show_busy(self, explanation: Explanation, *, can_ask: bool) -> None:
-        """Show an explanation, and disable the buttons of requests that cannot be made now."""
+        """Show an explanation, and disable the buttons of requests that are not possible at the moment."""
         self.ask.disabled = not can_ask
         self.explain_button.disabled = explanation.busy != ""
         if self.reasons.content != explanation.content:
@@ -126,11 +126,11 @@ class ActionWidgets:
         add_button_group(self._gui, label, tuple(by_caption), pressed)
 
     def _slider(self, action: Action, numbers: tuple[float, float, float, float], hint: str, label: str = "") -> Any:
-        """Add a slider with its lowest and highest value, step and initial value."""
+        """Add a slider; `numbers` are its minimum, maximum, step and initial value."""
         return self._input(action, self._gui.add_slider(label or action.value, *numbers, hint=hint))
 
     def _input(self, action: Action, widget: Any) -> Any:
-        """Pass the changes of a widget to `act`, except changes made by the program; return the widget."""
+        """Pass the user's changes of a widget to `act`, and return the widget."""
         self._values[action] = widget.value
 
         def changed(event: Any) -> None:
@@ -143,7 +143,7 @@ class ActionWidgets:
         return widget
 
     def _set(self, action: Action, widget: Any, value: Any) -> None:
-        """Set a widget without calling `act`, unless it has a user's change that `act` has not received yet."""
+        """Set a widget without calling `act`, unless `act` has not yet received the user's last change."""
         if widget.value == self._values[action]:
             self._reset(action, widget, value)
 
@@ -157,7 +157,7 @@ class ActionWidgets:
 def escape_mdx(text: str) -> str:
     """Escape a text so that MDX shows it literally.
 
-    Possible markup or code becomes character references, and unprintable characters become escape sequences.
+    Characters that could be markup or code become character references. Unprintable ones become escape sequences.
 
     >>> escape_mdx("a {b}")
     'a &#123;b&#125;'
@@ -185,25 +185,25 @@ _OBJECT_BUTTONS = {
 
 
 class ObjectRows:
-    """List of found objects, added to the container of the panel that is open when it is created.
+    """List of found objects in a panel; the constructor adds it to the open container.
 
     Args:
         gui: viser's `GuiApi`.
-        act: called with an action on an object; its value is the object.
+        act: function to call with an action and the row of its object as the value.
     """
 
     def __init__(self, gui: Any, act: Act) -> None:
         self._objects: tuple[ObjectRow, ...] = ()
         with gui.add_folder("Found objects"):
             self._summary = gui.add_markdown("No visible objects selected")
-            # created once: viser never frees what is added to or removed from a panel that all pages share
+            # Created once, because viser never frees the memory of widgets in a panel that all pages share.
             self._rows = [self._row(gui, i, act) for i in range(MAX_OBJECT_ROWS)]
 
     def show(self, object_list: ObjectList) -> None:
         """Replace the listed objects; at most `MAX_OBJECT_ROWS` are shown."""
         self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
         unlisted = [f"{object_list.left_out:,} smaller objects are not listed"] * (object_list.left_out > 0)
-        unlisted += [f"Gaussians in smaller components: {small:,}"] * (small > 0)
+        unlisted += [f"Gaussians in components too small to be objects: {small:,}"] * (small > 0)
         empty = "" if len(self._objects) > 0 else "No visible objects selected"
         self._summary.content = escape_mdx("; ".join(unlisted) or empty)
         for i, (text, buttons) in enumerate(self._rows):
@@ -227,11 +227,12 @@ class ObjectRows:
 def prompt_rows(
     prompts: Sequence[Prompt], headings: Sequence[str], numbers: Mapping[str, Sequence[str]], *, max_rows: int
 ) -> list[str]:
-    """Return the lines of a table with the color and the numbers of each prompt, or with its error.
+    """Return the lines of a Markdown table with the color and the numbers, or the error, of each prompt.
 
     Args:
-        headings: headings of the numbers.
-        numbers: numbers of the prompts that are asked, in their order.
+        headings: headings of the columns of numbers.
+        numbers: numbers by prompt, in the order of the query.
+        max_rows: maximum number of prompts in the table.
     """
     colors = dict(zip(numbers, prompt_rgb_tuples(tuple(numbers))))
     rows = [("", "prompt", *headings), ("---",) * (2 + len(headings))]
@@ -246,20 +247,21 @@ def prompt_rows(
     return [f"| {' | '.join(row)} |" for row in rows]
 
 
-# Histograms and images as MDX, for the panels of both viewers.
+# Histograms and images as MDX.
 
 
 _WIDTH, _HEIGHT, _TOP, _BOTTOM = 280, 70, 14, 14
-"""Size of a histogram in pixels, and margins above and below its bars."""
+"""Width and height of a histogram in pixels, and margins above and below its bars."""
 _BACKGROUND, _INK, _BAR = "#141414", "#ffffff", "#8c8c8c"
 _MAX_SIDE, _QUALITY = 480, 80
-"""Longer side of an image in pixels, and its JPEG quality."""
+"""Maximum longer side of an image in pixels, and its JPEG quality."""
 
 
 def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
-    """Draw the histogram of one prompt.
+    """Draw the histogram of one prompt as SVG.
 
-    The heights of the bars are logarithmic. A solid line marks the threshold, and a dashed line the suggested one.
+    The heights of the bars are logarithmic. A solid line marks the threshold, and a dashed line marks the suggested
+    threshold.
 
     Args:
         color: color of the bars above the threshold, RGB in 0..1.
@@ -300,7 +302,7 @@ def _text(x: float, y: float, anchor: str, text: str) -> str:
 
 
 def diagnostics_mdx(state: State) -> str:
-    """Return histograms and warnings of the prompts that select; empty if no prompt selects."""
+    """Return the histograms and warnings of the prompts that select, as MDX; empty if no prompt selects."""
     diagnostics, lines = diagnose_prompts(state), []
     for one in diagnostics:
         lines += [f"{color_swatch(one.color)} {escape_mdx(clip_text(one.text, 40))}"] * (len(diagnostics) > 1)
@@ -308,7 +310,7 @@ def diagnostics_mdx(state: State) -> str:
         lines += [escape_mdx(clip_text(one.warning, 400))] * (one.warning != "")
     count = 0 if state.answer is None or state.shown is not None else len(state.answer.texts)
     if 0 < len(diagnostics) < count:
-        lines.append(f"and {count - len(diagnostics)} more; choose one to see its histogram.")
+        lines.append(f"{count - len(diagnostics)} more prompts are not shown. Choose one to see its histogram.")
     return "\n\n".join(lines)
 
 
@@ -325,24 +327,24 @@ def _image(media_type: str, content: bytes) -> str:
     return f'<img src="data:{media_type};base64,{data}" style={{{{width: "100%", borderRadius: "4px"}}}} />'
 
 
-# Explanation of a selection for a panel: the training images that voted for it, and those that disagree most.
+# Explanation of a selection for a panel: training images that voted for it, and images that disagree most.
 
 
 MAX_EXPLAIN_IMAGES = 3
-"""Number of images shown with the largest weight, and of those shown with the largest disagreement."""
+"""Maximum number of images with the largest weight, and of images with the largest disagreement."""
 _BUSY = "Finding supporting images …"
 _explain_lock = Lock()
-"""Held while votes are read and cached, so that two threads do not do both twice."""
+"""Lock for reading and caching votes, so that no two threads do it at the same time."""
 
 
 def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refined: bool = True) -> str:
-    """Return the agreement of the images in words, and the images with the regions that voted for a selection.
+    """Return the agreement of the images as text, and the images with outlines of the regions that voted, as MDX.
 
-    If the images cannot be shown, for instance because features were passed from Python, a sentence gives the reason.
+    If the images cannot be shown, for instance because features were passed from Python, the text gives the reason.
 
     Raises:
-        ValueError: nothing is selected, or the cache lacks the votes.
-        FileNotFoundError: an image needed to count the votes is missing.
+        ValueError: nothing is selected, or the votes are not in the cache.
+        FileNotFoundError: an image that is needed to count the votes is missing.
     """
     why = votes.explain(selected.cpu(), refined=refined)
     heaviest, different = why.views[:MAX_EXPLAIN_IMAGES], why.most_different[:MAX_EXPLAIN_IMAGES]
@@ -360,7 +362,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
 
 
 def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[int, str]) -> list[str]:
-    """List each view with its numbers, and with its image at the first mention."""
+    """Return lines with the numbers of each view, and with its image unless it is already in the panel."""
     lines = []
     for vote in votes:
         regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
@@ -373,33 +375,33 @@ def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[in
 
 
 class Explanation:
-    """Explanation shown to one user. It is dropped when the selection changes.
+    """Explanation of the current selection of one user.
 
     Args:
-        votes: returns the votes of the run; called at the first explanation.
+        votes: function that returns the votes of the run; it is called at the first explanation.
     """
 
     def __init__(self, votes: Callable[[], RecordedVotes]) -> None:
         self._votes, self._turns = votes, RequestTokens()
         self._selection: Bool[Tensor, " n"] | None = None
         self.content = ""
-        """MDX of the explanation; empty if there is none."""
+        """Explanation as MDX; empty if there is none."""
 
     @property
     def busy(self) -> str:
-        """Description of the running work; empty if there is none."""
+        """Description of the running work; empty if no work is running."""
         return self._turns.busy
 
     def start(self, state: State) -> RequestToken:
-        """Return a token to `find` the explanation of a selection; the previous explanation is dropped."""
+        """Return a token for `compute`, and drop the previous explanation."""
         self._selection, self.content = state.selection, ""
         return self._turns.start(_BUSY)
 
     def compute(self, token: RequestToken, state: State) -> None:
-        """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
+        """Compute the explanation of a selection. This can take seconds, so call it without a lock, from any thread.
 
         Raises:
-            ValueError, FileNotFoundError: for the same reasons as `explanation_mdx`, unless the request is stale.
+            ValueError, FileNotFoundError: for the reasons of `explanation_mdx`, unless the request is stale.
         """
         content = ""
         try:
@@ -413,7 +415,7 @@ class Explanation:
             self.content = content
 
     def update(self, state: State) -> None:
-        """Drop the explanation if the selection of this state is another one."""
+        """Drop the explanation if this state has a different selection."""
         if self._selection is not None and not torch.equal(self._selection, state.selection):
             self.clear()
 

@@ -82,7 +82,7 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
     ):
         with pytest.raises(InputError):
             wrong()
-    with pytest.raises(OSError, match="does not answer"):
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
         connect("127.0.0.1:9")
 
 
@@ -252,6 +252,6 @@ def test_runs_are_closed_when_memory_is_scarce_but_not_those_with_pages(tmp_path
         store.get(name)
     assert len(opened) == 4  # castle-one twice
     assert store.get("fox-one") is first
-    with pytest.raises(InputError, match="The runs are: fox-one, castle-one"):
+    with pytest.raises(InputError, match="fox-one, castle-one"):
         store.get("other")
     assert isinstance(first.space.field, SemanticField)

@@ -1,8 +1,8 @@
 /**
- * Connection to the server's session of this page.
+ * Connection of this page to its session on the server.
  *
- * It comes back by itself, with the last question. Dispatches `status` with `online` and `reason`, and an event per
- * type of message.
+ * It reconnects automatically and restores the last query. It dispatches `status` events with `online` and `reason`,
+ * and one event for each message, with the message's type as its name.
  */
 
 /** @typedef {{type: string, seq?: number, [name: string]: any}} Message */
@@ -17,7 +17,7 @@ export function parseFrame(frame) {
 }
 
 export class Connection extends EventTarget {
-  /** @param {string} run Id of the run. @param {() => object} greeting Further fields of the first action. */
+  /** @param {string} run Id of the run. @param {() => object} greeting Value of the first action. */
   constructor(run, greeting) {
     super();
     this.run = run;
@@ -30,7 +30,7 @@ export class Connection extends EventTarget {
     this.open();
   }
 
-  /** @returns {Record<string, string>} What this tab knows of its session, also after a reload. */
+  /** @returns {Record<string, string>} Data about the session, which this tab stores and keeps after a reload. */
   get memory() {
     return JSON.parse(sessionStorage.getItem(this.key) ?? "{}");
   }
@@ -70,7 +70,7 @@ export class Connection extends EventTarget {
     this.dispatchEvent(Object.assign(new Event(header.type), { message: header, payload }));
   }
 
-  /** @param {string} action @param {any} [value] @returns {number} Number that answers carry; -1 without connection. */
+  /** @param {string} action @param {any} [value] @returns {number} Number of the message, -1 if offline. */
   send(action, value = null) {
     if (this.socket?.readyState !== WebSocket.OPEN) return -1;
     this.seq++;

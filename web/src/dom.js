@@ -1,8 +1,9 @@
-/** Small helpers for elements. */
+/** Helper functions for DOM elements. */
 
 /**
+ * Create an element.
  * @param {string} name Tag, with classes after dots.
- * @param {Record<string, any>} [attributes] Functions become listeners, null and false are left out.
+ * @param {Record<string, any>} [attributes] Attributes; those that begin with "on" are event listeners.
  * @param {...(Node | string | null | undefined | false)} children
  * @returns {any}
  */
@@ -32,7 +33,7 @@ export const fixed = (value, digits = 2) => (Number.isFinite(value) ? value.toFi
 /** @param {number[]} rgb Values in 0..1. */
 export const cssColor = (rgb) => `rgb(${rgb.map((x) => Math.round(255 * x)).join(" ")})`;
 
-/** @param {Element} parent @param {Node[]} children Replaces only what differs, so that focus stays. */
+/** Replace children if they differ, and keep the focus. @param {Element} parent @param {Node[]} children */
 export function fill(parent, children) {
   const fresh = h("div", {}, ...children);
   if (fresh.innerHTML === parent.innerHTML && fresh.childNodes.length === parent.childNodes.length) return;
@@ -49,8 +50,8 @@ export function saveBlob(blob, name) {
 }
 
 /**
- * Limits calls to one per wait; the last one is always made.
- * @param {(...values: any[]) => void} call @param {number} wait Milliseconds.
+ * Limit the calls of a function to one per interval; the last call is always made.
+ * @param {(...values: any[]) => void} call @param {number} wait Interval in milliseconds.
  * @returns {(...values: any[]) => void}
  */
 export function throttled(call, wait) {

@@ -1,4 +1,4 @@
-/** Icons, drawn with strokes in a square of 24. */
+/** Icons as SVG paths for strokes, 24 units wide and high. */
 
 const PATHS = {
   search: "M10.5 4a6.5 6.5 0 1 0 0 13a6.5 6.5 0 1 0 0-13zM15.5 15.5L20 20",

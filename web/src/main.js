@@ -1,4 +1,4 @@
-/** The page: connects the server's session with the scene, the panel and the tools. */
+/** Page that connects the session on the server with the scene, the panel and the tools. */
 import { Connection } from "./connection.js";
 import { $, fixed, h, saveBlob, throttled } from "./dom.js";
 import { icon } from "./icons.js";
@@ -14,12 +14,12 @@ import { showExplanation } from "./why.js";
 
 /** @type {[string, string, string][]} Color mode, label and tooltip. */
 const MODES = [
-  ["overlay", "Overlay", "Answers in their colors over the gray scene."],
-  ["heat", "Heat map", "Relevancy of everything."],
-  ["prompts", "Prompts", "Each answer in its own color."],
-  ["rgb", "RGB", "The scene as trained."],
-  ["reliability", "Reliability", "R: how well the images support each feature."],
-  ["pca", "Features", "Three principal components of the features as colors."],
+  ["overlay", "Overlay", "Show answers over the gray scene, more opaque for higher relevancy."],
+  ["heat", "Heat map", "Show the relevancy of all Gaussians."],
+  ["prompts", "Prompts", "Show each answer in its own color."],
+  ["rgb", "RGB", "Show the trained colors."],
+  ["reliability", "Reliability", "Show the reliability R, which is high if many images agree on a feature."],
+  ["pca", "Features", "Show three principal components of the features as colors."],
 ];
 const OUTLINED = ["overlay", "prompts"];
 const COARSE_TOO_SLOW = 800;
@@ -35,7 +35,7 @@ async function fetchRuns() {
         if (runs.length > 0) return runs;
       }
     } catch {
-      /* the server is not there yet */
+      /* the server has not started yet */
     }
     await new Promise((resolve) => setTimeout(resolve, wait));
   }
@@ -48,7 +48,7 @@ class Page {
     this.runs = runs;
     this.state = /** @type {any} */ (null);
     this.revision = 0;
-    /** @type {Map<number, Element | null>} What was pressed, by the number of the action. */
+    /** @type {Map<number, Element | null>} Pressed elements, by the number of the action. */
     this.anchors = new Map();
     /** @type {Map<number, (position: number[] | null) => void>} */
     this.probes = new Map();
@@ -80,7 +80,7 @@ class Page {
   }
 
   /**
-   * Fields of the greeting: the token of this tab, and the question of the address or the last one.
+   * Return the token of this tab, the link in the URL or the last link, and the access token.
    * @returns {{token: string, link: string, access: string}}
    */
   greeting() {
@@ -96,7 +96,7 @@ class Page {
   }
 
   /**
-   * @param {string} action @param {any} [value] @param {Element | null} [anchor] Element that was pressed.
+   * @param {string} action @param {any} [value] @param {Element | null} [anchor] Pressed element.
    * @returns {number} Number of the action.
    */
   act(action, value = null, anchor = null) {
@@ -110,7 +110,7 @@ class Page {
     return seq;
   }
 
-  /** Dims the old answer if a new question has none. @param {boolean} stale */
+  /** Dim the old answer if a new query fails. @param {boolean} stale */
   setStale(stale) {
     if (this.stale === stale) return;
     this.stale = stale;
@@ -159,7 +159,7 @@ class Page {
         max: 1,
         step: 0.01,
         value: 1,
-        "aria-label": "Blend: scene to answer",
+        "aria-label": "Blend between scene and answer",
         "data-tip": "Blend between scene and answer.",
         oninput: () => this.scene?.setBlend(Number($("blend").value)),
       }),
@@ -186,17 +186,17 @@ class Page {
         icon(name),
       );
     $("corner").replaceChildren(
-      tool("Start view", "home", "Back to the view at the start.", "Home", () => this.home && this.view.go(this.home), {
+      tool("Start view", "home", "Go back to the first view.", "Home", () => this.home && this.view.go(this.home), {
         id: "do-home",
       }),
       tool("Compare", "compare", "Compare scene and answer with a divider.", "C", () => this.toggleCompare(), {
         id: "do-compare",
         "aria-pressed": "false",
       }),
-      tool("Screenshot", "camera", "Save a picture of the scene.", "S", (anchor) => this.screenshot(anchor), {
+      tool("Screenshot", "camera", "Save an image of this view.", "S", (anchor) => this.screenshot(anchor), {
         id: "do-screenshot",
       }),
-      tool("Link", "link", "Copy a link to this question and view.", null, (anchor) => this.copyLink(anchor), {
+      tool("Link", "link", "Copy a link to this search and view.", null, (anchor) => this.copyLink(anchor), {
         id: "do-link",
       }),
       tool("Dark or light", "theme", "Switch between dark and light.", "D", () => this.switchTheme(), {
@@ -225,7 +225,7 @@ class Page {
           $("prompts").select();
         },
       },
-      { keys: "Escape", text: "Stop searching, close, back to Select", run: () => this.escape() },
+      { keys: "Escape", text: "Cancel, close, or return to Select", run: () => this.escape() },
       ...TOOLS.map(([name, , label, keys]) => ({ keys, text: label, run: () => this.tools.choose(name) })),
       { keys: "H", text: "Hide the selection", run: press("do-hide") },
       { keys: "I", text: "Isolate the selection", run: press("do-isolate") },
@@ -233,19 +233,19 @@ class Page {
       { keys: "X", text: "Invert the selection", run: press("do-invert") },
       { keys: "[", text: "Shrink the selection", run: press("do-shrink") },
       { keys: "]", text: "Grow the selection", run: press("do-grow") },
-      { keys: "W", text: "Why?", run: press("do-why") },
+      { keys: "W", text: "Explain the selection", run: press("do-why") },
       { keys: "G", text: "Go to the selection", run: press("do-go") },
       { keys: "N", text: "Save a layer", run: press("do-layer") },
       { keys: "T", text: "Use the suggested threshold", run: press("do-suggested") },
-      { keys: "Delete", text: "Clear", run: press("do-clear") },
+      { keys: "Delete", text: "Clear search and selection", run: press("do-clear") },
       { keys: "Ctrl+Z", text: "Undo", run: press("do-undo") },
       { keys: "Ctrl+Shift+Z or Ctrl+Y", text: "Redo", run: press("do-redo") },
       ...MODES.map(([mode, label], i) => ({ keys: String(i + 1), text: `Show ${label}`, run: press(`mode-${mode}`) })),
       { keys: "C", text: "Compare scene and answer", run: press("do-compare") },
-      { keys: "S", text: "Screenshot", run: press("do-screenshot") },
-      { keys: "D", text: "Dark or light", run: press("do-theme") },
-      { keys: "Home", text: "Start view", run: press("do-home") },
-      { keys: "?", text: "This list", run: () => ($("help").open ? $("help").close() : $("help").showModal()) },
+      { keys: "S", text: "Save a screenshot", run: press("do-screenshot") },
+      { keys: "D", text: "Switch between dark and light", run: press("do-theme") },
+      { keys: "Home", text: "Go back to the first view", run: press("do-home") },
+      { keys: "?", text: "Toggle this list", run: () => ($("help").open ? $("help").close() : $("help").showModal()) },
     ];
   }
 
@@ -313,7 +313,7 @@ class Page {
         this.cameras = this.panel.scene.cameras = cameras;
       });
     if (!this.scene) {
-      $("loading").querySelector("p").textContent = "This browser has no WebGL 2: the server draws the scene.";
+      $("loading").querySelector("p").textContent = "This browser has no WebGL 2, so the server renders the scene.";
       return;
     }
     const digest = this.run.digest ? `?digest=${encodeURIComponent(this.run.digest)}` : "";
@@ -383,7 +383,7 @@ class Page {
     if (probe) {
       this.probes.delete(seq);
       probe(position);
-      if (!position) toast("There is nothing here. Click on an object.", {});
+      if (!position) toast("There is no object at this position. Click an object.", {});
       return;
     }
     if (seq !== this.pointed || !this.pointer) return;
@@ -420,7 +420,7 @@ class Page {
     this.connection.send("camera", { ...view, fov: (Math.PI / 180) * view.fov });
   }
 
-  /** Keeps what a page needs after a restart of the server. */
+  /** Store the camera and the link, so that the page can restore them after a restart of the server. */
   remember() {
     this.sendCamera();
     this.silent.add(this.connection.send("link"));
@@ -435,7 +435,7 @@ class Page {
     this.connection.remember({ search: location.search });
     const anchor = this.anchors.get(seq);
     const done = () => toast("Link copied", { kind: "done", anchor });
-    const failed = () => toast("The address of this page is the link now.", { kind: "done", anchor });
+    const failed = () => toast("The link is now the address of this page. Copy it there.", { kind: "done", anchor });
     navigator.clipboard ? navigator.clipboard.writeText(location.href).then(done, failed) : failed();
   }
 
@@ -449,12 +449,12 @@ class Page {
   async screenshot(anchor) {
     const name = `${this.run.name}.png`.replace(/[^\w.-]+/g, "_");
     const blob = this.scene ? await this.scene.screenshot() : await this.stills.blob();
-    if (!blob) return toast("There is no picture yet.", { kind: "error", anchor });
+    if (!blob) return toast("There is no image yet. Try again in a moment.", { kind: "error", anchor });
     saveBlob(blob, name);
     toast(`Downloaded ${name}`, { kind: "done", anchor });
   }
 
-  /** @param {boolean} online @param {string} reason Of the server, if it has closed the connection. */
+  /** @param {boolean} online @param {string} reason Reason from the server for closing the connection. */
   showStatus(online, reason) {
     clearTimeout(this.offlineTimer);
     if (online) {
@@ -475,7 +475,7 @@ class Page {
     this.setDivider(on ? 0.5 : null);
   }
 
-  /** @param {number | null} share Of the width. */
+  /** @param {number | null} share Position of the divider, as a fraction of the width. */
   setDivider(share) {
     this.scene?.setSplit(share === null ? -2 : 2 * share - 1);
     if (share === null) return;

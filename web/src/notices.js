@@ -1,7 +1,7 @@
-/** Tooltips with shortcuts, and toasts near what was pressed. */
+/** Tooltips with shortcuts, and toasts near the pressed element. */
 import { $, h } from "./dom.js";
 
-/** Keeps a box inside the window, below its anchor if there is room. @param {HTMLElement} box @param {DOMRect} anchor */
+/** Place a box inside the window, below its anchor if possible. @param {HTMLElement} box @param {DOMRect} anchor */
 function place(box, anchor) {
   const { width, height } = box.getBoundingClientRect();
   const left = Math.min(Math.max(8, anchor.left + anchor.width / 2 - width / 2), innerWidth - width - 8);
@@ -11,7 +11,7 @@ function place(box, anchor) {
   box.style.top = `${Math.max(4, top)}px`;
 }
 
-/** Shows `data-tip` and `data-keys` of an element under the pointer or with the focus. */
+/** Show `data-tip` and `data-keys` of an element under the pointer or with the focus as a tooltip. */
 export function startTooltips() {
   const tip = $("tip");
   let timer = 0;
@@ -41,8 +41,9 @@ export function startTooltips() {
 }
 
 /**
+ * Show a toast near its anchor.
  * @param {string | Node} content
- * @param {{kind?: string, anchor?: Element | null, seconds?: number}} [options] The anchor is what was pressed.
+ * @param {{kind?: string, anchor?: Element | null, seconds?: number}} [options] The anchor is the pressed element.
  */
 export function toast(content, { kind = "info", anchor = null, seconds = 5 } = {}) {
   const box = h(`div.toast.${kind}`, { role: kind === "error" ? "alert" : "status" }, content);

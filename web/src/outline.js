@@ -1,4 +1,4 @@
-/** Draws the edge of what an answer selects, so that it stands out whatever its color. */
+/** Outline of the selection, which makes it visible in every color. */
 import * as THREE from "three";
 import { fullScreenPass } from "./passes.js";
 
@@ -25,7 +25,7 @@ void main() {
   color = vec4(vec3(core) * opacity, opacity);
 }`;
 
-/** A pass over a drawn frame. */
+/** Full-screen pass that draws the outline over a rendered frame. */
 export class Outline {
   constructor() {
     this.target = new THREE.WebGLRenderTarget(1, 1, { depthBuffer: false });

@@ -1,4 +1,4 @@
-/** The panel: selection, objects, layers, history, cameras and advanced settings. */
+/** Panel with selection, objects, layers, history, cameras and advanced settings. */
 import { $, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 
@@ -6,7 +6,7 @@ const COLORMAPS = ["viridis", "cividis", "inferno", "magma", "turbo"];
 const RULES = [
   ["auto", "Automatic"],
   ["contrast", "Contrast with unrelated words"],
-  ["lerf", "LERF: against each negative"],
+  ["lerf", "LERF, contrast with each negative"],
   ["margin", "Margin over negatives"],
   ["cosine", "Cosine"],
 ];
@@ -95,20 +95,20 @@ export class Panel {
             (anchor) => this.isolate(null, this.state.objects ?? [], anchor),
             { id: "do-isolate" },
           ),
-          button("Show all", null, "Show everything that is hidden.", "A", simple("show_all"), { id: "do-show" }),
-          button("Invert", null, "Select everything else.", "X", simple("invert"), { id: "do-invert" }),
+          button("Show all", null, "Show all hidden Gaussians.", "A", simple("show_all"), { id: "do-show" }),
+          button("Invert", null, "Select all other visible Gaussians.", "X", simple("invert"), { id: "do-invert" }),
           button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), {
             id: "do-why",
           }),
           button(
             "Go to",
             null,
-            "Move the camera to the selection's largest object.",
+            "Move the camera to the largest selected object.",
             "G",
             (anchor) => this.goToFirst(anchor),
             { id: "do-go" },
           ),
-          button("Clear", null, "Remove question and selection.", "Delete", simple("clear"), { id: "do-clear" }),
+          button("Clear", null, "Clear search and selection.", "Delete", simple("clear"), { id: "do-clear" }),
           button("Layer", null, "Save the selection as a layer.", "N", (anchor) => this.addLayer(anchor), {
             id: "do-layer",
           }),
@@ -120,7 +120,7 @@ export class Panel {
             "div.row",
             { role: "group", "aria-label": "History" },
             button("Undo", "undo", "Undo the last step.", "Ctrl+Z", simple("undo"), { id: "do-undo", bare: true }),
-            button("Redo", "redo", "Redo the step that was undone.", "Ctrl+Shift+Z", simple("redo"), {
+            button("Redo", "redo", "Redo the last undone step.", "Ctrl+Shift+Z", simple("redo"), {
               id: "do-redo",
               bare: true,
             }),
@@ -134,7 +134,7 @@ export class Panel {
               bare: true,
             }),
             h("span.num", { id: "grow" }, "0"),
-            button("Grow", "grow", "Grow the selection from part to whole.", "]", (anchor) => this.grow(1, anchor), {
+            button("Grow", "grow", "Grow the selection to similar neighbors.", "]", (anchor) => this.grow(1, anchor), {
               id: "do-grow",
               bare: true,
             }),
@@ -158,7 +158,7 @@ export class Panel {
           button(
             "Masks",
             null,
-            "Download masks of the selection in all training images.",
+            "Download a mask of the selection for each training image.",
             null,
             simple("export", { format: "masks" }),
             { id: "save-masks" },
@@ -180,7 +180,7 @@ export class Panel {
         h(
           "label.field",
           {},
-          h("span", {}, "Least relevancy", h("b.num", { id: "threshold-value" })),
+          h("span", {}, "Minimum relevancy", h("b.num", { id: "threshold-value" })),
           h("input", {
             id: "threshold",
             type: "range",
@@ -194,7 +194,7 @@ export class Panel {
         h(
           "label.field",
           {},
-          h("span", {}, "Least reliability R", h("b.num", { id: "reliability-value" })),
+          h("span", {}, "Minimum reliability R", h("b.num", { id: "reliability-value" })),
           h("input", {
             id: "reliability",
             type: "range",
@@ -204,13 +204,13 @@ export class Panel {
             value: 0,
             oninput: () => this.slid("reliability"),
             onchange: () => this.rested(),
-            "data-tip": "Leaves out what few images have shown clearly.",
+            "data-tip": "Deselect Gaussians that few images show clearly.",
           }),
         ),
       ),
       fold("objects", "Objects", [h("ul.list", { id: "objects" })], true),
       fold("layers", "Layers", [
-        h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to come back to it."),
+        h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to restore it later."),
         h("ul.list", { id: "layers" }),
       ]),
       fold("history", "History", [h("ol.list", { id: "history" })]),
@@ -219,7 +219,7 @@ export class Panel {
     );
     $("facts").textContent =
       `${grouped(run.num_drawn)} Gaussians · ${grouped(run.num_views)} images` +
-      (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} hidden to keep the browser responsive` : "");
+      (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} not drawn, to keep the browser responsive` : "");
     $("fold-cameras").addEventListener("toggle", () => this.showCameras(), { once: true });
   }
 
@@ -235,7 +235,7 @@ export class Panel {
           id: "negatives",
           type: "text",
           placeholder: "Automatic",
-          "data-tip": "What the answer is compared with, separated by commas. Empty: automatic.",
+          "data-tip": "Prompts to compare with, separated by commas. Leave empty for the default of the encoder.",
           onchange: () => {
             const texts = $("negatives")
               .value.split(",")
@@ -267,7 +267,7 @@ export class Panel {
         button(
           "Select likely floaters",
           null,
-          "Select Gaussians that belong to no surface. Look first, then hide them.",
+          "Select Gaussians that are probably not part of a surface. Check them before you hide them.",
           null,
           (anchor) => act("floaters", null, anchor),
           { id: "do-floaters" },
@@ -275,7 +275,7 @@ export class Panel {
         button(
           "Remove weak evidence",
           null,
-          "Leave out what few images have shown clearly.",
+          "Remove Gaussians that few images show clearly from the selection.",
           null,
           (anchor) => act("remove_weak", null, anchor),
           { id: "do-weak" },
@@ -284,7 +284,7 @@ export class Panel {
           button(
             "Save prompts",
             null,
-            "Store these prompts in the run, in addition to the saved ones.",
+            "Save these prompts in the run, in addition to those already saved.",
             null,
             (anchor) => act("save_prompts", { replace: false }, anchor),
             { id: "do-save" },
@@ -300,8 +300,8 @@ export class Panel {
   }
 
   /**
-   * Hides everything else, and goes to an object if none would be in view.
-   * @param {number[] | null} ids Of objects; null: the selection.
+   * Hide everything else, and move the camera to the first object if none is in view.
+   * @param {number[] | null} ids Ids of objects; null for the selection.
    * @param {{id: number, center: number[]}[]} objects @param {Element} anchor
    */
   isolate(ids, objects, anchor) {
@@ -384,7 +384,7 @@ export class Panel {
       parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
     if (hidden > 0) parts.push(`${grouped(hidden)} hidden`);
     if (some && state.by_hand) parts.push("by hand");
-    $("selected-more").textContent = parts.join(" · ") || (some ? "Gaussians" : "Ask, or click an object.");
+    $("selected-more").textContent = parts.join(" · ") || (some ? "Gaussians" : "Search, or click an object.");
     $("warning").textContent = state.warning ?? "";
     for (const id of [
       "do-hide",
@@ -487,7 +487,7 @@ export class Panel {
       state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} smaller ones`)] : [];
     fill(
       $("objects"),
-      rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "Objects of an answer are listed here.")],
+      rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "This list shows the objects of the selection.")],
     );
   }
 
@@ -601,7 +601,7 @@ function histogram(row, threshold, low, high) {
     preserveAspectRatio: "none",
     class: "histogram",
     role: "img",
-    "aria-label": `How many Gaussians have which relevancy for ${row.text}`,
+    "aria-label": `Histogram of the relevancy for ${row.text}`,
     "data-low": low,
     "data-high": high,
   });

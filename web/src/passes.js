@@ -1,9 +1,9 @@
-/** Passes over a whole frame. */
+/** Full-screen passes. */
 import * as THREE from "three";
 
 /**
  * @param {string} fragmentShader @param {Record<string, THREE.IUniform>} uniforms @param {THREE.Blending} blending
- * @returns {THREE.Scene} A scene that covers the frame.
+ * @returns {THREE.Scene} Scene with one triangle that covers the frame.
  */
 export function fullScreenPass(fragmentShader, uniforms, blending) {
   const material = new THREE.RawShaderMaterial({

@@ -1,12 +1,12 @@
 /**
- * Shows new colors within milliseconds where a frame takes a second: of a picture of the scene in its own colors, each
- * pixel gets the color of the Gaussian that is nearest there.
+ * Preview of new colors within milliseconds, for renderers that need a second per frame. It recolors a stored image of
+ * the scene: each pixel gets the color of its nearest Gaussian.
  */
 import * as THREE from "three";
 import { fullScreenPass } from "./passes.js";
 import { GRAY_LEVEL, WIDTH } from "./splats.js";
 
-/** Pixels of the picture per pixel of the page and side. */
+/** Width of the stored image relative to the page. */
 const RATIO = 0.5;
 const FRAGMENT = `
 precision highp float;
@@ -54,7 +54,7 @@ export class Preview {
   }
 
   /**
-   * Keeps a picture of the scene in its own colors.
+   * Store an image of the scene in its trained colors.
    * @param {THREE.WebGLRenderer} renderer @param {THREE.Scene} scene @param {THREE.Camera} camera
    * @param {import("./splats.js").Splats} splats
    */
@@ -77,7 +77,7 @@ export class Preview {
     this.ready = true;
   }
 
-  /** Draws the picture in the colors of now. @param {THREE.WebGLRenderer} renderer @param {THREE.Camera} camera */
+  /** Draw the stored image in the current colors. @param {THREE.WebGLRenderer} renderer @param {THREE.Camera} camera */
   draw(renderer, camera) {
     renderer.getDrawingBufferSize(this.uniforms.size.value);
     if (this.pass) renderer.render(this.pass, camera);

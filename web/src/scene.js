@@ -1,20 +1,20 @@
-/** Draws the Gaussians with WebGL, when something has changed. */
+/** WebGL renderer of the Gaussians, which draws a frame only after a change. */
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { Outline } from "./outline.js";
 import { Preview } from "./preview.js";
 import { Splats } from "./splats.js";
 
-/** Milliseconds per frame from which on a moving camera gets coarser frames. */
+/** Milliseconds per frame above which frames are coarser while the camera moves. */
 const SLOW = 120;
-/** Milliseconds per frame from which on a changed answer is first drawn coarsely. */
+/** Milliseconds per frame above which the first frame with new colors is coarse. */
 const VERY_SLOW = 700;
-/** Milliseconds without a change after which the finest frame is drawn. */
+/** Milliseconds without a change before a frame at full resolution. */
 const REST = 200;
-/** Milliseconds of rest after which a slow renderer adds the outline. */
+/** Milliseconds without a change before a slow renderer adds the outline. */
 const LONG_REST = 800;
 
-/** @param {THREE.WebGLRenderer} renderer @returns {Promise<void>} Resolves when the GPU has drawn all so far. */
+/** @param {THREE.WebGLRenderer} renderer @returns {Promise<void>} Resolves when the GPU has finished. */
 function drawn(renderer) {
   const gl = /** @type {WebGL2RenderingContext} */ (renderer.getContext());
   const fence = /** @type {WebGLSync} */ (gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0));
@@ -30,14 +30,14 @@ function drawn(renderer) {
   });
 }
 
-/** @returns {boolean} True if this browser can draw the scene itself. */
+/** @returns {boolean} True if this browser supports WebGL 2. */
 export function hasWebGL() {
   const gl = document.createElement("canvas").getContext("webgl2");
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return gl !== null;
 }
 
-/** Draws a scene with WebGL. Dispatches `frame` events, with `full` and `milliseconds`. */
+/** WebGL renderer of a scene. It dispatches `frame` events with `full` and `milliseconds`. */
 export class SceneRenderer extends EventTarget {
   /** @param {HTMLCanvasElement} canvas @param {import("./view.js").View3D} view */
   constructor(canvas, view) {
@@ -69,7 +69,7 @@ export class SceneRenderer extends EventTarget {
     view.addEventListener("move", () => this.invalidate("camera"));
   }
 
-  /** @param {string} url Of an SPZ file. @param {(share: number) => void} progress */
+  /** @param {string} url URL of an SPZ file. @param {(share: number) => void} progress */
   async load(url, progress) {
     const mesh = new SplatMesh({
       url,
@@ -84,7 +84,7 @@ export class SceneRenderer extends EventTarget {
     this.invalidate("order");
   }
 
-  /** @param {string} css Color behind the scene. */
+  /** @param {string} css Background color. */
   setBackground(css) {
     this.renderer.setClearColor(new THREE.Color(css), 1);
     this.invalidate("colors");
@@ -96,13 +96,13 @@ export class SceneRenderer extends EventTarget {
     this.invalidate(hidden ? "order" : "colors");
   }
 
-  /** @param {number} position In -1..1; what is left of it keeps its own colors. -2: nothing. */
+  /** @param {number} position Divider in -1..1, with trained colors to the left of it; -2 for no divider. */
   setSplit(position) {
     if (this.splats) this.splats.uniforms.split.value = position;
     this.invalidate("colors");
   }
 
-  /** @param {number} share In 0..1: 0 shows the colors of the scene, 1 those of the answer. */
+  /** @param {number} share Blend in 0..1, from the trained colors (0) to the colors of the answer (1). */
   setBlend(share) {
     if (this.splats) this.splats.uniforms.blend.value = share;
     this.invalidate("colors");
@@ -119,7 +119,7 @@ export class SceneRenderer extends EventTarget {
     return this.costs.full > SLOW;
   }
 
-  /** Draws soon. @param {"camera" | "colors" | "order"} what Has changed. */
+  /** Schedule a new frame. @param {"camera" | "colors" | "order"} what Part of the scene that has changed. */
   invalidate(what) {
     this.changed = { what, when: performance.now() };
     if (what !== "colors") this.preview.ready = false;
@@ -130,14 +130,14 @@ export class SceneRenderer extends EventTarget {
     }
   }
 
-  /** Draws one frame, coarser if a fine one would come too late, and the fine one once nothing changes any more. */
+  /** Draw one frame, at low resolution if the renderer is slow, and schedule the frame at full resolution. */
   async draw() {
     if (this.busy) return;
     this.waiting = false;
     if (!this.splats || !this.view.placed) return;
     this.busy = true;
     const still = performance.now() - this.changed.when > REST || this.changed.what !== "camera";
-    const known = this.frames > 0; // the first frame is coarse: it may take long
+    const known = this.frames > 0; // the first frame is coarse because it may take long
     const quick = this.costs.full < VERY_SLOW && !this.preview.ready;
     const full = known && (!this.slow || (still && (quick || this.coarse)));
     const milliseconds = await (this.preview.ready && !full ? this.renderPreview() : this.render(full));
@@ -149,7 +149,7 @@ export class SceneRenderer extends EventTarget {
     else if (this.slow) this.timer = setTimeout(() => this.rest(), LONG_REST);
   }
 
-  /** Adds the outline to a fine frame of a slow renderer, and prepares the next colors. */
+  /** Add the outline to a full frame of a slow renderer, and store an image for the preview of the next colors. */
   async rest() {
     const { renderer, scene, splats, view } = this;
     if (this.busy || this.waiting || !splats) return;
@@ -165,14 +165,14 @@ export class SceneRenderer extends EventTarget {
     if (this.waiting) requestAnimationFrame(() => this.draw());
   }
 
-  /** Draws the fine frame after a coarse one. */
+  /** Draw the full frame after a coarse frame. */
   finish() {
     if (this.waiting) return;
     this.waiting = true;
     requestAnimationFrame(() => this.draw());
   }
 
-  /** Shows new colors at once. @returns {Promise<number>} Milliseconds that the GPU took. */
+  /** Show a preview of new colors. @returns {Promise<number>} GPU time in milliseconds. */
   async renderPreview() {
     const start = performance.now();
     this.preview.draw(this.renderer, this.view.camera);
@@ -180,7 +180,7 @@ export class SceneRenderer extends EventTarget {
     return performance.now() - start;
   }
 
-  /** @param {boolean} full @returns {Promise<number>} Milliseconds that the GPU took. */
+  /** @param {boolean} full @returns {Promise<number>} GPU time in milliseconds. */
   async render(full) {
     const { renderer, view } = this;
     const start = performance.now();
@@ -204,7 +204,7 @@ export class SceneRenderer extends EventTarget {
     return milliseconds;
   }
 
-  /** @returns {Promise<Blob | null>} PNG of the scene as it is drawn. */
+  /** @returns {Promise<Blob | null>} PNG of the current view. */
   async screenshot() {
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
     this.renderer.render(this.scene, this.view.camera);

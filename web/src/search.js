@@ -1,4 +1,4 @@
-/** The search box, its examples and the answers. */
+/** Search box with examples and answers. */
 import { $, cssColor, fill, fixed, grouped, h } from "./dom.js";
 import { icon } from "./icons.js";
 
@@ -24,7 +24,7 @@ export class Search {
       $("prompts").blur();
     });
     Object.assign($("ask").dataset, {
-      tip: "Search. Commas separate several prompts, double quotes keep a comma.",
+      tip: "Search. Separate several prompts by commas. Put a prompt that contains a comma in double quotes.",
       keys: "Enter",
     });
     Object.assign($("cancel").dataset, { tip: "Stop searching.", keys: "Escape" });
@@ -117,7 +117,7 @@ export class Search {
     const several = texts.length > 1;
     const tip =
       `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
-      (several ? (shown ? " Press to show all answers." : " Press to show this answer alone.") : "");
+      (several ? (shown ? " Click to show all answers." : " Click to show only this answer.") : "");
     const dim = state.by_hand || (state.shown !== null && !shown && several);
     return h(
       "li",

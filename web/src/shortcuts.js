@@ -1,4 +1,4 @@
-/** Keyboard shortcuts, and the dialog that lists them. */
+/** Keyboard shortcuts and their help dialog. */
 import { $, h } from "./dom.js";
 
 /** @typedef {{keys: string, text: string, run: () => void}} Shortcut */
@@ -12,10 +12,10 @@ const POINTER = [
   ["Ctrl or Alt + click", "Remove an object that was added"],
   ["Arrow keys", "Turn the focused scene"],
   ["+  −", "Zoom the focused scene"],
-  ["Enter", "Select in the middle of the focused scene"],
+  ["Enter", "Select the object in the middle of the focused scene"],
 ];
 
-/** @param {KeyboardEvent} event @returns {string} As shortcuts name it, such as "Ctrl+Shift+Z". */
+/** @param {KeyboardEvent} event @returns {string} Pressed keys, such as "Ctrl+Shift+Z". */
 function pressed(event) {
   const key = event.key.length === 1 ? event.key.toUpperCase() : event.key;
   const shifts = event.shiftKey && (event.key.length > 1 || /[A-Z]/.test(key));
@@ -53,7 +53,7 @@ export function startShortcuts(shortcuts) {
   closesOutside($("help"));
 }
 
-/** @param {HTMLDialogElement} dialog Closes at a click beside it. */
+/** Close a dialog when the user clicks outside it. @param {HTMLDialogElement} dialog */
 export function closesOutside(dialog) {
   dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
 }

@@ -1,11 +1,11 @@
 /**
- * Extends Spark's renderer: colors by one byte per Gaussian, and batches instead of one instance per Gaussian.
+ * Extension of Spark's renderer with one color byte per Gaussian, and with batches of Gaussians as instances.
  *
- * Colors are looked up when a frame is drawn. Geometry, spherical harmonics and sort order stay as they are, so a new
- * answer needs no sorting, and the next frame shows it. Hidden Gaussians keep their position in the sort order.
- * Batches make software WebGL four times as fast as instances, which it draws one by one.
+ * The shader looks up colors while it draws a frame. Geometry, spherical harmonics and sort order do not change, so a
+ * new answer needs no sorting, and the next frame shows it. Hidden Gaussians keep their position in the sort order.
+ * Software WebGL draws instances one by one; batches make it four times as fast.
  *
- * The changes are made in Spark's own shaders, whose version is pinned; `patched` throws if a line is not there.
+ * The extension patches the shaders of Spark, whose version is pinned; `patched` throws if a line is missing.
  */
 import * as THREE from "three";
 
@@ -13,9 +13,9 @@ import * as THREE from "three";
 const BATCH = 256;
 /** Width of the texture of codes. */
 export const WIDTH = 2048;
-/** Brightness of what is not selected, relative to its own gray. */
+/** Brightness of unselected Gaussians, relative to the gray value of their trained colors. */
 export const GRAY_LEVEL = 0.8;
-/** Opacity from which on a Gaussian counts as the nearest one of a pixel. */
+/** Minimum opacity of the nearest Gaussian of a pixel. */
 const OPAQUE = 0.3;
 /** Code of Gaussians that are not drawn. */
 const HIDDEN = 255;
@@ -44,7 +44,7 @@ const COLOR = `
         rgba.rgb = mix(mix(rgba.rgb, level, gray * blend), tint.rgb, tint.a * blend);
     }
     vRgba = rgba;`;
-/** A triangle reaches to where its Gaussian falls below the least opacity that is drawn. */
+/** Size of a triangle, which ends at the minimum drawn opacity of its Gaussian. */
 const TIGHT = `
     vRgba.a = rgba.a;
     if (rgba.a <= 1.0) {
@@ -52,7 +52,7 @@ const TIGHT = `
         vSplatUv = position.xy * adjustedStdDev;
     }`;
 
-/** Nearest Gaussian of each pixel, if a second target is drawn to: blending with opacity 1 replaces, with 0 keeps. */
+/** Nearest Gaussian of each pixel for a second render target. Opacity 1 replaces the previous value, 0 keeps it. */
 const NEAREST = `fragColor = vec4(rgba.rgb * rgba.a, rgba.a);
     uvec3 bytes = uvec3(vSplatIndex, vSplatIndex >> 8, vSplatIndex >> 16) & 255u;
     nearest = rgba.a > ${OPAQUE} ? vec4(vec3(bytes) / 255.0, 1.0) : vec4(0.0);`;
@@ -90,7 +90,7 @@ function codeTexture(count) {
   return texture;
 }
 
-/** The Gaussians of a scene that holds a single mesh. */
+/** Gaussians of a scene with a single mesh. */
 export class Splats {
   /** @param {import("@sparkjsdev/spark").SparkRenderer} spark @param {number} count Number of Gaussians. */
   constructor(spark, count) {
@@ -131,10 +131,10 @@ export class Splats {
   }
 
   /**
-   * Changes the colors of the next frame.
-   * @param {Uint8Array} codes One per Gaussian.
-   * @param {number[][]} palette Rows of red, green and blue in 0..255, and of share and gray in 0..1.
-   * @returns {boolean} True if other Gaussians are hidden now.
+   * Change the colors of the next frame.
+   * @param {Uint8Array} codes One code per Gaussian.
+   * @param {number[][]} palette Rows of red, green and blue in 0..255, opacity in 0..1, and 1 to mix with gray.
+   * @returns {boolean} True if the set of hidden Gaussians has changed.
    */
   paint(codes, palette) {
     const old = this.codes.image.data;

@@ -1,4 +1,4 @@
-/** Pictures that the server draws: for browsers without WebGL 2, and while a slow one draws. */
+/** Images rendered by the server, for browsers that are slow or do not support WebGL 2. */
 import { $ } from "./dom.js";
 
 const COARSE = 480;
@@ -8,8 +8,8 @@ const REST = 350;
 export class Stills {
   /**
    * @param {import("./view.js").View3D} view
-   * @param {(value: any) => number} send Asks for a picture.
-   * @param {() => void} place Tells the server the camera.
+   * @param {(value: any) => number} send Request an image.
+   * @param {() => void} place Send the camera to the server.
    */
   constructor(view, send, place) {
     this.view = view;
@@ -28,7 +28,7 @@ export class Stills {
     this.background = [0, 2, 4].map((i) => Number.parseInt(hex.slice(i, i + 2), 16) / 255);
   }
 
-  /** @param {boolean} moving True for a small picture, which a large one follows. */
+  /** @param {boolean} moving True for a small image, followed by a large one. */
   request(moving) {
     clearTimeout(this.timer);
     if (moving) this.timer = setTimeout(() => this.request(false), REST);

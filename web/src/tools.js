@@ -1,4 +1,4 @@
-/** Tools of the pointer: pick, rectangle, lasso, brush and measure. */
+/** Pointer tools: select, rectangle, lasso, brush, more like this and measure. */
 import { MOUSE, TOUCH } from "three";
 import { $, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
@@ -15,15 +15,15 @@ export const TOOLS = [
     "R",
     "Drag a rectangle. Shift adds, Ctrl or Alt removes. Right drag moves the view.",
   ],
-  ["lasso", "lasso", "Lasso", "L", "Draw around what you want. Shift adds, Ctrl or Alt removes."],
+  ["lasso", "lasso", "Lasso", "L", "Draw around Gaussians to select them. Shift adds, Ctrl or Alt removes."],
   [
     "brush",
     "brush",
     "Brush",
     "B",
-    "Paint over what you want. Wheel changes the size, Shift adds, Ctrl or Alt removes.",
+    "Paint over Gaussians to select them. The wheel changes the size. Shift adds, Ctrl or Alt removes.",
   ],
-  ["like", "alike", "More like this", "K", "Click something to find everything similar."],
+  ["like", "alike", "More like this", "K", "Click an object to find all similar Gaussians."],
   ["measure", "measure", "Measure", "M", "Click two points to measure the distance between them."],
 ];
 const CLICK_SLACK = 5;
@@ -41,7 +41,7 @@ function shape(name, attributes, text) {
 const modeOf = (event) =>
   event.shiftKey ? "add" : event.ctrlKey || event.altKey || event.metaKey ? "remove" : "select";
 
-/** Dispatches `hover` with a ray, or with null. */
+/** Pointer tools. They dispatch `hover` events with a ray or null, and `probe` events with a ray. */
 export class Tools extends EventTarget {
   /**
    * @param {import("./view.js").View3D} view
@@ -172,7 +172,7 @@ export class Tools extends EventTarget {
     this.view.addEventListener("move", () => this.ends.length > 0 && this.draw());
   }
 
-  /** Does what a click in the middle of the scene does. @param {KeyboardEvent} event */
+  /** Click in the middle of the scene. @param {KeyboardEvent} event */
   pickMiddle(event) {
     this.click(event, [this.view.width / 2, this.view.height / 2]);
   }
@@ -229,7 +229,7 @@ export class Tools extends EventTarget {
     this.draw();
   }
 
-  /** Draws what the tool shows over the scene. */
+  /** Draw the shapes of the current tool over the scene. */
   draw() {
     const parts = [];
     const { points, pointer } = this;
@@ -276,7 +276,7 @@ export class Tools extends EventTarget {
       parts.push(shape("line", { class: "ruler", x1: from.x, y1: from.y, x2: to.x, y2: to.y }));
       const label = `${length.toPrecision(3)} units`;
       parts.push(shape("text", { x: (from.x + to.x) / 2, y: (from.y + to.y) / 2 - 9 }, label));
-      $("hint").textContent = `Distance: ${label}. Click again to measure another one.`;
+      $("hint").textContent = `Distance: ${label}. Click again to measure another distance.`;
     }
     return [
       ...parts,

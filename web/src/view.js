@@ -1,15 +1,15 @@
-/** The camera and its controls. */
+/** Camera of the page and its controls. */
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-/** Degrees of the vertical field of view at the start. */
+/** Initial vertical field of view in degrees. */
 const FOV = 55;
 
 /** @typedef {{position: number[], look_at: number[], up: number[], fov?: number}} View */
 
-/** The camera and its controls, with or without WebGL. Dispatches `move` events. */
+/** Camera and controls, with or without WebGL. It dispatches `move` events. */
 export class View3D extends EventTarget {
-  /** @param {HTMLElement} element Receives the pointer. @param {number[]} up @param {number} radius Of the scene. */
+  /** @param {HTMLElement} element Target of events. @param {number[]} up @param {number} radius Scene radius. */
   constructor(element, up, radius) {
     super();
     this.element = element;
@@ -52,7 +52,7 @@ export class View3D extends EventTarget {
     };
   }
 
-  /** Camera in the convention of OpenCV, for pixels of the page. */
+  /** Return the camera in OpenCV's convention, for pixels of the page. */
   intrinsics() {
     this.camera.updateMatrixWorld();
     const focal = this.height / 2 / Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
@@ -96,7 +96,7 @@ export class View3D extends EventTarget {
     step();
   }
 
-  /** Shows what a training image shows. @param {{world_to_camera: number[][], K: number[][], height: number}} camera */
+  /** Move to a training camera. @param {{world_to_camera: number[][], K: number[][], height: number}} camera */
   goToCamera({ world_to_camera: rows, K, height }) {
     const [right, down, forward] = rows.map((row) => new THREE.Vector3(row[0], row[1], row[2]));
     const position = new THREE.Vector3();
@@ -108,7 +108,7 @@ export class View3D extends EventTarget {
     this.go({ position: position.toArray(), look_at: look.toArray(), up, fov: Math.min(90, fov) });
   }
 
-  /** Turns around the middle of the view. @param {number} right @param {number} up Radians. */
+  /** Turn around the target of the camera. @param {number} right @param {number} up Angles in radians. */
   turn(right, up) {
     const offset = this.camera.position.clone().sub(this.controls.target);
     const side = new THREE.Vector3().crossVectors(this.camera.up, offset).normalize();
@@ -120,14 +120,14 @@ export class View3D extends EventTarget {
     this.moved();
   }
 
-  /** @param {number} factor Of the distance. */
+  /** @param {number} factor Factor on the distance to the target. */
   zoom(factor) {
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
     this.controls.update();
     this.moved();
   }
 
-  /** @param {number} x @param {number} y Pixels of the element. */
+  /** @param {number} x @param {number} y Position in pixels of the element. */
   ray(x, y) {
     const caster = new THREE.Raycaster();
     this.camera.updateMatrixWorld();
@@ -135,13 +135,13 @@ export class View3D extends EventTarget {
     return { origin: caster.ray.origin.toArray(), direction: caster.ray.direction.toArray() };
   }
 
-  /** @param {number[]} point @returns {{x: number, y: number, visible: boolean}} Pixels of the element. */
+  /** @param {number[]} point @returns {{x: number, y: number, visible: boolean}} Position in pixels. */
   project(point) {
     const p = new THREE.Vector3().fromArray(point).project(this.camera);
     return { x: ((p.x + 1) / 2) * this.width, y: ((1 - p.y) / 2) * this.height, visible: p.z < 1 };
   }
 
-  /** @param {number[]} point @returns {boolean} True if a point lies within the picture. */
+  /** @param {number[]} point @returns {boolean} True if the point is in view. */
   sees(point) {
     const { x, y, visible } = this.project(point);
     return visible && x >= 0 && y >= 0 && x <= this.width && y <= this.height;

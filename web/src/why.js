@@ -1,9 +1,9 @@
-/** The images behind a selection, beside the scene. */
+/** Images that explain a selection, next to the scene. */
 import { $, h } from "./dom.js";
 import { button } from "./panel.js";
 import { closesOutside } from "./shortcuts.js";
 
-/** @param {any} message Of the type explanation. @param {() => void} closed */
+/** @param {any} message Message of the type `explanation`. @param {() => void} closed */
 export function showExplanation(message, closed) {
   const close = () => {
     $("why").hidden = true;
