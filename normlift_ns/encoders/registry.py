@@ -74,8 +74,8 @@ class EncoderKind:
     """Returns the words of a prompt that count; "" if there are none. The encoder ignores all others."""
     words: Callable[[], Sequence[str]] = tuple
     """Returns the words that an inventory names objects by; (): none."""
-    suggested: float = 0.6
-    """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
+    suggested: tuple[float, float] = (0.4, 0.8)
+    """Range of a suggested threshold between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
     """Best cosines from which a prompt is a weak match, and from which it is found. None: see `query.presence`."""
     learned: bool = True
@@ -267,7 +267,7 @@ COLOR = EncoderKind(
     threshold=0.7,
     texts=_make_color_encoder,
     has_null_words=False,
-    suggested=0.8,
+    suggested=(0.8, 0.8),
     present_from=(0.66, 0.74),
     learned=False,
     is_here=lambda: True,
