@@ -2,10 +2,9 @@
 
     python -m research.cut fox=RUN/config.yml castle=RUN/config.yml tabletop=RUN/config.yml     results/cut.json
 
-The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images of the
-tabletop. The vector of a label is its
-prototype, the normalized mean of the features of the regions inside its polygons, by area, which is compared like a
-click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
+The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images
+of the tabletop. The vector of a label is its prototype, the normalized mean of the features of the regions inside its
+polygons, weighted by area, which is compared like a click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
 labeled images and compared with the polygons; a text has one figure, pooled over its images.
 
 Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
