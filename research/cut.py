@@ -4,8 +4,9 @@
 
 The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images
 of the tabletop. The vector of a label is its prototype, the normalized mean of the features of the regions inside its
-polygons, weighted by area, which is compared like a click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
-labeled images and compared with the polygons; a text has one figure, pooled over its images.
+polygons, weighted by area, which is compared like a click. If the encoder knows the word, the word is a prompt too.
+Relevancies are rendered into the labeled images and compared with the polygons. Every prompt has one figure, pooled
+over its images.
 
 Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
 .default, the IoU at the best threshold of that text and at the default one; for prototypes also other candidates.
