@@ -1,11 +1,12 @@
 """Average precision, and IoU at the default cut against IoU at the best one, on captures with labels drawn by hand.
 
-    python -m research.cut fox=RUN/config.yml castle=RUN/config.yml     results/cut.json
+    python -m research.cut fox=RUN/config.yml castle=RUN/config.yml tabletop=RUN/config.yml     results/cut.json
 
-The labels are `fox_labels.json` next to the captures and `labels/castle_labels.json`. The vector of a label is its
-prototype, the normalized mean of the features of the regions inside its polygons, by area, which is compared like a
-click; where the encoder knows the word, it is asked too, as users would ask it. Relevancies are rendered into the
-labeled images and compared with the polygons; a text has one figure, pooled over its images.
+The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images
+of the tabletop. The vector of a label is its prototype, the normalized mean of the features of the regions inside its
+polygons, weighted by area, which is compared like a click. If the encoder knows the word, the word is a prompt too.
+Relevancies are rendered into the labeled images and compared with the polygons. Every prompt has one figure, pooled
+over its images.
 
 Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
 .default, the IoU at the best threshold of that text and at the default one; for prototypes also other candidates.
@@ -40,11 +41,19 @@ LABELS = {
     "fox": SHARED / "captures" / "fox_labels.json",
     "castle": Path(__file__).parent / "labels" / "castle_labels.json",
 }
+TABLETOP_IMAGES = ("0000", "0009", "0018", "0027", "0036", "0045")
 _PARTS = {"fox head"}
 
 
 def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     """Yield the labeled images, and the pixels of every label in each."""
+    if capture == "tabletop":
+        folder = SHARED / "captures" / "tabletop"
+        names = json.loads((folder / "labels.json").read_text())["labels"]
+        for image in TABLETOP_IMAGES:
+            pixels = np.array(Image.open(folder / "instance" / f"{image}.png"))
+            yield image, {name: pixels == int(label) for label, name in names.items() if (pixels == int(label)).any()}
+        return
     table = json.loads(LABELS[capture].read_text())
     for image in sorted({label["image"] for label in table["labels"]}):
         canvas, parts, names = Image.new("I", tuple(table["size"])), {}, [""]

@@ -76,8 +76,8 @@ class EncoderKind:
     """Function that returns the words of a prompt that the encoder uses, or "" if it ignores them all."""
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
-    suggested: float = 0.6
-    """Position of a suggested threshold between the median (0) and the top (1) of the relevancies."""
+    suggested: tuple[float, float] = (0.4, 0.8)
+    """Range of suggested thresholds between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
     """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.presence`."""
     learned: bool = True
@@ -275,7 +275,7 @@ COLOR = EncoderKind(
     threshold=0.7,
     texts=_make_color_encoder,
     has_null_words=False,
-    suggested=0.8,
+    suggested=(0.8, 0.8),
     present_from=(0.66, 0.74),
     learned=False,
     is_here=lambda: True,

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import warnings
+import zipfile
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
@@ -41,6 +42,8 @@ MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
 DIGESTED_PATH = re.compile(r"(\.\./(nerfstudio_models/)?)?\w[\w.-]*")
 """Pattern of the paths of files with digests, relative to the manifest. They are next to it or part of its run."""
+_LARGE = 2**32
+"""Size in bytes above which the end of a checkpoint is checked before its digest is computed, which takes seconds."""
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
@@ -302,6 +305,12 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
             )
 
 
+def _ends_as_archive(path: Path) -> bool:
+    """Return whether a file has the record that ends a ZIP archive. This reads the last 66 kB only."""
+    with path.open("rb") as file:
+        return zipfile.is_zipfile(file)
+
+
 def check_file_digests(folder: Path) -> None:
     """Raise if an existing file of a run differs from the digest in the manifest.
 
@@ -318,6 +327,11 @@ def check_file_digests(folder: Path) -> None:
         path = folder.parent / name.removeprefix("../") if name.startswith("../") else folder / name
         if not path.is_file() or path.suffix == ".safetensors":  # safetensors files contain their own digests
             continue
+        if path.stat().st_size > _LARGE and path.suffix == ".ckpt" and not _ends_as_archive(path):
+            raise InputError(
+                f"{path} is damaged: it is not a ZIP archive, as checkpoints are; copy the whole run again, "
+                f"or {LIFT_AGAIN}"
+            )
         actual = file_digest(path)
         if actual != expected:
             raise InputError(

@@ -100,7 +100,7 @@ class Answer:
     @property
     def suggested_threshold(self) -> float | None:
         """Suggested threshold for all prompts together; None if no Gaussian has a direction."""
-        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid), suggested_position(self.field))
+        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid), suggested_range(self.field))
 
     def __len__(self) -> int:
         return len(self.texts)
@@ -201,7 +201,7 @@ class Finding:
         """Histogram of the relevancies; None if no Gaussian has a direction."""
         question = self.answer.question
         relevancy, valid = as_numpy(self.relevancy), as_numpy(self.answer.valid)
-        return relevancy_histogram(relevancy, valid, question.threshold, suggested_position(self.answer.field))
+        return relevancy_histogram(relevancy, valid, question.threshold, suggested_range(self.answer.field))
 
     @property
     def suggested_threshold(self) -> float | None:
@@ -347,8 +347,11 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 # Gaussian in a thousand exceeds. If more than half of the Gaussians are at the top, m is the minimum instead of the
 # median, so that a threshold can still separate them.
 #
-# The suggested threshold is m + f (t - m), with a fraction f that depends on the encoder. docs/honest_answers.md
-# compares the errors of this threshold and of its alternatives.
+# The suggested threshold is the one at which the selection is most stable. Let N(x) be the number of Gaussians above x
+# and u the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer. Of the thresholds m + f (u - m)
+# with f in the range of the encoder, it is the one for which log N falls least from f - 0.2 to f + 0.2. If that is at an
+# end of the range, the selection is stable nowhere, and f is the middle of the range. docs/honest_answers.md has the
+# errors of this rule, and those of alternatives.
 
 
 HISTOGRAM_BINS = 32
@@ -356,6 +359,12 @@ _AT_TOP = 1e-3
 """Distance from the top, as a fraction of the range of relevancies, below which the median counts as at the top."""
 _EPSILON = 1e-6
 """Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
+_SMALLEST_OBJECT = 20
+"""Number of Gaussians of the smallest object that a suggested threshold may select."""
+_STABLE_OVER = 0.2
+"""Change of f to which the selection must be stable."""
+_STEPS = 100
+"""Number of thresholds between the median and u at which the selected Gaussians are counted."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -367,9 +376,9 @@ class Histogram:
     >>> import numpy as np
     >>> from normlift_ns.query.engine import relevancy_histogram
     >>> values = np.array([0.1] * 60 + [0.2] * 30 + [0.9] * 10)
-    >>> hist = relevancy_histogram(values, np.ones(100, bool), 0.5, 0.6)
-    >>> int(hist.counts.sum()), round(hist.suggested, 6)
-    (100, 0.58)
+    >>> hist = relevancy_histogram(values, np.ones(100, bool), 0.5, (0.4, 0.8))
+    >>> int(hist.counts.sum()), 0.2 < hist.suggested < 0.9
+    (100, True)
     """
 
     edges: Float[np.ndarray, " bins_plus_1"]
@@ -391,7 +400,7 @@ class Histogram:
 
 
 def relevancy_histogram(
-    relevancy: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], threshold: float, position: float
+    relevancy: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], threshold: float, positions: tuple[float, float]
 ) -> Histogram | None:
     """Return the histogram of one prompt; None if no Gaussian has a direction.
 
@@ -399,7 +408,7 @@ def relevancy_histogram(
         relevancy: relevancies of all Gaussians.
         valid: True for Gaussians that have a direction.
         threshold: relevancy above which a Gaussian is selected.
-        position: as in `suggest_threshold`.
+        positions: result of `suggested_range`.
     """
     values = relevancy[valid].astype(np.float64)
     if len(values) == 0:
@@ -409,7 +418,7 @@ def relevancy_histogram(
         low, high = low - _EPSILON / 2, high + _EPSILON / 2
     counts, edges = np.histogram(values, HISTOGRAM_BINS, (low, high))
     median, top = _median_and_top(values)
-    return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(median, top, position))
+    return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(values, median, top, positions))
 
 
 def draw_histogram(
@@ -427,36 +436,48 @@ def draw_histogram(
     return f"{line[:position]}|{line[position:]}"
 
 
-def suggested_position(field: HasManifest) -> float:
-    """Return the position of the suggested threshold between median (0) and top (1), for the encoder of the field."""
+def suggested_range(field: HasManifest) -> tuple[float, float]:
+    """Return the range of suggested thresholds between the median (0) and the top (1), for the field's encoder."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
 
 def suggest_threshold(
-    relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndarray, " n"], position: float
+    relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndarray, " n"], positions: tuple[float, float]
 ) -> float | None:
     """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
     Args:
-        relevancy: relevancies of all Gaussians.
-        valid: True for Gaussians that have a direction.
-        position: result of `suggested_position`.
+        positions: result of `suggested_range`.
 
-    >>> suggest_threshold(np.array([[0.0, 0.0], [0.0, 0.1], [0.0, 1.0]]), np.ones(3, bool), 0.6) > 0.5
+    >>> values = np.array([[0.1]] * 60 + [[0.2]] * 30 + [[0.9]] * 10)
+    >>> 0.2 < suggest_threshold(values, np.ones(100, bool), (0.4, 0.8)) < 0.9
     True
-    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), 0.5) < 1  # equal relevancies are all selected
+    >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), (0.4, 0.8)) < 1  # all alike: all are selected
     True
     """
     values = relevancy[valid].astype(np.float64).ravel()
-    if len(values) == 0:
-        return None
-    return _suggest(*_median_and_top(values), position)
+    return None if len(values) == 0 else _suggest(values, *_median_and_top(values), positions)
 
 
-def _suggest(median: float, top: float, position: float) -> float:
-    threshold = median + position * (top - median)
-    return min(threshold, top - _EPSILON) if top > 0 else threshold  # without relevancy, select nothing
+def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[float, float]) -> float:
+    """Return the threshold at which the selection is most stable, for M >= 1 relevancies."""
+    if top <= 0:
+        return top  # if nothing is relevant, select nothing
+    rank = min(_SMALLEST_OBJECT, len(values) // 1000)
+    upper = float(np.partition(values, len(values) - 1 - rank)[len(values) - 1 - rank])
+    if upper - median < _EPSILON:
+        return upper - _EPSILON
+    counts, edges = np.histogram(values, _STEPS, (median, upper))
+    higher = (values > upper).sum() + counts[::-1].cumsum()[::-1]
+    above = np.log([*higher, (values >= upper).sum()])  # log N at every edge
+    first, last = (round(_STEPS * position) for position in positions)
+    reach = round(_STEPS * _STABLE_OVER)
+    steps = np.arange(first, last + 1)
+    fall = above[steps - reach] - above[steps + reach]
+    stable = steps[fall <= fall.min() + _EPSILON]
+    best = stable[len(stable) // 2]
+    return float(edges[best if first < best < last else (first + last) // 2])
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:

@@ -114,7 +114,7 @@ class Guard:
         if refused is not None:
             return await PlainTextResponse(f"403: {refused}\n", 403, _HEADERS)(scope, receive, send)
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or int(length) > MAX_BODY:
+        if not length.isdecimal() or len(length) > 20 or int(length) > MAX_BODY:
             response = JSONResponse(
                 {"error": f"The request body exceeds the limit of {MAX_BODY:,} bytes."}, 413, _HEADERS
             )
@@ -297,7 +297,7 @@ class WarmServer:
 
     async def _image(self, request: Request) -> Response:
         run, size = await self.run_of(request.path_params["run"]), request.query_params.get("max_size", "1024")
-        if not size.isdecimal() or not 16 <= int(size) <= 4096:
+        if not size.isdecimal() or len(size) > 4 or not 16 <= int(size) <= 4096:
             raise InputError(f"max_size must be a whole number from 16 to 4096, got {size[:20]!r}.")
         content = await self.in_thread(partial(run.image, request.path_params["index"], int(size)))
         return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")

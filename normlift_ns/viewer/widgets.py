@@ -268,7 +268,7 @@ def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
 
     >>> values = np.array([0.1] * 60 + [0.9] * 10)
     >>> from normlift_ns.query.engine import relevancy_histogram
-    >>> counts = relevancy_histogram(values, np.ones(70, bool), threshold=0.5, position=0.6)
+    >>> counts = relevancy_histogram(values, np.ones(70, bool), 0.5, (0.4, 0.8))
     >>> histogram_svg(counts, (1, 0, 0)).count("#ff0000")
     1
     """

@@ -415,3 +415,14 @@ def test_what_is_no_file(tmp_path: Path) -> None:
                 SemanticField.load(tmp_path)
         path.write_bytes(whole)
     SemanticField.load(tmp_path)
+
+
+def test_a_large_checkpoint_without_its_end_is_refused_unread(tmp_path: Path) -> None:
+    folder, path = tmp_path / "normlift", tmp_path / "nerfstudio_models" / "step-1.ckpt"
+    folder.mkdir()
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        file.truncate(10**12)  # a sparse file that would take minutes to read
+    write_manifest(folder, example().manifest, {"../nerfstudio_models/step-1.ckpt": "0" * 16})
+    with pytest.raises(InputError, match=r"step-1\.ckpt"):
+        check_file_digests(folder)

@@ -104,6 +104,8 @@ def test_geometry_images_and_the_description_of_the_api(served_room, client):
     assert client.get(f"{RUN}/geometry", headers={"If-None-Match": tag}).status_code == 304
     assert "immutable" in client.get(f"{RUN}/geometry?digest={tag[1:-1]}").headers["cache-control"]
     assert client.get(f"{RUN}/images/0?max_size=16").content[:2] == b"\xff\xd8"
+    for size in ("15", "4097", "9" * 5000, "²"):
+        assert client.get(f"{RUN}/images/0?max_size={size}").status_code == 400
     assert client.get(f"{RUN}/images/7").status_code == 400
     assert client.get(f"{RUN}/cameras").json()["cameras"][0]["width"] == 16
     document = client.get("/api/openapi.json").json()

@@ -22,7 +22,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def drawn(threshold: float = 0.5) -> tuple[ElementTree.Element, np.ndarray]:
     values = np.concatenate([np.full(900, 0.1), np.full(90, 0.3), np.full(10, 0.9)])
-    found = relevancy_histogram(values, np.ones(1000, bool), threshold, 0.6)
+    found = relevancy_histogram(values, np.ones(1000, bool), threshold, (0.4, 0.8))
     assert found is not None
     return ElementTree.fromstring(histogram_svg(found, (1.0, 0.5, 0.0))), found.counts
 
@@ -47,7 +47,7 @@ def test_the_line_is_at_the_threshold():
         assert x == pytest.approx(min(max((threshold - low) / (high - low) * 280, 1), 279), abs=0.06)
         texts = [text.text for text in picture.findall(f"{SVG}text")]
         assert texts == [f"> {threshold:.2f}", f"{low:.2f}", f"{high:.2f}"]
-    found = relevancy_histogram(np.full(5, 0.25), np.ones(5, bool), 0.25, 0.6)
+    found = relevancy_histogram(np.full(5, 0.25), np.ones(5, bool), 0.25, (0.4, 0.8))
     assert found is not None
     assert len(ElementTree.fromstring(histogram_svg(found, (0, 0, 1))).findall(f"{SVG}rect")) == 2
 
