@@ -349,8 +349,8 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 #
 # The suggested threshold is the one at which the selection is most stable. Let N(x) be the number of Gaussians above x
 # and u the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer. Of the thresholds m + f (u - m)
-# with f in the range of the encoder, it is the one for which log N falls least from f - 0.2 to f + 0.2. If that is at an
-# end of the range, the selection is stable nowhere, and f is the middle of the range. docs/honest_answers.md has the
+# with f in the range of the encoder, it is the one for which log N falls least from f - 0.2 to f + 0.2. If this is at
+# an end of the range, the selection is stable nowhere, and f is the middle of the range. docs/honest_answers.md has the
 # errors of this rule, and those of alternatives.
 
 
