@@ -21,7 +21,7 @@ from normlift_ns.io.atomic import (
     text_digest,
     write_text_file,
 )
-from normlift_ns.io.guard import read_file, read_text, refuse_inputs
+from normlift_ns.io.guard import open_regular, read_file, read_text, refuse_inputs
 from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names
 
 FIELD_FOLDER = "normlift"
@@ -307,7 +307,7 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
 
 def _ends_as_archive(path: Path) -> bool:
     """Return whether a file has the record that ends a ZIP archive. This reads the last 66 kB only."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return zipfile.is_zipfile(file)
 
 
