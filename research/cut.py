@@ -10,7 +10,8 @@ over its images.
 
 Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
 .default, the IoU at the best threshold of that text and at the default one; for prototypes also other candidates.
-<capture>.mean.<cut>, the mean over texts of IoU divided by the best; <capture>.worst.<cut>, the smallest of these.
+<capture>.mean.<cut>, the mean over texts of IoU divided by the best; <capture>.worst.<cut>, the smallest of these;
+<capture>.total.<cut>, the mean IoU over texts divided by the mean of the best.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ def measure(report: Report, capture: str, config: Path) -> None:
         image: nl.render(scene.gaussians, views[image].camera, relevancy, rasterize_mode=scene.rasterize_mode)[0]
         for image in masks
     }
-    ratios: dict[str, dict[str, float]] = {}
+    reached: dict[str, list[tuple[float, float]]] = {}
     for q, (key, (label, _)) in enumerate(asked.items()):
         images = [image for image, labels in masks.items() if label in labels]
         values = np.concatenate([drawn[image][..., q].numpy().ravel() for image in images])
@@ -150,10 +151,12 @@ def measure(report: Report, capture: str, config: Path) -> None:
         for name, cut in cuts.items():
             value = float(((values > cut) & truth).sum() / ((values > cut) | truth).sum())
             report.add(f"{capture}.{key}.{name}", value, "IoU")
-            ratios.setdefault(name, {})[key] = value / best
-    for name, found in ratios.items():
-        report.add(f"{capture}.mean.{name}", float(np.mean(list(found.values()))), "of the best IoU")
-        report.add(f"{capture}.worst.{name}", min(found.values()), "of the best IoU")
+            reached.setdefault(name, []).append((value, best))
+    for name, pairs in reached.items():
+        values, best = np.array(pairs).T
+        report.add(f"{capture}.mean.{name}", float((values / best).mean()), "of the best IoU")
+        report.add(f"{capture}.worst.{name}", float((values / best).min()), "of the best IoU")
+        report.add(f"{capture}.total.{name}", float(values.sum() / best.sum()), "of the best IoU")
 
 
 def main() -> None:
