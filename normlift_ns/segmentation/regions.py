@@ -99,7 +99,7 @@ class RegionDefaults:
 
 @dataclass(frozen=True)
 class Superpixels(RegionDefaults):
-    """SLIC superpixels, which are regions of similar size, color and position that follow image edges."""
+    """SLIC superpixels on CIELAB color and position, which have similar sizes and follow image edges."""
 
     count: int = 256
     """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
