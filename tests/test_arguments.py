@@ -268,7 +268,7 @@ def test_numbers_out_of_range_are_refused_by_name(tmp_path) -> None:
         "dtype": lambda x: nl.rasterize_evidence(SCENE, [CAMERA], [MAP], dtype=torch.float16 if x < 0 else torch.bool),
         "dtype must be": lambda x: LIFTED.directions(dtype=torch.int8),
         "JSON": lambda x: nl.SemanticField.build(LIFTED, MEANS, provenance={"a": {x}}).save(tmp_path / "a"),
-        "encoded": lambda x: EVIDENCE.save(tmp_path / "a", remarks={"a": "\ud800"}),
+        "metadata": lambda x: EVIDENCE.save(tmp_path / "a", remarks={"a": "\ud800"}),
     }.items():  # fmt: skip
         for count in (-5, 10**30) if name != "factor" else (-5, -math.inf, 0):
             with pytest.raises(nl.InputError, match=name):

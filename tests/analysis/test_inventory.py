@@ -115,7 +115,7 @@ def test_command_writes_a_list_and_a_picture(
         (("--inventory", "--text", "red"), "cannot be combined"),
         (("--text", "red", "--image", "a.png"), "--inventory"),
         (("--inventory", "--vocabulary", "none.txt"), "does not exist"),
-        (("--inventory", "--save-query"), "--text only"),
+        (("--inventory", "--save-query"), "--save-query"),
     ],
 )
 def test_options_that_do_not_fit(flags, message, lifted: Path, monkeypatch, capsys) -> None:

@@ -81,7 +81,7 @@ def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> N
         _ = opened(run.config).train[0]
     for radius in (None, 15, 1e9, 0.0):
         arias(tmp_path / "scene", fisheye_crop_radius=radius)
-        with pytest.raises(InputError, match=rf"fisheye_crop_radius is {radius}.* {WIDTH + HEIGHT}"):
+        with pytest.raises(InputError, match=rf"fisheye_crop_radius is {radius}.*\b{WIDTH + HEIGHT}\b"):
             _ = opened(run.config).train.cameras
 
 
@@ -145,7 +145,7 @@ def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None
         with pytest.raises(InputError, match=r"images/003\.jpg cannot be read"):
             run.train[3]
     Image.new("RGB", (20, 10)).save(file)
-    with pytest.raises(InputError, match=r"003\.jpg is 20 x 10 pixels, but its camera has 48 x 36"):
+    with pytest.raises(InputError, match=r"003\.jpg .*20 x 10.*48 x 36"):
         run.train[3]
     file.unlink()
     assert run.train[2].name == "images/002.jpg"
