@@ -328,7 +328,7 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
             f"labels of view {index} contain {low}, expected region ids >= 0, -1 (unlabeled) or -2 (masked)"
         )
     if count is not None and high >= count:
-        raise InputError(f"labels of view {index} contain region {high}, expected ids below num_regions, {count}")
+        raise InputError(f"labels of view {index} contain region {high}, expected ids below num_regions ({count})")
     count = max(high, UNLABELED) + 1 if count is None else count
     if not 0 <= count <= MAX_REGIONS:
         found = f"{short_repr(count)}; number the regions of a view 0, 1, …"
