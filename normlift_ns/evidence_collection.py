@@ -57,11 +57,13 @@ class RasterConfig:
     rasterize_mode: RasterizeMode
     weight_power: int
     """Exponent of the summed weights."""
+    clip_planes: tuple[float, float] | None = None
+    """Near and far plane of the training in world units; None: those of splatfacto."""
 
     @property
     def settings(self) -> RasterSettings:
         """Constants of the rasterization rules."""
-        return RasterSettings.of_gsplat(self.gsplat_version)
+        return RasterSettings.recorded({"gsplat_rules": self.gsplat_version, "clip_planes": self.clip_planes})
 
     @property
     def options(self) -> dict[str, Any]:
@@ -326,8 +328,10 @@ def cached_batch_evidence(
 
 def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConfig) -> list[str]:
     """Return the cache key of each view's cell evidence: a digest of everything it depends on."""
+    primitive = [] if gaussians.primitive == "3dgs" else [gaussians.primitive]
     scene = _digest(
-        [_CACHE_VERSION, *config.key], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+        [_CACHE_VERSION, *config.key, *primitive],
+        [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities],
     )
     views = zip(block.cameras, block.labels, block.regions)
     return [

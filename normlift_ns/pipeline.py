@@ -159,7 +159,8 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     """Choose how to rasterize, and raise before any image is read if that is impossible."""
     rules, mode = resolve_gsplat_version(scene, options), scene.rasterize_mode
     dtype = torch.float64 if options.precision == "double" else torch.float32
-    config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power)
+    planes = scene.identity.get("clip_planes")
+    config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power, planes)
     return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
@@ -344,8 +345,7 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
     """
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    sample = GaussianScene(*(array[:_WARM_UP_GAUSSIANS] for array in arrays))
+    sample = gaussians.select(slice(_WARM_UP_GAUSSIANS))
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says

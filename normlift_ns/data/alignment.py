@@ -58,12 +58,12 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
 
     Args:
         scene: Gaussians, cameras and images.
-        settings: constants of the rasterizer at full size; None: those of gsplat 1.4.
+        settings: constants of the rasterizer at full size; None: those that the scene records.
         device: torch device to render on.
     Raises:
         FileNotFoundError, ValueError: if an image is missing or cannot be read.
     """
-    views, settings = _sample_views(scene), settings or RasterSettings()
+    views, settings = _sample_views(scene), settings or RasterSettings.recorded(scene.identity)
     render = partial(_render, scene, scene.gaussians.to(device), settings)
     visible = max(float(in_frustum(scene.gaussians.means, view.camera).float().mean()) for view, _ in views)
     psnrs = {small[0].name: _psnr(small[0], render(small, 1.0)) for small in views}
@@ -77,7 +77,7 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
 
 def mean_psnr(scene: Scene, factor: float = 1.0) -> float:
     """Return `Alignment.psnr` alone, in dB, with a factor on the focal lengths."""
-    render = partial(_render, scene, scene.gaussians, RasterSettings())
+    render = partial(_render, scene, scene.gaussians, RasterSettings.recorded(scene.identity))
     return _mean_psnr(render, _sample_views(scene), factor)
 
 

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -59,10 +60,11 @@ class SplatScene:
     """None, because `normlift_ns` renders the scene."""
     has_harmonics = True
 
-    @property
+    @cached_property
     def gaussians(self) -> GaussianScene:
         """The N Gaussians, activated."""
-        return self.splat.activated
+        primitive = self.identity.get("primitive", "3dgs")
+        return self.splat.activated if primitive == "3dgs" else replace(self.splat.activated, primitive=primitive)
 
     @property
     def parameters(self) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
@@ -20,7 +21,7 @@ from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.data.compressed_ply import PACKED, unpack_compressed_ply
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import file_kind, open_regular
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import Primitive, RasterizeMode
 
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 """Degree of the spherical harmonics by the number of coefficients beyond the constant one."""
@@ -168,6 +169,20 @@ class SplatFile(NamedTuple):
     """Interval of the images that the training held out; None if the file does not name it."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
+    primitive: Primitive | None = None
+    """Kind of the Gaussians; None if the file does not name it."""
+    clip_planes: tuple[float, float] | None = None
+    """Near and far plane of the training in world units; None if the file does not name them."""
+
+
+_FLATNESS = math.log(1e-3)
+"""Logarithm of the thickness of a 2D Gaussian, as a fraction of its smaller standard deviation."""
+
+
+def flatten_splat(splat: SplatParameters) -> SplatParameters:
+    """Return 2D Gaussians as thin 3D ones, for viewers and files that have no others."""
+    in_plane = splat.scales[:, :2]
+    return replace(splat, scales=torch.cat([in_plane, in_plane.amin(dim=1, keepdim=True) + _FLATNESS], dim=1))
 
 
 _OTHER_PRIMITIVES = re.compile(
@@ -236,9 +251,9 @@ def read_ply(path: Path) -> SplatFile:
         splat = splat_from_parameters(parameters, path)
         validate_splat(splat, path)
         return SplatFile(splat, mode, remarks=(rounding,))
-    _check_properties(path, vertex)
+    is_2d = _check_properties(path, vertex)
     rest = _rest_names(path, {item.name for item in vertex.properties})
-    splat, mode = _read_columns(path, vertex.data, rest), _mode([*data.comments, *vertex.comments])
+    splat, mode = _read_columns(path, vertex.data, rest, is_2d), _mode([*data.comments, *vertex.comments])
     remarks = _remarks(path, vertex, rest, _mode_names([*data.comments, *vertex.comments]))
     if any(item.name == _FILTER for item in vertex.properties):
         widths = torch.from_numpy(np.ascontiguousarray(vertex.data[_FILTER]).astype(np.float64))
@@ -248,7 +263,7 @@ def read_ply(path: Path) -> SplatFile:
             "filter, of 0.1 square pixels, is that of the rasterize mode antialiased, with 0.3.",
         )
     validate_splat(splat, path)
-    return SplatFile(splat, mode, remarks=remarks)
+    return SplatFile(splat, mode, primitive="2dgs" if is_2d else None, remarks=remarks)
 
 
 def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) -> tuple[str, ...]:
@@ -307,12 +322,13 @@ def _parse_ply(path: Path) -> PlyData:
         ) from error
 
 
-def _check_properties(path: Path, vertex: PlyElement) -> None:
-    """Raise InputError unless the vertices have the properties of a splat, as plain numbers."""
+def _check_properties(path: Path, vertex: PlyElement) -> bool:
+    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError if they are no splat."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
-    if missing:
+    is_2d = missing == ["scale_2"] and _FILTER not in names
+    if missing and not is_2d:
         raise InputError(
             f"{path} is not a splat: its {vertex.count:,} vertices lack {', '.join(missing)}. Expected the properties "
             f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
@@ -321,6 +337,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> None:
     lists = [item.name for item in vertex.properties if item.name in required and hasattr(item, "len_dtype")]
     if lists:
         raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+    return is_2d
 
 
 def check_ply_header(path: Path) -> None:
@@ -358,8 +375,6 @@ def check_ply_header(path: Path) -> None:
 
 
 def _advice(missing: list[str]) -> str:
-    if missing == ["scale_2"]:
-        return "2D Gaussians, which have two scales, are not supported; train the scene with 3D Gaussians."
     if all(name.startswith("f_dc_") for name in missing):
         return "Its colors are not spherical harmonics; export it again with f_dc_*."
     return "Give the PLY file that its trainer or ns-export gaussian-splat wrote, not the initial point cloud."
@@ -378,17 +393,18 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
     return expected
 
 
-def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParameters:
+def _read_columns(path: Path, table: np.ndarray, rest: list[str], is_2d: bool) -> SplatParameters:
     n, k = len(table), len(rest) // 3
     columns = {name: torch.empty(n, len(group)) for name, group in _COLUMNS.items()}
     harmonics = torch.empty(n, k, 3)
     for start, rows in _blocks(path, table):
         for name, group in _COLUMNS.items():
-            for i, column in enumerate(group):
+            for i, column in enumerate(group[:2] if is_2d and name == "scales" else group):
                 columns[name].numpy()[start : start + len(rows), i] = rows[column]
         for i, column in enumerate(rest):  # all of red, then green, then blue
             harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
-    return SplatParameters(**columns, features_rest=harmonics)
+    splat = SplatParameters(**columns, features_rest=harmonics)
+    return flatten_splat(splat) if is_2d else splat
 
 
 def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

@@ -103,8 +103,7 @@ def _project_enormous(
     rows = (scene.drawable & (scene.scales.amax(dim=1) > _LARGE)).nonzero().squeeze(1)
     if len(rows) == 0:
         return
-    large = GaussianScene(*(x[rows] for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
-    world = prepare_gaussians(large, torch.float32)
+    world = prepare_gaussians(scene.select(rows), torch.float32)
     for view, camera in enumerate(cameras):
         projected = project(world, camera, job.settings, job.antialiased)
         overflows = projected.radii.amax(dim=1) > _OVERFLOWS
@@ -119,6 +118,8 @@ def _project_enormous(
 def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not float32 on a GPU, or needs constants that gsplat was not compiled with."""
     check_gpu("gsplat", job)
+    if job.is_2d:
+        raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')
     compiled = installed_settings()
     squares = compiled.per_axis and not job.settings.per_axis
     names = _COMPILED if squares else (*_COMPILED, *_EXTENT)

@@ -16,7 +16,7 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
 from normlift_ns.rasterization import numba_kernels as kernels
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
-from normlift_ns.rasterization.projection import ProjectedGaussians, project
+from normlift_ns.rasterization.projection import AnyProjected, ProjectedGaussians2D
 from normlift_ns.rasterization.settings import RasterSettings
 
 _Triple = tuple[Any, Any, Any]
@@ -37,7 +37,7 @@ def in_flight(job: RasterJob, camera: Camera) -> int:
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
     """Return the entries of one view, bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
-    projected = project(job.prepared, camera, job.settings, job.antialiased)
+    projected = job.project(camera)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     size, label_map = job.settings.tile_size, labels.int().numpy()
     capacity = np.diff(offsets) * kernels.count_labels(label_map, size)
@@ -58,7 +58,7 @@ def composite(
     job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
-    projected = project(job.prepared, camera, job.settings, job.antialiased)
+    projected = job.project(camera)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     visible_values = values[projected.gaussian].to(job.dtype).contiguous().numpy()
     image = np.zeros((camera.height, camera.width, values.shape[1]), visible_values.dtype)
@@ -70,21 +70,21 @@ def composite(
     return torch.from_numpy(image), torch.from_numpy(alpha)
 
 
-def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
+def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
     """Return the input of the kernels in three groups.
 
-    These are means, conics and opacities; limits of alpha and transmittance; and offsets and members of the tiles with
-    shapes of the Gaussians.
+    These are means, conics or transforms, and opacities; limits of alpha and transmittance; and offsets and members of
+    the tiles with shapes of the Gaussians.
     """
-    means, conics, opacities = (
-        x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
-    )
+    is_2d = isinstance(projected, ProjectedGaussians2D)
+    kinds = projected.transforms.flatten(1) if is_2d else projected.conics
+    means, conics, opacities = (x.contiguous().numpy() for x in (projected.means2d, kinds, projected.opacities))
     number = means.dtype.type
     max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
-    radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
+    ellipses = np.zeros_like(conics[:, :3]) if is_2d else conics  # zeros reach every tile of the square
     sizes = (camera.width, camera.height, settings.tile_size)
     tile_lists = kernels.list_tiles(
-        means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
+        means, ellipses, opacities, projected.radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
     )
     return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
 

@@ -308,14 +308,55 @@ def _first_active(pixels, index):  # pragma: no cover (compiled)
 
 
 @fused_kernel
+def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, limits):  # pragma: no cover (compiled)
+    """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
+    top, left, bottom, right = box
+    max_alpha, min_alpha, min_transmittance = limits
+    u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
+    u0, u1, u2 = transforms[g, 0], transforms[g, 1], transforms[g, 2]
+    v0, v1, v2 = transforms[g, 3], transforms[g, 4], transforms[g, 5]
+    w0, w1, w2 = transforms[g, 6], transforms[g, 7], transforms[g, 8]
+    number = means2d.dtype.type
+    half, one, zero = number(0.5), number(1), number(0)
+    for row in range(bottom - top):
+        y = number(top + row) + half
+        b0, b1, b2 = y * w0 - v0, y * w1 - v1, y * w2 - v2
+        dy = v - y
+        for chunk in range(transmittance.shape[1]):
+            left_x = number(left + chunk * LANES) + half
+            for lane in range(LANES):
+                before = transmittance[row, chunk, lane]
+                x = left_x + number(lane)
+                a0, a1, a2 = x * w0 - u0, x * w1 - u1, x * w2 - u2
+                c = a0 * b1 - a1 * b0
+                meets = c != zero
+                inverse = one / (c if meets else one)
+                first, second = (a1 * b2 - a2 * b1) * inverse, (a2 * b0 - a0 * b2) * inverse
+                dx = u - x
+                in_plane, in_image = half * (first * first + second * second), dx * dx + dy * dy
+                sigma = in_plane if in_plane < in_image else in_image
+                alpha = opacity * exp(-sigma)
+                alpha = alpha if alpha < max_alpha else max_alpha
+                after = before * (one - alpha)
+                drawn = (before > zero) & meets & (alpha >= min_alpha)
+                continues = after > min_transmittance
+                weights[row, chunk, lane] = alpha * before if drawn & continues else zero
+                transmittance[row, chunk, lane] = (after if continues else -before) if drawn else before
+    return 0, bottom - top
+
+
+@fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
     """Composite one Gaussian over a tile: weights[row, chunk, lane] = A_ij, or 0 if it is not drawn.
 
-    The transmittance of a pixel that has stopped is stored with a minus sign.
+    The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
+    transform of a Gaussian of 2D Gaussian Splatting.
 
     Returns:
         The range (first, stop) of rows that the Gaussian may reach; other rows are not written.
     """
+    if conics.shape[1] == 9:
+        return _blend_2d(g, box, means2d, conics, opacities, transmittance, weights, limits)
     top, left, bottom, right = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
