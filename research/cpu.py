@@ -34,19 +34,13 @@ from normlift_ns.progress import peak_gib
 from normlift_ns.rasterization import numba as compiled
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import assign_tiles, project
+from research.gpu_cases import grid_labels
 from research.report import RESULTS, Report, stopwatch
 from tests.captures import SHARED, trained_scene, training_cameras
 
-CELL = 60
 """Side of the square regions in pixels: 9 x 16 = 144 regions per view."""
 OTHER = 1e-3
 """Length of the difference above which a refined direction is another one."""
-
-
-def grid_labels(camera: Camera) -> torch.Tensor:
-    across = -(-camera.width // CELL)
-    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    return (y // CELL * across + x // CELL).int()
 
 
 def clip_like_table(rows: int) -> torch.Tensor:

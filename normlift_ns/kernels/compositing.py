@@ -280,10 +280,9 @@ def blend(
     u, v, opacity, a, b, c, d, e, f, g, h, i, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D: tl.constexpr
 ):  # fmt: skip
     """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
+    sigma = _exponent(u, v, a, b, c, px, py)
     if IS_2D:
         sigma = _exponent_2d(u, v, a, b, c, d, e, f, g, h, i, px, py)
-    else:
-        sigma = _exponent(u, v, a, b, c, px, py)
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
     visible = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)

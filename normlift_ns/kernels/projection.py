@@ -63,6 +63,7 @@ def camera_axis(camera, axis: tl.constexpr, x, y, z):
 
 @triton.jit
 def dot(ax, ay, az, bx, by, bz):
+    """Return the scalar product of two vectors, rounded as in gsplat."""
     return tl.fma(az, bz, tl.fma(ax, bx, ay * by))
 
 

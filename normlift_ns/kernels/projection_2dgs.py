@@ -108,7 +108,7 @@ def _project(
     u, extent_x = _along_axis(a2, b2, depth, u0, u1, u2, inverse)
     v, extent_y = _along_axis(a2, b2, depth, v0, v1, v2, inverse)
     extent = tl.maximum(tl.maximum(extent_x, extent_y).to(tl.float64), _LEAST_EXTENT)
-    radius = tl.ceil(radius_sigmas.to(tl.float64) * tl.sqrt(extent)).to(tl.float32)
+    radius = tl.ceil(tl.sqrt(extent) * radius_sigmas).to(tl.float32)
     visible &= (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
     if WRITE:
         radius = tl.minimum(radius, _LARGEST_RADIUS)
@@ -171,7 +171,5 @@ def project_gaussians_2d(
     splats, depth = torch.zeros(len(keys), SPLAT_2D, device=device), torch.empty(len(keys), device=device)
     if len(keys) > 0:
         outputs[1:] = [splats, depth]
-        _project[(triton.cdiv(len(keys), _BLOCK),)](
-            *inputs, keys, *outputs, len(keys), *sizes, WRITE=True, **options
-        )
+        _project[(triton.cdiv(len(keys), _BLOCK),)](*inputs, keys, *outputs, len(keys), *sizes, WRITE=True, **options)
     return ProjectedSplats(keys, splats, depth)

@@ -84,7 +84,13 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
     ellipses = np.zeros_like(conics[:, :3]) if is_2d else conics  # zeros reach every tile of the square
     sizes = (camera.width, camera.height, settings.tile_size)
     tile_lists = kernels.list_tiles(
-        means, ellipses, opacities, projected.radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
+        means,
+        ellipses,
+        opacities,
+        projected.radii.contiguous().numpy(),
+        *sizes,
+        number(min_alpha),
+        numba.get_num_threads(),
     )
     return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
 

@@ -220,7 +220,9 @@ def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSetti
     factor = sign / (sign * last * last).sum(2, keepdim=True)
     means2d = (factor * transforms[:, :2] * last).sum(2)
     extents = means2d.square() - (factor * transforms[:, :2].square()).sum(2)
-    radii = (settings.radius_sigmas * extents.amax(1, keepdim=True).clamp(min=_LEAST_EXTENT).sqrt()).ceil().expand(-1, 2)
+    radii = (
+        (settings.radius_sigmas * extents.amax(1, keepdim=True).clamp(min=_LEAST_EXTENT).sqrt()).ceil().expand(-1, 2)
+    )
     visible = _touch_image(means2d, radii, camera).nonzero().squeeze(1)
     dtype = world.opacities.dtype
     means2d, transforms, radii = (x[visible].to(dtype) for x in (means2d, transforms, radii))
