@@ -14,7 +14,6 @@ from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 from research import rooms
 from tests.captures import trained_scene, training_cameras
 
-
 CELL, DIMENSION = 60, 512
 
 

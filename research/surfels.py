@@ -65,8 +65,8 @@ def one_hot(rows: Tensor, n: int) -> Tensor:
 def weight_errors(scene: GaussianScene, camera: Camera, settings: RasterSettings) -> dict[str, float]:
     """Differences of the weights of every Gaussian in every pixel, and in every region of 60 x 60 pixels.
 
-    They are the largest absolute difference (pixel, region), the relative Frobenius norm (pixel_rel, region_rel) and the
-    number of pairs of a Gaussian and a pixel that differ by more than 1e-5 (differing).
+    They are the largest absolute difference (pixel, region), the relative Frobenius norm (pixel_rel, region_rel) and
+    the number of pairs of a Gaussian and a pixel that differ by more than 1e-5 (differing).
     """
     stock, n = StockView(scene, camera, settings), len(scene)
     labels = grid_labels(camera).cuda()

@@ -17,7 +17,7 @@ from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS

@@ -310,7 +310,7 @@ def _first_active(pixels, index):  # pragma: no cover (compiled)
 @fused_kernel
 def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, limits):  # pragma: no cover (compiled)
     """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
-    top, left, bottom, right = box
+    top, left, bottom, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     u0, u1, u2 = transforms[g, 0], transforms[g, 1], transforms[g, 2]

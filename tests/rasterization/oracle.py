@@ -84,7 +84,7 @@ def compositing_matrix(
 
 
 def compositing_matrix_2d(scene: GaussianScene, camera: Camera) -> np.ndarray:
-    """A [height, width, N] of one view of 2D Gaussians, float64: a ray meets every plane, by the rules of gsplat 1.4."""
+    """A [height, width, N] of one view of 2D Gaussians, float64: rays meet planes, by the rules of gsplat 1.4."""
     K, pose = camera.K.double().numpy(), camera.world_to_camera.double().numpy()
     width, height = camera.width, camera.height
     splats = []
