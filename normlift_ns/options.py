@@ -407,10 +407,10 @@ def check_path(name: str, value: object) -> Path:
 
 RasterizeMode = Literal["classic", "antialiased"]
 """Rasterization mode that a scene was trained with: splatfacto's `rasterize_mode`."""
-Primitive = Literal["3dgs", "2dgs"]
-"""Kind of the trained Gaussians: 3D ones, or the flat ones of 2D Gaussian Splatting."""
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
 """Rasterization backend; see `normlift_ns.rasterize_evidence`."""
+Primitive = Literal["3dgs", "2dgs"]
+"""Kind of the trained Gaussians: 3D ones, or the flat ones of 2D Gaussian Splatting."""
 GSPLAT_VERSIONS = ("1.4", "1.5", "1.6")
 """gsplat versions that rasterize differently."""
 GsplatVersion = Literal["auto", "1.4", "1.5", "1.6", "installed"]
@@ -591,7 +591,8 @@ class SplatOptions:
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    the cfg.yml of gsplat's trainer or the file name (*2dgs*) says so or a PLY file has two scales, else 3dgs."""
+    the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
+    otherwise 3dgs."""
     background: Background = "black"
     """Background color behind the splat, and behind images with an alpha channel."""
 

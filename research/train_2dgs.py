@@ -157,7 +157,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the results")
     parser.add_argument("names", nargs="+", help="captures")
-    parser.add_argument("--steps", type=int, default=7000, help="steps of the training")
+    parser.add_argument("--steps", type=int, default=5000, help="steps of the training")
     arguments = parser.parse_args()
     for capture in arguments.names:
         train(capture, arguments.folder, arguments.steps)

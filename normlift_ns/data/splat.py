@@ -323,7 +323,7 @@ def _parse_ply(path: Path) -> PlyData:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
-    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError if they are no splat."""
+    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]

@@ -38,7 +38,7 @@ class RasterJob:
 
     @property
     def is_2d(self) -> bool:
-        """Whether the Gaussians are those of 2D Gaussian Splatting."""
+        """True for a scene of 2D Gaussian Splatting."""
         return self.scene.primitive == "2dgs"
 
     def project(self, camera: Camera) -> projection.AnyProjected:
