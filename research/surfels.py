@@ -35,10 +35,11 @@ class StockView:
 
         pose, K = camera.world_to_camera.float().cuda()[None], camera.K.float().cuda()[None]
         self.width, self.height = camera.width, camera.height
-        planes = {"near_plane": settings.near_plane, "far_plane": settings.far_plane}
-        self.radii, self.means2d, depths, self.transforms, self.normals = fully_fused_projection_2dgs(
-            scene.means, scene.quats, scene.scales, pose, K, self.width, self.height, **planes
-        )
+        arrays: Any = fully_fused_projection_2dgs(
+            scene.means, scene.quats, scene.scales, pose, K, self.width, self.height, near_plane=settings.near_plane,
+            far_plane=settings.far_plane,
+        )  # fmt: skip
+        self.radii, self.means2d, depths, self.transforms, self.normals = arrays
         across, down = -(-self.width // 16), -(-self.height // 16)
         _, keys, self.members = isect_tiles(self.means2d, self.radii, depths, 16, across, down)
         self.offsets = isect_offset_encode(keys, 1, across, down)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from plyfile import PlyData
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from normlift_ns.core.gaussians import SH_C0
@@ -65,7 +65,7 @@ def read_capture(name: str) -> tuple[list[View], list[View], Tensor, Tensor]:
 
 def first_splats(points: Tensor, colors: Tensor, scale: float) -> tuple[torch.nn.ParameterDict, dict[str, Any]]:
     """Parameters by gsplat's names, as large as the distance to their neighbors, and an optimizer of each."""
-    distance, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)
+    distance, _ = KDTree(points.numpy()).query(points.numpy(), k=4)
     size = torch.from_numpy(np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(1e-6)).float().log()
     n = len(points)
     torch.manual_seed(0)
@@ -118,7 +118,7 @@ def train(name: str, folder: Path, steps: int) -> None:
     strategy.check_sanity(splats, optimizers)
     state = strategy.initialize_state(scene_scale=scale)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / steps))
-    order = torch.Generator().manual_seed(0)
+    order, turn = torch.Generator().manual_seed(0), list[int]()
     for step in range(steps):
         if step % len(views) == 0:
             turn = torch.randperm(len(views), generator=order).tolist()

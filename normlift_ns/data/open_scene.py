@@ -60,9 +60,13 @@ class SplatScene:
     """None, because `normlift_ns` renders the scene."""
     has_harmonics = True
 
-    @cached_property
+    @property
     def gaussians(self) -> GaussianScene:
         """The N Gaussians, activated."""
+        return self._gaussians
+
+    @cached_property
+    def _gaussians(self) -> GaussianScene:
         primitive = self.identity.get("primitive", "3dgs")
         return self.splat.activated if primitive == "3dgs" else replace(self.splat.activated, primitive=primitive)
 
