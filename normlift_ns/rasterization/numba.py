@@ -81,7 +81,7 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
     means, conics, opacities = (x.contiguous().numpy() for x in (projected.means2d, kinds, projected.opacities))
     number = means.dtype.type
     max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
-    ellipses = np.zeros_like(conics[:, :3]) if is_2d else conics  # zeros reach every tile of the square
+    ellipses = _bounding_ellipses(projected, settings.min_alpha).numpy() if is_2d else conics
     sizes = (camera.width, camera.height, settings.tile_size)
     tile_lists = kernels.list_tiles(
         means,
@@ -93,6 +93,30 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
         numba.get_num_threads(),
     )
     return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
+
+
+_STRETCH = 0.1
+"""Relative growth of the covariance of an ellipse that is to contain the same ellipse around another center."""
+
+
+def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:
+    """Return conics in pixels, around `means2d`, of ellipses that contain every pixel with alpha >= min_alpha.
+
+    Such a pixel lies in the projected ellipse of r standard deviations or in a disc with a radius of r / sqrt(2)
+    pixels. A conic is scaled so that r ** 2 bounds its ellipse; it is zero if the projection is not an ellipse.
+    """
+    transforms, means = projected.transforms.double(), projected.means2d.double()
+    square = (2 * (projected.opacities.double() / min_alpha).log()).clamp(min=0)
+    dual = transforms * torch.stack([square, square, -torch.ones_like(square)], 1)[:, None] @ transforms.mT
+    dual = dual / dual[:, 2:, 2:]
+    bounded = (transforms[:, 2, :2].square().sum(1) * square < transforms[:, 2, 2].square())[:, None]
+    center = dual[:, :2, 2]
+    shift = (center - means)[:, :, None]
+    covariance = (1 + _STRETCH) * (center[:, :, None] * center[:, None] - dual[:, :2, :2])
+    covariance = covariance + (1 + 1 / _STRETCH) * shift * shift.mT + 0.5 * square[:, None, None] * torch.eye(2)
+    (xx, xy), (_, yy) = (row.unbind(1) for row in covariance.unbind(1))
+    conics = (square / (xx * yy - xy * xy))[:, None] * torch.stack([yy, -xy, xx], 1)
+    return torch.where(bounded & conics.isfinite().all(1, keepdim=True), conics, 0.0).to(projected.means2d.dtype)
 
 
 def compile_kernels(*dtypes: torch.dtype) -> Thread:

@@ -308,9 +308,23 @@ def _first_active(pixels, index):  # pragma: no cover (compiled)
 
 
 @fused_kernel
-def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, limits):  # pragma: no cover (compiled)
+def _rows(g, box, means2d, shapes):  # pragma: no cover (compiled)
+    """Return the range (first, stop) of rows of a tile that a Gaussian may reach."""
+    top, left, bottom, right = box
+    u, v = means2d[g, 0], means2d[g, 1]
+    down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
+    above, below = ellipse_extent(down, left + 0.5 - u, right - 0.5 - u)
+    first = math.ceil(min(max(v + above - 0.5 - top, 0.0), bottom - top))
+    stop = math.floor(min(max(v + below - 0.5 - top, -1.0), bottom - top - 1)) + 1
+    return first, stop
+
+
+@fused_kernel
+def _blend_2d(
+    g, box, means2d, transforms, opacities, shapes, transmittance, weights, limits
+):  # pragma: no cover (compiled)
     """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
-    top, left, bottom, _ = box
+    top, left, _, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     u0, u1, u2 = transforms[g, 0], transforms[g, 1], transforms[g, 2]
@@ -318,7 +332,8 @@ def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, li
     w0, w1, w2 = transforms[g, 6], transforms[g, 7], transforms[g, 8]
     number = means2d.dtype.type
     half, one, zero = number(0.5), number(1), number(0)
-    for row in range(bottom - top):
+    first, stop = _rows(g, box, means2d, shapes)
+    for row in range(first, stop):
         y = number(top + row) + half
         b0, b1, b2 = y * w0 - v0, y * w1 - v1, y * w2 - v2
         dy = v - y
@@ -331,9 +346,9 @@ def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, li
                 c = a0 * b1 - a1 * b0
                 meets = c != zero
                 inverse = one / (c if meets else one)
-                first, second = (a1 * b2 - a2 * b1) * inverse, (a2 * b0 - a0 * b2) * inverse
+                a, b = (a1 * b2 - a2 * b1) * inverse, (a2 * b0 - a0 * b2) * inverse
                 dx = u - x
-                in_plane, in_image = half * (first * first + second * second), dx * dx + dy * dy
+                in_plane, in_image = half * (a * a + b * b), dx * dx + dy * dy
                 sigma = in_plane if in_plane < in_image else in_image
                 alpha = opacity * exp(-sigma)
                 alpha = alpha if alpha < max_alpha else max_alpha
@@ -342,7 +357,7 @@ def _blend_2d(g, box, means2d, transforms, opacities, transmittance, weights, li
                 continues = after > min_transmittance
                 weights[row, chunk, lane] = alpha * before if drawn & continues else zero
                 transmittance[row, chunk, lane] = (after if continues else -before) if drawn else before
-    return 0, bottom - top
+    return first, stop
 
 
 @fused_kernel
@@ -356,18 +371,15 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
         The range (first, stop) of rows that the Gaussian may reach; other rows are not written.
     """
     if conics.shape[1] == 9:
-        return _blend_2d(g, box, means2d, conics, opacities, transmittance, weights, limits)
-    top, left, bottom, right = box
+        return _blend_2d(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)
+    top, left, _, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
     number = means2d.dtype.type
     half, one, zero = number(0.5), number(1), number(0)
     half_a, half_c = half * a, half * c
-    down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
-    above, below = ellipse_extent(down, left + 0.5 - u, right - 0.5 - u)
-    first = math.ceil(min(max(v + above - 0.5 - top, 0.0), bottom - top))
-    stop = math.floor(min(max(v + below - 0.5 - top, -1.0), bottom - top - 1)) + 1
+    first, stop = _rows(g, box, means2d, shapes)
     for row in range(first, stop):
         dy = v - (number(top + row) + half)
         linear, constant = b * dy, half_c * dy * dy
