@@ -56,12 +56,14 @@ class RasterConfig:
     dtype: torch.dtype
     rasterize_mode: RasterizeMode
     weight_power: int
-    """Exponent of the weights in the sums, 1 or 2."""
+    """Exponent of the summed weights."""
+    clip_planes: tuple[float, float] | None = None
+    """Near and far plane of the training in world units; None: those of splatfacto."""
 
     @property
     def settings(self) -> RasterSettings:
         """Constants of the rasterization rules."""
-        return RasterSettings.of_gsplat(self.gsplat_version)
+        return RasterSettings.recorded({"gsplat_rules": self.gsplat_version, "clip_planes": self.clip_planes})
 
     @property
     def options(self) -> dict[str, Any]:
@@ -326,9 +328,11 @@ def cached_batch_evidence(
 
 
 def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConfig) -> list[str]:
-    """Return the cache key of each view's cell evidence, which is a digest of all its inputs."""
+    """Return the cache key of each view's cell evidence: a digest of everything it depends on."""
+    primitive = [] if gaussians.primitive == "3dgs" else [gaussians.primitive]
     scene = _digest(
-        [_CACHE_VERSION, *config.key], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+        [_CACHE_VERSION, *config.key, *primitive],
+        [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities],
     )
     views = zip(block.cameras, block.labels, block.regions)
     return [

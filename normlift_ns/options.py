@@ -409,6 +409,8 @@ RasterizeMode = Literal["classic", "antialiased"]
 """Rasterization mode that a scene was trained with: splatfacto's `rasterize_mode`."""
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
 """Rasterization backend; see `normlift_ns.rasterize_evidence`."""
+Primitive = Literal["3dgs", "2dgs"]
+"""Kind of the trained Gaussians: 3D ones, or the flat ones of 2D Gaussian Splatting."""
 GSPLAT_VERSIONS = ("1.4", "1.5", "1.6")
 """gsplat versions with different rasterization rules."""
 GsplatVersion = Literal["auto", "1.4", "1.5", "1.6", "installed"]
@@ -585,8 +587,12 @@ class SplatOptions:
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1, which is the default of ns-train."""
     rasterize_mode: RasterizeMode | None = None
-    """Rasterization mode that the splat was trained with. None: the mode recorded in the file or in the cfg.yml of
-    gsplat's trainer, or else classic."""
+    """Rasterization mode that the splat was trained with. Default: as recorded in the file or in the cfg.yml of
+    gsplat's trainer, else classic."""
+    primitive: Primitive | None = None
+    """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
+    the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
+    otherwise 3dgs."""
     background: Background = "black"
     """Background color behind the splat, and behind images with an alpha channel."""
 

@@ -158,7 +158,8 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     """Choose rasterization rules, backend and precision. If none fit, raise before any image is read."""
     rules, mode = resolve_gsplat_version(scene, options), scene.rasterize_mode
     dtype = torch.float64 if options.precision == "double" else torch.float32
-    config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power)
+    planes = scene.identity.get("clip_planes")
+    config = RasterConfig(rules, options.backend, dtype, mode, options.weight_power, planes)
     return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
@@ -345,8 +346,7 @@ def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptio
     """
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
-    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    sample = GaussianScene(*(array[:_WARM_UP_GAUSSIANS] for array in arrays))
+    sample = gaussians.select(slice(_WARM_UP_GAUSSIANS))
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says

@@ -33,20 +33,14 @@ from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.progress import peak_gib
 from normlift_ns.rasterization import numba as compiled
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
-from normlift_ns.rasterization.projection import assign_tiles, project
+from normlift_ns.rasterization.projection import assign_tiles
+from research.gpu_cases import grid_labels
 from research.report import RESULTS, Report, stopwatch
 from tests.captures import SHARED, trained_scene, training_cameras
 
-CELL = 60
 """Side of the square regions in pixels: 9 x 16 = 144 regions per view."""
 OTHER = 1e-3
 """Length of the difference above which a refined direction is another one."""
-
-
-def grid_labels(camera: Camera) -> torch.Tensor:
-    across = -(-camera.width // CELL)
-    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    return (y // CELL * across + x // CELL).int()
 
 
 def clip_like_table(rows: int) -> torch.Tensor:
@@ -95,9 +89,9 @@ def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[
     """CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that is kept."""
     job = RasterJob(scene, False, RasterSettings(), torch.float32)
     batch = RasterBatch([camera], [labels], [int(labels.max()) + 1])
-    projected = project(job.prepared, camera, job.settings, job.antialiased)
+    projected = job.project(camera)
     tasks: dict[str, Callable[[], Any]] = {
-        "project": lambda: project(job.prepared, camera, job.settings, job.antialiased),
+        "project": lambda: job.project(camera),
         "lists": lambda: compiled._tiles(projected, camera, job.settings),
         "view": lambda: compiled.views_evidence(job, batch),
     }
@@ -118,8 +112,7 @@ def main(quick: bool, output: Path) -> None:
     report = Report("cpu")
     scene, cameras = trained_scene("fox"), training_cameras("fox")
     if quick:
-        some = (x[::4].contiguous() for x in (scene.means, scene.quats, scene.scales, scene.opacities))
-        scene, cameras = GaussianScene(*some), cameras[:4]
+        scene, cameras = scene.select(slice(None, None, 4)), cameras[:4]
     labels = [grid_labels(camera) for camera in cameras]
     rasterize_evidence(scene, cameras[:1], labels[:1])  # compiles, or reads what was compiled before
 

@@ -11,7 +11,6 @@ gsplat's RGB render is measured in turns with it, in seven rounds.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,21 +24,12 @@ from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import project_views
 from normlift_ns.rasterization.settings import RasterSettings
 from research.cpu import relative_difference
-from research.gpu_cases import Case, capture_case, room_case, timed
+from research.gpu_cases import DIMENSION, Case, capture_case, features, once, room_case, timed
 from research.gpu_errors import evidence_error, lift_errors, vote_errors
 from research.gpu_stages import kernel_milliseconds, stage_seconds
 from research.report import RESULTS, Report
 
-DIMENSION, GSPLAT_VIEWS = 512, 6
-
-
-def features(rows: int, device: str = "cuda") -> torch.Tensor:
-    """Unit rows around 40 directions, so that neighbours agree in part."""
-    g = torch.Generator(device).manual_seed(0)
-    classes = torch.randn(40, DIMENSION, generator=g, device=device)
-    which = torch.randint(0, 40, (rows,), generator=g, device=device)
-    noise = torch.randn(rows, DIMENSION, generator=g, device=device)
-    return torch.nn.functional.normalize(classes[which] + 0.5 * noise, dim=1)
+GSPLAT_VIEWS = 6
 
 
 def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
@@ -77,15 +67,6 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
         dense_sums(RasterJob(scene, False, RasterSettings(), torch.float32), some, [gradient] * len(some), DIMENSION)
 
     return rgb, backward
-
-
-def once(run: Callable[[], Any]) -> float:
-    """Seconds of one run, the GPU waited for on both sides."""
-    torch.cuda.synchronize()
-    start = time.perf_counter()
-    run()
-    torch.cuda.synchronize()
-    return time.perf_counter() - start
 
 
 def compare_with_rgb(report: Report, case: Case, rounds: int = 7) -> None:

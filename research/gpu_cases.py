@@ -12,8 +12,24 @@ import torch
 
 from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 from research import rooms
-from research.cpu import grid_labels
 from tests.captures import trained_scene, training_cameras
+
+CELL, DIMENSION = 60, 512
+
+
+def grid_labels(camera: Camera) -> torch.Tensor:
+    across = -(-camera.width // CELL)
+    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    return (y // CELL * across + x // CELL).int()
+
+
+def features(rows: int, device: str = "cuda") -> torch.Tensor:
+    """Unit rows around 40 directions, so that neighbours agree in part."""
+    g = torch.Generator(device).manual_seed(0)
+    classes = torch.randn(40, DIMENSION, generator=g, device=device)
+    which = torch.randint(0, 40, (rows,), generator=g, device=device)
+    noise = torch.randn(rows, DIMENSION, generator=g, device=device)
+    return torch.nn.functional.normalize(classes[which] + 0.5 * noise, dim=1)
 
 
 @dataclass(frozen=True)
@@ -41,6 +57,15 @@ def room_case(name: str, n: int, views: int, regions: int = 128, scale: float = 
 def capture_case(name: str) -> Case:
     cameras = training_cameras(name)
     return Case(name, trained_scene(name).to("cuda"), cameras, [grid_labels(camera).cuda() for camera in cameras])
+
+
+def once(run: Callable[[], Any]) -> float:
+    """Seconds of one run, the GPU waited for on both sides."""
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    run()
+    torch.cuda.synchronize()
+    return time.perf_counter() - start
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:

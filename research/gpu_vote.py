@@ -25,7 +25,8 @@ from normlift_ns.core import refine as voting
 from normlift_ns.kernels import nearest
 from normlift_ns.kernels import vote as kernel
 from normlift_ns.kernels.vote import LaunchConfig
-from research.gpu import ROOMS, Case, capture_case, features, room_case, timed, vote_errors
+from research.gpu import ROOMS, Case, capture_case, room_case, timed, vote_errors
+from research.gpu_cases import features
 from research.gpu_stages import kernel_milliseconds
 from research.report import RESULTS, Report
 from tests.captures import SHARED

@@ -35,7 +35,8 @@ from normlift_ns.session import actions
 from normlift_ns.session.prompts import prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, State
-from research.cpu import clip_like_table, grid_labels
+from research.cpu import clip_like_table
+from research.gpu_cases import grid_labels
 from research.panel import add_fox_panel
 from research.report import RESULTS, Report
 from research.view import add_fox_view

@@ -374,6 +374,7 @@ class RecordedVotes:
             dtype=torch.float64 if self._option("precision", str, "standard") == "double" else torch.float32,
             rasterize_mode=self.scene.rasterize_mode,
             weight_power=self._option("weight_power", int, 1),
+            clip_planes=self.field.manifest.get("clip_planes"),
         )
         evidence = evidence_collection.cached_batch_evidence(
             self.scene.gaussians, block, self.cache / "evidence", config

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import TensorRecord
 from normlift_ns.errors import InputError
+from normlift_ns.options import Primitive
 
 MIN_OPACITY = 1 / 255
 """Opacity below which Gaussians are never drawn."""
@@ -57,6 +58,8 @@ class GaussianScene(TensorRecord):
     """Standard deviations along the three axes in world units, >= 0; linear, not logarithms."""
     opacities: Float[Tensor, " n"]
     """Opacities in 0..1, not logits."""
+    primitive: Primitive = "3dgs"
+    """Kind of the Gaussians. "2dgs": flat Gaussians, which 2D Gaussian Splatting draws without their third scale."""
 
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities"):
@@ -77,6 +80,11 @@ class GaussianScene(TensorRecord):
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def select(self, rows: Int64[Tensor, " m"] | Bool[Tensor, " n"] | slice) -> GaussianScene:
+        """Return some of the Gaussians, without gradients."""
+        tensors = {name: getattr(self, name).detach()[rows] for name in ("means", "quats", "scales", "opacities")}
+        return replace(self, **tensors)
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:

@@ -61,13 +61,13 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
     """Render three training views with at most 400 pixels on the longer side, and compare them with their images.
 
     Args:
-        scene: Scene with Gaussians, cameras and images.
-        settings: Constants of the rasterizer at full size; None for the constants of gsplat 1.4.
-        device: Device of torch that renders the views.
+        scene: Gaussians, cameras and images.
+        settings: constants of the rasterizer at full size; None: those that the scene records.
+        device: torch device to render on.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
-    views, settings = _sample_views(scene), settings or RasterSettings()
+    views, settings = _sample_views(scene), settings or RasterSettings.recorded(scene.identity)
     render = partial(_render, scene, scene.gaussians.to(device), settings)
     visible = max(float(in_frustum(scene.gaussians.means, view.camera).float().mean()) for view, _ in views)
     psnrs = {small[0].name: _psnr(small[0], render(small, 1.0)) for small in views}
@@ -80,8 +80,8 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
 
 
 def mean_psnr(scene: Scene, factor: float = 1.0) -> float:
-    """Return the mean PSNR of `Alignment` in dB, after multiplying the focal lengths by a factor."""
-    render = partial(_render, scene, scene.gaussians, RasterSettings())
+    """Return `Alignment.psnr` alone, in dB, with a factor on the focal lengths."""
+    render = partial(_render, scene, scene.gaussians, RasterSettings.recorded(scene.identity))
     return _mean_psnr(render, _sample_views(scene), factor)
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import yaml
 
 from normlift_ns.data.nerfstudio.config import config_string, describe_yaml_error
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import read_text
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import Primitive, RasterizeMode
 
+_NAMES = ("cfg.yml", "cfg.json")
+"""Names of the file; that of simple_trainer_2dgs.py ends with .json, which is YAML too."""
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
 _ADVICE = "Copy it from the training run again, or move the splat to a separate folder."
@@ -24,6 +27,9 @@ class GsplatConfig(NamedTuple):
     rasterize_mode: RasterizeMode | None
     normalize_world_space: bool | None
     test_every: int | None
+    primitive: Primitive | None
+    clip_planes: tuple[float, float] | None
+    """Near and far plane of a training of 2D Gaussians, in world units."""
 
 
 def find_gsplat_config(splat: Path) -> GsplatConfig | None:
@@ -32,10 +38,11 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     Returns:
         The settings, or None if there is no cfg.yml of gsplat's trainer.
     Raises:
-        ValueError: The file is damaged, or the splat was not trained as 3D Gaussians with pinhole cameras.
+        ValueError: if the file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
     """
-    path = splat.parent.parent / "cfg.yml" if splat.parent.name in _FOLDERS else splat.parent / "cfg.yml"
-    if not path.is_file():
+    folder = splat.parent.parent if splat.parent.name in _FOLDERS else splat.parent
+    path = next((folder / name for name in _NAMES if (folder / name).is_file()), None)
+    if path is None:
         return None
     if path.stat().st_size > _MAX_BYTES:
         raise InputError(f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}. {_ADVICE}")
@@ -53,7 +60,27 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
         raise InputError(f"{path} has test_every {test_every[:40]!r}, expected a whole number above 0. {_ADVICE}")
     antialiased = flags["antialiased"]
     mode = None if antialiased is None else "antialiased" if antialiased else "classic"
-    return GsplatConfig(path, mode, flags["normalize_world_space"], None if test_every is None else int(test_every))
+    primitive = cast("Primitive | None", texts["model_type"])
+    planes = (_number(path, root, "near_plane"), _number(path, root, "far_plane")) if primitive == "2dgs" else None
+    return GsplatConfig(
+        path,
+        "classic" if primitive == "2dgs" else mode,
+        flags["normalize_world_space"],
+        None if test_every is None else int(test_every),
+        primitive,
+        planes,
+    )
+
+
+def _number(path: Path, root: yaml.Node | None, name: str) -> float:
+    text = config_string(root, name)
+    try:
+        number = float("" if text is None else text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise InputError(f"{path} has {name} {str(text)[:40]!r}, expected a number above 0. {_ADVICE}")
+    return number
 
 
 def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
@@ -65,14 +92,14 @@ def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
 
 def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, *, is_3dgut: bool) -> None:
     if is_3dgut:
-        problem = "with_ut true (3DGUT), which renders Gaussians in another way"
-    elif model_type not in (None, "3dgs"):
-        problem = f"model_type {model_type[:40]}, which renders Gaussians in another way"
+        problem = "with_ut true (3DGUT), whose Gaussians are drawn in another way"
+    elif model_type not in (None, "3dgs", "2dgs"):
+        problem = f"model_type {model_type[:40]}, whose Gaussians are drawn in another way"
     elif camera_model not in (None, "pinhole"):
         problem = f"camera_model {camera_model[:40]}"
     else:
         return
     raise InputError(
-        f"According to {path}, the splat was trained with {problem}. Expected 3D Gaussians and pinhole cameras. Train "
-        "it again with simple_trainer.py and undistorted images."
+        f"{path} says that the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
+        "Train it again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
     )

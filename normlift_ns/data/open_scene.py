@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -61,8 +62,13 @@ class SplatScene:
 
     @property
     def gaussians(self) -> GaussianScene:
-        """Gaussians with activated scales and opacities."""
-        return self.splat.activated
+        """The N Gaussians, activated."""
+        return self._gaussians
+
+    @cached_property
+    def _gaussians(self) -> GaussianScene:
+        primitive = self.identity.get("primitive", "3dgs")
+        return self.splat.activated if primitive == "3dgs" else replace(self.splat.activated, primitive=primitive)
 
     @property
     def parameters(self) -> dict[str, Tensor]:

@@ -18,12 +18,12 @@ from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names
 from normlift_ns.data.open_scene import SplatScene, split_views
-from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, flatten_splat, validate_splat
 from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
 from normlift_ns.data.transforms import CameraFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
-from normlift_ns.options import SplatOptions
+from normlift_ns.options import Primitive, SplatOptions
 from normlift_ns.registry import Registry
 
 _MAX_STEP = 0.1
@@ -60,7 +60,7 @@ def open_splat(
         )
     path = Path(path).absolute()
     cameras = read_camera_file(options)
-    file = _read(path)
+    file = _with_primitive(_read(path), path, options)
     _check_coordinates(
         file.splat, file.splat.means[:: len(file.splat) // 10_000 + 1].double().numpy(), str(path), options
     )
@@ -87,6 +87,7 @@ def open_splat(
                 "source_cameras": str(cameras.source),
                 "source_step": file.step,
                 "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+                **({"primitive": "2dgs", "clip_planes": file.clip_planes} if file.primitive == "2dgs" else {}),
             },
             options.rasterize_mode or file.rasterize_mode or "classic",
             options.background,
@@ -212,7 +213,40 @@ def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
         rasterize_mode=mode or file.rasterize_mode,
         by_gsplat=file.by_gsplat if normalized is None else normalized,
         test_every=config.test_every,
-        remarks=(*file.remarks, f"The settings of the training are read from {config.path}."),
+        primitive=file.primitive or config.primitive,
+        clip_planes=config.clip_planes,
+        remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
+    )
+
+
+_CLIP_PLANES = (0.2, 1e10)
+"""Near and far plane of the 2DGS trainers of gsplat and Inria, in world units, if no file names them."""
+
+
+def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
+    """Return a file whose primitive is known: that of the options, the files or the file name, in this order.
+
+    Raises:
+        ValueError: if options and files contradict each other.
+    """
+    named: Primitive = "2dgs" if "2dgs" in path.name.lower() else "3dgs"
+    if options.primitive is not None and file.primitive not in (None, options.primitive):
+        raise InputError(
+            f"{path} has {file.primitive} Gaussians, by its scales or by the settings of its training, but --primitive "
+            f"is {options.primitive}. Omit --primitive, or give the file of another training."
+        )
+    if (options.primitive or file.primitive or named) == "3dgs":
+        return file._replace(primitive="3dgs")
+    if options.rasterize_mode == "antialiased":
+        raise InputError(f"{path} holds 2D Gaussians, which have no antialiasing; omit --rasterize-mode antialiased.")
+    near, far = planes = file.clip_planes or _CLIP_PLANES
+    remark = f"{path.name} holds 2D Gaussians, drawn from {near:g} to {far:g} world units in front of a camera."
+    return file._replace(
+        splat=flatten_splat(file.splat),
+        rasterize_mode="classic",
+        primitive="2dgs",
+        clip_planes=planes,
+        remarks=(*file.remarks, remark),
     )
 
 

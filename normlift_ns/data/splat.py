@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
@@ -20,7 +21,7 @@ from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.data.compressed_ply import PACKED, unpack_compressed_ply
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import file_kind, open_regular
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import Primitive, RasterizeMode
 
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 """Degree of the spherical harmonics, by the number of coefficients without the constant one."""
@@ -170,6 +171,20 @@ class SplatFile(NamedTuple):
     """Interval n if the training held out every n-th image; None if the file does not contain it."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
+    primitive: Primitive | None = None
+    """Kind of the Gaussians; None if the file does not name it."""
+    clip_planes: tuple[float, float] | None = None
+    """Near and far plane of the training in world units; None if the file does not name them."""
+
+
+_FLATNESS = math.log(1e-3)
+"""Logarithm of the thickness of a 2D Gaussian, as a fraction of its smaller standard deviation."""
+
+
+def flatten_splat(splat: SplatParameters) -> SplatParameters:
+    """Return 2D Gaussians as thin 3D ones, for viewers and files that have no others."""
+    in_plane = splat.scales[:, :2]
+    return replace(splat, scales=torch.cat([in_plane, in_plane.amin(dim=1, keepdim=True) + _FLATNESS], dim=1))
 
 
 _OTHER_PRIMITIVES = re.compile(
@@ -237,9 +252,9 @@ def read_ply(path: Path) -> SplatFile:
         splat = splat_from_parameters(parameters, path)
         validate_splat(splat, path)
         return SplatFile(splat, mode, remarks=(rounding,))
-    _check_properties(path, vertex)
+    is_2d = _check_properties(path, vertex)
     rest = _rest_names(path, {item.name for item in vertex.properties})
-    splat, mode = _read_columns(path, vertex.data, rest), _mode([*data.comments, *vertex.comments])
+    splat, mode = _read_columns(path, vertex.data, rest, is_2d), _mode([*data.comments, *vertex.comments])
     remarks = _remarks(path, vertex, rest, _mode_names([*data.comments, *vertex.comments]))
     if any(item.name == _FILTER for item in vertex.properties):
         widths = torch.from_numpy(np.ascontiguousarray(vertex.data[_FILTER]).astype(np.float64))
@@ -249,7 +264,7 @@ def read_ply(path: Path) -> SplatFile:
             "2D filter of Mip-Splatting has 0.1 square pixels; the rasterize mode antialiased uses 0.3 instead.",
         )
     validate_splat(splat, path)
-    return SplatFile(splat, mode, remarks=remarks)
+    return SplatFile(splat, mode, primitive="2dgs" if is_2d else None, remarks=remarks)
 
 
 def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) -> tuple[str, ...]:
@@ -313,12 +328,13 @@ def _parse_ply(path: Path) -> PlyData:
         ) from error
 
 
-def _check_properties(path: Path, vertex: PlyElement) -> None:
-    """Raise InputError unless the vertices have all properties of a splat, with one number each."""
+def _check_properties(path: Path, vertex: PlyElement) -> bool:
+    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
-    if missing:
+    is_2d = missing == ["scale_2"] and _FILTER not in names
+    if missing and not is_2d:
         raise InputError(
             f"{path} is not a splat: its {vertex.count:,} vertices lack {', '.join(missing)}. Expected the properties "
             f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
@@ -326,9 +342,8 @@ def _check_properties(path: Path, vertex: PlyElement) -> None:
         )
     lists = [item.name for item in vertex.properties if item.name in required and hasattr(item, "len_dtype")]
     if lists:
-        raise InputError(
-            f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian. Export it again."
-        )
+        raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+    return is_2d
 
 
 def check_ply_header(path: Path) -> None:
@@ -366,8 +381,6 @@ def check_ply_header(path: Path) -> None:
 
 
 def _advice(missing: list[str]) -> str:
-    if missing == ["scale_2"]:
-        return "2D Gaussians, which have two scales, are not supported. Train the scene with 3D Gaussians."
     if all(name.startswith("f_dc_") for name in missing):
         return "Its colors are not spherical harmonics. Export it again with f_dc_*."
     return "Give the PLY file that the trainer or ns-export gaussian-splat wrote, not the initial point cloud."
@@ -386,17 +399,18 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
     return expected
 
 
-def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParameters:
+def _read_columns(path: Path, table: np.ndarray, rest: list[str], is_2d: bool) -> SplatParameters:
     n, k = len(table), len(rest) // 3
     columns = {name: torch.empty(n, len(group)) for name, group in _COLUMNS.items()}
     harmonics = torch.empty(n, k, 3)
     for start, rows in _blocks(path, table):
         for name, group in _COLUMNS.items():
-            for i, column in enumerate(group):
+            for i, column in enumerate(group[:2] if is_2d and name == "scales" else group):
                 columns[name].numpy()[start : start + len(rows), i] = rows[column]
         for i, column in enumerate(rest):  # all coefficients of red, then green, then blue
             harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
-    return SplatParameters(**columns, features_rest=harmonics)
+    splat = SplatParameters(**columns, features_rest=harmonics)
+    return flatten_splat(splat) if is_2d else splat
 
 
 def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

@@ -16,7 +16,8 @@ import triton.language as tl
 from jaxtyping import Float32, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.kernels.projection import SPLAT, ProjectedSplats
+from normlift_ns.kernels.projection import ProjectedSplats
+from normlift_ns.kernels.projection_2dgs import SPLAT_2D
 
 _BLOCK = 32
 _ROUNDING = tl.constexpr(2.0**-20)
@@ -160,7 +161,8 @@ def build_cell_lists(
     launch = (triton.cdiv(entries, _BLOCK),)
     sizes = (entries, views, grid.width, grid.height, min_alpha, -(-grid.width // tile), -(-grid.height // tile))
     sizes += (grid.across, grid.down)
-    shape = {"TILE": tile, "CELL_W": grid.cell_width, "CELL_H": grid.cell_height, "SPLAT": SPLAT, "BLOCK": _BLOCK}
+    shape = {"TILE": tile, "CELL_W": grid.cell_width, "CELL_H": grid.cell_height, "BLOCK": _BLOCK}
+    shape["SPLAT"] = projected.splats.shape[1]
     options = {**shape, "CULL": cull, "num_warps": 1}
     unused = count
     if entries > 0:
@@ -233,21 +235,53 @@ def _unpack_floats(pair):
 
 
 @triton.jit
-def load_splat(splats, m, valid):
-    """Return u, v, half of xx, half of yy, xy and opacity of a splat. An invalid splat has opacity 0."""
-    row = splats + 4 * m.to(tl.int64)
+def load_splat(splats, m, valid, IS_2D: tl.constexpr):
+    """Return u, v, opacity and nine numbers of the shape of a splat; an invalid splat has opacity 0.
+
+    The nine numbers are the transform of a 2D Gaussian. A conic has three, half of xx, half of yy, and xy; the last one
+    is repeated.
+    """
+    row = splats + (8 if IS_2D else 4) * m.to(tl.int64)
     u, v = _unpack_floats(tl.load(row, mask=valid, other=0))
-    a, c = _unpack_floats(tl.load(row + 1, mask=valid, other=0))
-    b, opacity = _unpack_floats(tl.load(row + 2, mask=valid, other=0))
-    return u, v, a, c, b, opacity
+    a, b = _unpack_floats(tl.load(row + 1, mask=valid, other=0))
+    c, opacity = _unpack_floats(tl.load(row + 2, mask=valid, other=0))
+    d, e, f, g, h, i = c, c, c, c, c, c
+    if IS_2D:
+        d, e = _unpack_floats(tl.load(row + 4, mask=valid, other=0))
+        f, g = _unpack_floats(tl.load(row + 5, mask=valid, other=0))
+        h, i = _unpack_floats(tl.load(row + 6, mask=valid, other=0))
+    return u, v, opacity, a, b, c, d, e, f, g, h, i
 
 
 @triton.jit
-def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
-    """Return A_ij of one splat and the transmittance behind it in all pixels, which is 0 in finished pixels."""
+def _exponent(u, v, a, c, b, px, py):
+    """Return -log(alpha / opacity), fused as by nvcc in rasterize_to_pixels_fwd.cu."""
     dx, dy = u - px, v - py
-    # Multiply-adds are fused as nvcc does in rasterize_to_pixels_fwd.cu.
-    sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
+    return tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
+
+
+@triton.jit
+def _exponent_2d(u, v, u0, u1, u2, v0, v1, v2, w0, w1, w2, px, py):
+    """Return -log(alpha / opacity), fused as by nvcc in rasterize_to_pixels_2dgs_fwd.cu; -1 for an edge-on plane."""
+    a0, a1, a2 = tl.fma(px, w0, -u0), tl.fma(px, w1, -u1), tl.fma(px, w2, -u2)
+    b0, b1, b2 = tl.fma(py, w0, -v0), tl.fma(py, w1, -v1), tl.fma(py, w2, -v2)
+    c = tl.fma(a0, b1, -(a1 * b0))
+    meets = c != 0
+    inverse = 1.0 / tl.where(meets, c, 1.0)
+    x, y = tl.fma(a1, b2, -(a2 * b1)) * inverse, tl.fma(a2, b0, -(a0 * b2)) * inverse
+    dx, dy = u - px, v - py
+    in_image = tl.fma(dy, dy, dx * dx)
+    return tl.where(meets, 0.5 * tl.minimum(tl.fma(x, x, y * y), in_image + in_image), -1.0)
+
+
+@triton.jit
+def blend(
+    u, v, opacity, a, b, c, d, e, f, g, h, i, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D: tl.constexpr
+):  # fmt: skip
+    """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
+    sigma = _exponent(u, v, a, b, c, px, py)
+    if IS_2D:
+        sigma = _exponent_2d(u, v, a, b, c, d, e, f, g, h, i, px, py)
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
     visible = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)
@@ -285,7 +319,7 @@ def _number_labels(
 def _sum_regions(
     splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
-    POWER: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr,
+    POWER: tl.constexpr, IS_2D: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr,
 ):  # fmt: skip
     cell = first_cell + tl.program_id(0).to(tl.int64)
     start, stop = tl.load(offsets + cell), tl.load(offsets + cell + 1)
@@ -303,15 +337,20 @@ def _sum_regions(
         alive = 1
         # Load the next splat during the computation of the current one.
         m = tl.load(members + i)
-        u, v, a, c, b, o = load_splat(splats, m, i < stop)
+        u, v, o, s0, s1, s2, s3, s4, s5, s6, s7, s8 = load_splat(splats, m, i < stop, IS_2D)
         later = tl.load(members + i + 1, mask=i + 1 < stop, other=0)
         while (i < stop) & (alive > 0):
             for _ in tl.static_range(UNROLL):
                 next_m = later
                 later = tl.load(members + i + 2, mask=i + 2 < stop, other=0)
-                next_u, next_v, next_a, next_c, next_b, next_o = load_splat(splats, next_m, i + 1 < stop)
+                next_u, next_v, next_o, n0, n1, n2, n3, n4, n5, n6, n7, n8 = load_splat(
+                    splats, next_m, i + 1 < stop, IS_2D
+                )
 
-                weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+                weight, T = blend(
+                    u, v, o, s0, s1, s2, s3, s4, s5, s6, s7, s8, px, py, T, max_alpha, min_alpha, min_transmittance,
+                    IS_2D,
+                )  # fmt: skip
                 if POWER == 2:
                     weight = weight * weight
                 if POWER == 0:
@@ -332,7 +371,8 @@ def _sum_regions(
                                 tl.store(out_key + slot, base_key + label)
                                 slot += 1
                 i += 1
-                m, u, v, a, c, b, o = next_m, next_u, next_v, next_a, next_c, next_b, next_o
+                m, u, v, o = next_m, next_u, next_v, next_o
+                s0, s1, s2, s3, s4, s5, s6, s7, s8 = n0, n1, n2, n3, n4, n5, n6, n7, n8
             alive = tl.max(tl.where(T > 0, 1, 0))
     tl.store(out_used + cell - first_cell, slot - first)
 
@@ -350,7 +390,7 @@ def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED
 
 
 def sum_regions(
-    splats: Float32[Tensor, "m 8"],
+    splats: Float32[Tensor, "m values"],
     lists: CellLists,
     labels: Int32[Tensor, "views h w"],
     grid: CellGrid,
@@ -362,9 +402,9 @@ def sum_regions(
     """Return the sums of A_ij ** weight_power over the pixels of each region in each cell, for views of one size.
 
     Args:
-        splats: Projected Gaussians, as described at `SPLAT`.
-        lists: Lists of splats by cell.
-        labels: Region of every pixel. Unlabeled pixels, -1, are summed like a region. Pixels below -1 are ignored.
+        splats: Projected Gaussians; see `SPLAT` and `SPLAT_2D`.
+        lists: Splats by cell.
+        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels below -1 are ignored.
         grid: Cells of an image.
         columns: Number of columns in keys, larger than the largest label + 1.
         limits: Limits of alpha and transmittance.
@@ -389,7 +429,7 @@ def sum_regions(
         _sum_regions[(last - first,)](
             splats.view(torch.int64), lists.members, lists.offsets, local, table, counts, slots, key, weight, used,
             first, low, columns, grid.across, grid.cells, *limits,
-            POWER=weight_power, UNROLL=UNROLL, **shape,
+            POWER=weight_power, IS_2D=splats.shape[1] == SPLAT_2D, UNROLL=UNROLL, **shape,
         )  # fmt: skip
         ends = used.cumsum(0)
         total = int(ends[-1])
@@ -459,7 +499,7 @@ _CHANNELS = 8
 def _composite(
     splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,
-    CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
+    IS_2D: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
     cell = tl.program_id(0)
     channel = tl.program_id(1) * CHANNELS + tl.arange(0, CHANNELS)[None, None, :]
@@ -476,9 +516,11 @@ def _composite(
         for _ in tl.static_range(UNROLL):
             inside_list = i < stop
             m = tl.load(members + i, mask=inside_list, other=0).to(tl.int64)
-            u, v, a, c, b, o = load_splat(splats, m, inside_list)
+            u, v, o, s0, s1, s2, s3, s4, s5, s6, s7, s8 = load_splat(splats, m, inside_list, IS_2D)
             gaussian = tl.load(gaussians + m)
-            weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+            weight, T = blend(
+                u, v, o, s0, s1, s2, s3, s4, s5, s6, s7, s8, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D
+            )
             value = tl.load(values + gaussian * channels + channel, mask=channel < channels, other=0.0)
             color += weight[:, :, None] * value
             weight_sum += weight
@@ -491,7 +533,7 @@ def _composite(
 
 
 def composite(
-    splats: Float32[Tensor, "m 8"],
+    splats: Float32[Tensor, "m values"],
     lists: CellLists,
     gaussians: Int64[Tensor, " m"],
     values: Float32[Tensor, "n c"],
@@ -501,8 +543,8 @@ def composite(
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel of one view.
 
     Args:
-        splats: Projected Gaussians, as described at `SPLAT`.
-        lists: Lists of splats by cell.
+        splats: Projected Gaussians; see `SPLAT` and `SPLAT_2D`.
+        lists: Splats by cell.
         gaussians: Gaussian of every splat.
         values: Values of every Gaussian.
         grid: Cells of the image.
@@ -516,7 +558,7 @@ def composite(
     block = min(_CHANNELS, triton.next_power_of_2(max(1, channels)))
     _composite[(grid.cells, max(1, triton.cdiv(channels, block)))](
         splats.view(torch.int64), lists.members, lists.offsets, gaussians, values.contiguous(), image, alpha,
-        grid.width, grid.height, channels, grid.across, *limits, CELL_W=grid.cell_width, CELL_H=grid.cell_height,
-        UNROLL=UNROLL, CHANNELS=block, num_warps=1,
+        grid.width, grid.height, channels, grid.across, *limits, IS_2D=splats.shape[1] == SPLAT_2D,
+        CELL_W=grid.cell_width, CELL_H=grid.cell_height, UNROLL=UNROLL, CHANNELS=block, num_warps=1,
     )  # fmt: skip
     return image, alpha

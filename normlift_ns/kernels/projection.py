@@ -47,14 +47,14 @@ class ProjectedSplats(NamedTuple):
     """Visible Gaussians of all cameras, as splats."""
 
     keys: Int64[Tensor, " m"]
-    """Ascending keys gaussian * views + view."""
-    splats: Float32[Tensor, "m 8"]
-    """Values of every splat, as described at `SPLAT`."""
+    """Keys gaussian * views + view, ascending."""
+    splats: Float32[Tensor, "m values"]
+    """Values described at `SPLAT`, or for 2D Gaussian Splatting at `SPLAT_2D`."""
     depth: Float32[Tensor, " m"]
 
 
 @triton.jit
-def _camera_axis(camera, axis: tl.constexpr, x, y, z):
+def camera_axis(camera, axis: tl.constexpr, x, y, z):
     """Return one camera coordinate, rounded as CUDA rounds R p + t."""
     a, b = tl.load(camera + 4 * axis), tl.load(camera + 4 * axis + 1)
     c, t = tl.load(camera + 4 * axis + 2), tl.load(camera + 4 * axis + 3)
@@ -62,7 +62,8 @@ def _camera_axis(camera, axis: tl.constexpr, x, y, z):
 
 
 @triton.jit
-def _dot(ax, ay, az, bx, by, bz):
+def dot(ax, ay, az, bx, by, bz):
+    """Return the scalar product of two vectors, rounded as in gsplat."""
     return tl.fma(az, bz, tl.fma(ax, bx, ay * by))
 
 
@@ -76,7 +77,7 @@ def _covariance(quats, scales, i, valid):
     sx = tl.load(scales + 3 * i, mask=valid, other=0.0)
     sy = tl.load(scales + 3 * i + 1, mask=valid, other=0.0)
     sz = tl.load(scales + 3 * i + 2, mask=valid, other=0.0)
-    inverse = tl.rsqrt(tl.fma(w, w, _dot(x, y, z, x, y, z)))
+    inverse = tl.rsqrt(tl.fma(w, w, dot(x, y, z, x, y, z)))
     x, y, z, w = x * inverse, y * inverse, z * inverse, w * inverse
     y2, z2, wx, wy, wz = y * y, z * z, w * x, w * y, w * z
     ax = (1.0 - 2.0 * (y2 + z2)) * sx
@@ -84,19 +85,19 @@ def _covariance(quats, scales, i, valid):
     bx, by, bz = 2.0 * tl.fma(x, y, wz) * sx, (1.0 - 2.0 * tl.fma(x, x, z2)) * sy, 2.0 * tl.fma(y, z, -wx) * sz
     cx, cy, cz = 2.0 * tl.fma(x, z, -wy) * sx, 2.0 * tl.fma(y, z, wx) * sy, (1.0 - 2.0 * tl.fma(x, x, y2)) * sz
     return (
-        _dot(ax, ay, az, ax, ay, az),
-        _dot(ax, ay, az, bx, by, bz),
-        _dot(ax, ay, az, cx, cy, cz),
-        _dot(bx, by, bz, bx, by, bz),
-        _dot(bx, by, bz, cx, cy, cz),
-        _dot(cx, cy, cz, cx, cy, cz),
+        dot(ax, ay, az, ax, ay, az),
+        dot(ax, ay, az, bx, by, bz),
+        dot(ax, ay, az, cx, cy, cz),
+        dot(bx, by, bz, bx, by, bz),
+        dot(bx, by, bz, cx, cy, cz),
+        dot(cx, cy, cz, cx, cy, cz),
     )
 
 
 @triton.jit
 def _row_times(a, b, c, xx, xy, xz, yy, yz, zz):
-    """Return a row of the pose times the covariance. The last entry is summed in another order, as in gsplat."""
-    return _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
+    """Return a row of the pose times the covariance; the last entry is summed in another order, as in gsplat."""
+    return dot(a, b, c, xx, xy, xz), dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
 
 
 @triton.jit
@@ -109,9 +110,9 @@ def _rotate_covariance(camera, xx, xy, xz, yy, yz, zz):
     y0, y1, y2 = _row_times(d, e, f, xx, xy, xz, yy, yz, zz)
     z0, z1, z2 = _row_times(g, h, k, xx, xy, xz, yy, yz, zz)
     return (
-        _dot(x0, x1, x2, a, b, c), _dot(x0, x1, x2, d, e, f), _dot(x0, x1, x2, g, h, k),
-        _dot(y0, y1, y2, a, b, c), _dot(y0, y1, y2, d, e, f), _dot(y0, y1, y2, g, h, k),
-        _dot(z0, z1, z2, a, b, c), _dot(z0, z1, z2, d, e, f), _dot(z0, z1, z2, g, h, k),
+        dot(x0, x1, x2, a, b, c), dot(x0, x1, x2, d, e, f), dot(x0, x1, x2, g, h, k),
+        dot(y0, y1, y2, a, b, c), dot(y0, y1, y2, d, e, f), dot(y0, y1, y2, g, h, k),
+        dot(z0, z1, z2, a, b, c), dot(z0, z1, z2, d, e, f), dot(z0, z1, z2, g, h, k),
     )  # fmt: skip
 
 
@@ -124,7 +125,7 @@ def _splat(
     """Return visibility, u, v, conic (xx, xy, yy), opacity, half width, half height and depth of a splat."""
     fx, fy = tl.load(camera + 12), tl.load(camera + 13)
     cx, cy = tl.load(camera + 14), tl.load(camera + 15)
-    xc, yc, depth = _camera_axis(camera, 0, x, y, z), _camera_axis(camera, 1, x, y, z), _camera_axis(camera, 2, x, y, z)
+    xc, yc, depth = camera_axis(camera, 0, x, y, z), camera_axis(camera, 1, x, y, z), camera_axis(camera, 2, x, y, z)
     visible = (depth >= near_plane) & (depth <= far_plane)
     zc = tl.where(visible, depth, 1.0)
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = _rotate_covariance(camera, xx, xy, xz, yy, yz, zz)

@@ -31,14 +31,21 @@ class RasterJob:
     """Exponent p of the weights in the evidence, which sums A_ij ** p."""
 
     @cached_property
-    def prepared(self) -> projection.PreparedGaussians:
-        """Drawable Gaussians with their covariances, for any camera."""
-        return projection.prepare_gaussians(self.scene, self.dtype)
+    def prepared(self) -> projection.AnyPrepared:
+        """The drawable Gaussians, prepared for any camera."""
+        prepare = projection.prepare_gaussians_2d if self.is_2d else projection.prepare_gaussians
+        return prepare(self.scene, self.dtype)
 
-    def project(self, camera: Camera) -> tuple[projection.ProjectedGaussians, projection.TileLists]:
-        """Project the Gaussians into a camera, and list them by tile."""
-        projected = projection.project(self.prepared, camera, self.settings, self.antialiased)
-        return projected, projection.assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
+    @property
+    def is_2d(self) -> bool:
+        """True for a scene of 2D Gaussian Splatting."""
+        return self.scene.primitive == "2dgs"
+
+    def project(self, camera: Camera) -> projection.AnyProjected:
+        """Project the Gaussians into a camera."""
+        if isinstance(self.prepared, projection.PreparedGaussians2D):
+            return projection.project_2d(self.prepared, camera, self.settings)
+        return projection.project(self.prepared, camera, self.settings, self.antialiased)
 
 
 def check_gpu(backend: str, job: RasterJob) -> None:
@@ -94,11 +101,17 @@ class TileBackend:
 
     def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)
         (camera,), (labels,), (count,) = batch
-        return projection.view_evidence(*job.project(camera), labels, count, job.weight_power, job.settings)
+        projected, tiles = _with_tiles(job, camera)
+        return projection.view_evidence(projected, tiles, labels, count, job.weight_power, job.settings)
 
     def composite(  # noqa: D102 (as in the protocol)
         self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-        projected, tiles = job.project(camera)
+        projected, tiles = _with_tiles(job, camera)
         visible_values = values[projected.gaussian].to(projected.opacities.dtype)
         return projection.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)
+
+
+def _with_tiles(job: RasterJob, camera: Camera) -> tuple[projection.AnyProjected, projection.TileLists]:
+    projected = job.project(camera)
+    return projected, projection.assign_tiles(projected, camera.width, camera.height, job.settings.tile_size)

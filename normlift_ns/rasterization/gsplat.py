@@ -17,7 +17,7 @@ from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS
@@ -104,8 +104,7 @@ def _project_enormous(
     rows = (scene.drawable & (scene.scales.amax(dim=1) > _LARGE)).nonzero().squeeze(1)
     if len(rows) == 0:
         return
-    large = GaussianScene(*(x[rows] for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
-    world = prepare_gaussians(large, torch.float32)
+    world = prepare_gaussians(scene.select(rows), torch.float32)
     for view, camera in enumerate(cameras):
         projected = project(world, camera, job.settings, job.antialiased)
         overflows = projected.radii.amax(dim=1) > _OVERFLOWS
@@ -120,6 +119,8 @@ def _project_enormous(
 def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not float32 on a GPU, or needs other constants than the installed gsplat has."""
     check_gpu("gsplat", job)
+    if job.is_2d:
+        raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')
     compiled = installed_settings()
     squares = compiled.per_axis and not job.settings.per_axis
     names = _COMPILED if squares else (*_COMPILED, *_EXTENT)

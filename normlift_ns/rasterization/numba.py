@@ -16,7 +16,7 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
 from normlift_ns.rasterization import numba_kernels as kernels
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
-from normlift_ns.rasterization.projection import ProjectedGaussians, project
+from normlift_ns.rasterization.projection import AnyProjected, ProjectedGaussians2D
 from normlift_ns.rasterization.settings import RasterSettings
 
 _Triple = tuple[Any, Any, Any]
@@ -37,7 +37,7 @@ def in_flight(job: RasterJob, camera: Camera) -> int:
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
     """Return the entries of one view, which are bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
-    projected = project(job.prepared, camera, job.settings, job.antialiased)
+    projected = job.project(camera)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     size, label_map = job.settings.tile_size, labels.int().numpy()
     capacity = np.diff(offsets) * kernels.count_labels(label_map, size)
@@ -58,7 +58,7 @@ def composite(
     job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
-    projected = project(job.prepared, camera, job.settings, job.antialiased)
+    projected = job.project(camera)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     visible_values = values[projected.gaussian].to(job.dtype).contiguous().numpy()
     image = np.zeros((camera.height, camera.width, values.shape[1]), visible_values.dtype)
@@ -70,23 +70,53 @@ def composite(
     return torch.from_numpy(image), torch.from_numpy(alpha)
 
 
-def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
-    """Return the input of the kernels as three groups.
+def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
+    """Return the input of the kernels in three groups.
 
-    The first group is means, conics and opacities. The second is the limits of alpha and transmittance. The third is
-    the result of `numba_kernels.list_tiles`.
+    These are means, conics or transforms, and opacities; limits of alpha and transmittance; and offsets and members of
+    the tiles with shapes of the Gaussians.
     """
-    means, conics, opacities = (
-        x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
-    )
+    is_2d = isinstance(projected, ProjectedGaussians2D)
+    kinds = projected.transforms.flatten(1) if is_2d else projected.conics
+    means, conics, opacities = (x.contiguous().numpy() for x in (projected.means2d, kinds, projected.opacities))
     number = means.dtype.type
     max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
-    radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
+    ellipses = _bounding_ellipses(projected, settings.min_alpha).numpy() if is_2d else conics
     sizes = (camera.width, camera.height, settings.tile_size)
     tile_lists = kernels.list_tiles(
-        means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
+        means,
+        ellipses,
+        opacities,
+        projected.radii.contiguous().numpy(),
+        *sizes,
+        number(min_alpha),
+        numba.get_num_threads(),
     )
     return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
+
+
+_STRETCH = 0.1
+"""Relative growth of the covariance of an ellipse that is to contain the same ellipse around another center."""
+
+
+def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:
+    """Return conics in pixels, around `means2d`, of ellipses that contain every pixel with alpha >= min_alpha.
+
+    Such a pixel lies in the projected ellipse of r standard deviations or in a disc with a radius of r / sqrt(2)
+    pixels. A conic is scaled so that r ** 2 bounds its ellipse; it is zero if the projection is not an ellipse.
+    """
+    transforms, means = projected.transforms.double(), projected.means2d.double()
+    square = (2 * (projected.opacities.double() / min_alpha).log()).clamp(min=0)
+    dual = transforms * torch.stack([square, square, -torch.ones_like(square)], 1)[:, None] @ transforms.mT
+    dual = dual / dual[:, 2:, 2:]
+    bounded = (transforms[:, 2, :2].square().sum(1) * square < transforms[:, 2, 2].square())[:, None]
+    center = dual[:, :2, 2]
+    shift = (center - means)[:, :, None]
+    covariance = (1 + _STRETCH) * (center[:, :, None] * center[:, None] - dual[:, :2, :2])
+    covariance = covariance + (1 + 1 / _STRETCH) * shift * shift.mT + 0.5 * square[:, None, None] * torch.eye(2)
+    (xx, xy), (_, yy) = (row.unbind(1) for row in covariance.unbind(1))
+    conics = (square / (xx * yy - xy * xy))[:, None] * torch.stack([yy, -xy, xx], 1)
+    return torch.where(bounded & conics.isfinite().all(1, keepdim=True), conics, 0.0).to(projected.means2d.dtype)
 
 
 def compile_kernels(*dtypes: torch.dtype) -> Thread:

@@ -308,25 +308,78 @@ def _first_active(pixels, index):  # pragma: no cover (compiled)
 
 
 @fused_kernel
+def _rows(g, box, means2d, shapes):  # pragma: no cover (compiled)
+    """Return the range (first, stop) of rows of a tile that a Gaussian may reach."""
+    top, left, bottom, right = box
+    u, v = means2d[g, 0], means2d[g, 1]
+    down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
+    above, below = ellipse_extent(down, left + 0.5 - u, right - 0.5 - u)
+    first = math.ceil(min(max(v + above - 0.5 - top, 0.0), bottom - top))
+    stop = math.floor(min(max(v + below - 0.5 - top, -1.0), bottom - top - 1)) + 1
+    return first, stop
+
+
+@fused_kernel
+def _blend_2d(
+    g, box, means2d, transforms, opacities, shapes, transmittance, weights, limits
+):  # pragma: no cover (compiled)
+    """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
+    top, left, _, _ = box
+    max_alpha, min_alpha, min_transmittance = limits
+    u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
+    u0, u1, u2 = transforms[g, 0], transforms[g, 1], transforms[g, 2]
+    v0, v1, v2 = transforms[g, 3], transforms[g, 4], transforms[g, 5]
+    w0, w1, w2 = transforms[g, 6], transforms[g, 7], transforms[g, 8]
+    number = means2d.dtype.type
+    half, one, zero = number(0.5), number(1), number(0)
+    first, stop = _rows(g, box, means2d, shapes)
+    for row in range(first, stop):
+        y = number(top + row) + half
+        b0, b1, b2 = y * w0 - v0, y * w1 - v1, y * w2 - v2
+        dy = v - y
+        for chunk in range(transmittance.shape[1]):
+            left_x = number(left + chunk * LANES) + half
+            for lane in range(LANES):
+                before = transmittance[row, chunk, lane]
+                x = left_x + number(lane)
+                a0, a1, a2 = x * w0 - u0, x * w1 - u1, x * w2 - u2
+                c = a0 * b1 - a1 * b0
+                meets = c != zero
+                inverse = one / (c if meets else one)
+                a, b = (a1 * b2 - a2 * b1) * inverse, (a2 * b0 - a0 * b2) * inverse
+                dx = u - x
+                in_plane, in_image = half * (a * a + b * b), dx * dx + dy * dy
+                sigma = in_plane if in_plane < in_image else in_image
+                alpha = opacity * exp(-sigma)
+                alpha = alpha if alpha < max_alpha else max_alpha
+                after = before * (one - alpha)
+                drawn = (before > zero) & meets & (alpha >= min_alpha)
+                continues = after > min_transmittance
+                weights[row, chunk, lane] = alpha * before if drawn & continues else zero
+                transmittance[row, chunk, lane] = (after if continues else -before) if drawn else before
+    return first, stop
+
+
+@fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
     """Composite one Gaussian over a tile, and write A_ij to weights[row, chunk, lane], or 0 if it is not drawn.
 
-    The transmittance of a pixel that has stopped is stored as a negative number.
+    The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
+    transform of a Gaussian of 2D Gaussian Splatting.
 
     Returns:
         The range (first, stop) of rows that the Gaussian may reach. Other rows are not written.
     """
-    top, left, bottom, right = box
+    if conics.shape[1] == 9:
+        return _blend_2d(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)
+    top, left, _, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
     number = means2d.dtype.type
     half, one, zero = number(0.5), number(1), number(0)
     half_a, half_c = half * a, half * c
-    down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
-    above, below = ellipse_extent(down, left + 0.5 - u, right - 0.5 - u)
-    first = math.ceil(min(max(v + above - 0.5 - top, 0.0), bottom - top))
-    stop = math.floor(min(max(v + below - 0.5 - top, -1.0), bottom - top - 1)) + 1
+    first, stop = _rows(g, box, means2d, shapes)
     for row in range(first, stop):
         dy = v - (number(top + row) + half)
         linear, constant = b * dy, half_c * dy * dy

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED, Entries
@@ -45,6 +45,60 @@ class ProjectedGaussians(NamedTuple):
     radii: Float[Tensor, "m 2"]
     """Half width and half height of the rectangle that selects tiles, in whole pixels."""
 
+    def exponents(
+        self, members: Int64[Tensor, " k"], x: Float[Tensor, " w"], y: Float[Tensor, " h"]
+    ) -> Float[Tensor, "h w k"]:
+        """Return -log(alpha / opacity) of some Gaussians at the pixel centers (x, y)."""
+        dx, dy = self.means2d[members, 0] - x[None, :, None], self.means2d[members, 1] - y[:, None, None]
+        a, b, c = self.conics[members].unbind(1)
+        return 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+
+
+class PreparedGaussians2D(NamedTuple):
+    """The drawable Gaussians of a scene of 2D Gaussian Splatting, prepared for any camera."""
+
+    gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
+    means: Float[Tensor, "m 3"]
+    """Centers in the precision of the scene, which decides the drawing order."""
+    axes: Float64[Tensor, "m 3 2"]
+    """The two axes in the plane of each Gaussian, as long as its standard deviations."""
+    opacities: Float[Tensor, " m"]
+
+
+class ProjectedGaussians2D(NamedTuple):
+    """The Gaussians of 2D Gaussian Splatting visible in a camera, nearest first."""
+
+    gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
+    means2d: Float[Tensor, "m 2"]
+    """Centers of the projected ellipses of one standard deviation."""
+    transforms: Float[Tensor, "m 3 3"]
+    """Matrices from (a, b, 1), with a and b in standard deviations along the axes, to homogeneous pixels."""
+    opacities: Float[Tensor, " m"]
+    radii: Float[Tensor, "m 2"]
+    """Half width and height of the square that selects the tiles, in whole pixels."""
+
+    def exponents(
+        self, members: Int64[Tensor, " k"], x: Float[Tensor, " w"], y: Float[Tensor, " h"]
+    ) -> Float[Tensor, "h w k"]:
+        """Return -log(alpha / opacity) of some Gaussians at the pixel centers (x, y); inf for planes seen edge-on.
+
+        This is half the smaller one of two squares: the distance in standard deviations from the center to the point
+        where the ray of the pixel meets the plane, and sqrt(2) times the distance from `means2d` in pixels.
+        """
+        rows = self.transforms[members]
+        across, down = x[:, None, None] * rows[:, 2] - rows[:, 0], y[:, None, None] * rows[:, 2] - rows[:, 1]
+        a, b, c = torch.linalg.cross(across[None], down[:, None]).unbind(3)
+        in_plane = (a / c).square() + (b / c).square()
+        center = self.means2d[members]
+        in_image = 2 * ((center[:, 0] - x[:, None]).square()[None] + (center[:, 1] - y[:, None]).square()[:, None])
+        return torch.where(c == 0, torch.inf, 0.5 * torch.minimum(in_plane, in_image))
+
+
+AnyPrepared = PreparedGaussians | PreparedGaussians2D
+AnyProjected = ProjectedGaussians | ProjectedGaussians2D
+
 
 class TileLists(NamedTuple):
     """Lists of the Gaussians of every tile, with tiles numbered row by row.
@@ -62,6 +116,13 @@ def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGauss
     quats, scales, opacities = (x[gaussian].to(dtype) for x in (scene.quats, scene.scales, scene.opacities))
     half = rotation_matrices(quats) * scales[:, None, :]
     return PreparedGaussians(gaussian, scene.means[gaussian], half @ half.transpose(1, 2), opacities)
+
+
+def prepare_gaussians_2d(scene: GaussianScene, dtype: torch.dtype) -> PreparedGaussians2D:
+    """Return the drawable Gaussians with the axes of their planes."""
+    gaussian = scene.drawable.nonzero().squeeze(1)
+    axes = rotation_matrices(scene.quats[gaussian].double())[:, :, :2] * scene.scales[gaussian, None, :2].double()
+    return PreparedGaussians2D(gaussian, scene.means[gaussian], axes, scene.opacities[gaussian].to(dtype))
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
@@ -93,9 +154,7 @@ def project(
     pose = camera.world_to_camera.to(device)
     fx, _, cx, _, fy, cy, *_ = camera.K.double().flatten().tolist()
     width, height = camera.width, camera.height
-    depth = camera_depths(world.means, camera)
-    near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
-    near = near[torch.argsort(depth[near], stable=True)]
+    near = _between_planes(world, camera, settings)
     means, rotation = world.means[near].to(dtype), pose[:3, :3].to(dtype)
     x, y, z = (_camera_axis(means, row) for row in pose[:3])
 
@@ -127,17 +186,62 @@ def project(
         larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
         radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()[:, None].expand(-1, 2)
     u, v = fx * x / z + cx, fy * y / z + cy
-    visible = (det > 0) & (radii.isfinite() & (radii > 0)).all(1)
-    visible &= (u + radii[:, 0] > 0) & (u - radii[:, 0] < width) & (v + radii[:, 1] > 0) & (v - radii[:, 1] < height)
+    means2d = torch.stack([u, v], 1)
     conics = unit[:, None] * (torch.stack([c, -b, a], 1) / det[:, None])
-    visible = (visible & conics.isfinite().all(1)).nonzero().squeeze(1)
+    visible = (det > 0) & _touch_image(means2d, radii, camera) & conics.isfinite().all(1)
+    visible = visible.nonzero().squeeze(1)
     return ProjectedGaussians(
-        world.gaussian[near[visible]],
-        torch.stack([u, v], 1)[visible],
-        conics[visible],
-        opacities[visible],
-        radii[visible],
+        world.gaussian[near[visible]], means2d[visible], conics[visible], opacities[visible], radii[visible]
     )
+
+
+_LEAST_EXTENT = 1e-4
+"""Least square of the half side of a projected ellipse of one standard deviation, in square pixels."""
+
+
+def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
+    """Project the Gaussians of 2D Gaussian Splatting, drop invisible ones, and sort by depth (equal depths by index).
+
+    Computed in float64: the extent in the image is a difference of large numbers.
+
+    Args:
+        world: Gaussians.
+        camera: Camera of the image.
+        settings: Constants of the rasterizer.
+    """
+    near, device = _between_planes(world, camera, settings), world.means.device
+    pose, means = camera.world_to_camera.to(device), world.means[near].double()
+    center = torch.stack([_camera_axis(means, row) for row in pose[:3]], 1)
+    in_camera = torch.cat([pose[:3, :3].double() @ world.axes[near], center[:, :, None]], 2)
+    transforms = camera.K.to(device).double() @ in_camera
+    # {a^2 + b^2 <= 1} projects to an ellipse with this center and these half sides of its bounding box.
+    sign = transforms.new_tensor([1.0, 1.0, -1.0])
+    last = transforms[:, 2:]
+    factor = sign / (sign * last * last).sum(2, keepdim=True)
+    means2d = (factor * transforms[:, :2] * last).sum(2)
+    extents = means2d.square() - (factor * transforms[:, :2].square()).sum(2)
+    radii = (
+        (settings.radius_sigmas * extents.amax(1, keepdim=True).clamp(min=_LEAST_EXTENT).sqrt()).ceil().expand(-1, 2)
+    )
+    visible = _touch_image(means2d, radii, camera).nonzero().squeeze(1)
+    dtype = world.opacities.dtype
+    means2d, transforms, radii = (x[visible].to(dtype) for x in (means2d, transforms, radii))
+    return ProjectedGaussians2D(
+        world.gaussian[near[visible]], means2d, transforms, world.opacities[near[visible]], radii
+    )
+
+
+def _between_planes(world: AnyPrepared, camera: Camera, settings: RasterSettings) -> Int64[Tensor, " m"]:
+    """Return the Gaussians with centers between the near and the far plane, nearest first."""
+    depth = camera_depths(world.means, camera)
+    near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
+    return near[torch.argsort(depth[near], stable=True)]
+
+
+def _touch_image(means2d: Float[Tensor, "m 2"], radii: Float[Tensor, "m 2"], camera: Camera) -> Bool[Tensor, " m"]:
+    """Return whether the rectangles around the centers are finite, not empty, and touch the image."""
+    size = means2d.new_tensor([camera.width, camera.height])
+    return (radii.isfinite() & (radii > 0) & (means2d + radii > 0) & (means2d - radii < size)).all(1)
 
 
 def camera_depths(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, " m"]:
@@ -160,8 +264,8 @@ def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float
     return total + t.to(dtype)
 
 
-def assign_tiles(projected: ProjectedGaussians, width: int, height: int, tile_size: int) -> TileLists:
-    """Return the lists of the Gaussians whose rectangle touches each tile."""
+def assign_tiles(projected: AnyProjected, width: int, height: int, tile_size: int) -> TileLists:
+    """List, for every tile, the Gaussians whose rectangle touches it."""
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     u, v = (projected.means2d / tile_size).unbind(1)
     across, down = (projected.radii / tile_size).unbind(1)
@@ -196,7 +300,7 @@ def compositing_weights(alpha: Float[Tensor, "p k"], min_transmittance: float) -
 
 
 def view_evidence(
-    projected: ProjectedGaussians,
+    projected: AnyProjected,
     tiles: TileLists,
     labels: Int[Tensor, "h w"],
     num_regions: int,
@@ -218,7 +322,7 @@ def view_evidence(
 
 
 def composite(
-    projected: ProjectedGaussians,
+    projected: AnyProjected,
     tiles: TileLists,
     values: Float[Tensor, "m c"],
     width: int,
@@ -235,7 +339,7 @@ def composite(
 
 
 def _tiles(
-    projected: ProjectedGaussians, tiles: TileLists, width: int, height: int, settings: RasterSettings
+    projected: AnyProjected, tiles: TileLists, width: int, height: int, settings: RasterSettings
 ) -> Iterator[tuple[Tensor, tuple[slice, slice], Tensor]]:
     """Yield the K Gaussians, the pixels as slices of the image, and A_ij [pixels, K] of every nonempty tile."""
     size, device, dtype = settings.tile_size, projected.means2d.device, projected.means2d.dtype
@@ -247,13 +351,8 @@ def _tiles(
         member = tiles.indices[start:stop].long()
         top, left = tile // across * size, tile % across * size
         rows, columns = slice(top, min(top + size, height)), slice(left, min(left + size, width))
-        dx = (
-            projected.means2d[member, 0]
-            - (torch.arange(left, columns.stop, device=device).to(dtype) + 0.5)[None, :, None]
-        )
-        dy = projected.means2d[member, 1] - (torch.arange(top, rows.stop, device=device).to(dtype) + 0.5)[:, None, None]
-        a, b, c = projected.conics[member].unbind(1)
-        sigma = (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).flatten(0, 1)  # [P, K]
+        x, y = (torch.arange(side.start, side.stop, device=device).to(dtype) + 0.5 for side in (columns, rows))
+        sigma = projected.exponents(member, x, y).flatten(0, 1)  # [P, K]
         alpha = (projected.opacities[member] * torch.exp(-sigma)).clamp(max=settings.max_alpha)
         alpha = torch.where((sigma >= 0) & (alpha >= settings.min_alpha), alpha, 0.0)
         yield member, (rows, columns), compositing_weights(alpha, settings.min_transmittance)

@@ -282,7 +282,11 @@ def _job(
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
         raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; pass one for a {dtype} scene")
-    return RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
+    job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
+    if job.is_2d and (job.antialiased or job.settings.per_axis):
+        problem = "a scene without antialiasing" if job.antialiased else "the rules of gsplat 1.4"
+        raise InputError(f"2D Gaussians are drawn only as {problem}")
+    return job
 
 
 def _batches(

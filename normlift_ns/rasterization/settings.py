@@ -98,4 +98,8 @@ class RasterSettings:
         >>> RasterSettings.recorded({"gsplat_rules": "1.5"}).per_axis, RasterSettings.recorded({}).per_axis
         (True, False)
         """
-        return RasterSettings.of_gsplat(str(manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])))
+        settings = RasterSettings.of_gsplat(str(manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])))
+        if (planes := manifest.get("clip_planes")) is None:
+            return settings
+        near_plane, far_plane = planes
+        return replace(settings, near_plane=near_plane, far_plane=far_plane)

@@ -15,6 +15,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.kernels import compositing as kernel
 from normlift_ns.kernels.compositing import AlphaLimits, CellGrid, CellLists, build_cell_lists, decode_keys, sum_regions
 from normlift_ns.kernels.projection import ProjectedSplats, ProjectionSettings, project_gaussians
+from normlift_ns.kernels.projection_2dgs import Settings2D, project_gaussians_2d
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -60,11 +61,14 @@ def project_and_bin(
     views = torch.stack(rows).to(scene.means.device)
     width, height = cameras[0].width, cameras[0].height
     grid = _grid(job, cameras[0])
-    projected = project_gaussians(
-        scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height,
-        ProjectionSettings(*(getattr(settings, name) for name in ProjectionSettings._fields)),
-        antialiased=job.antialiased, per_axis=settings.per_axis,
-    )  # fmt: skip
+    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height)
+    if job.is_2d:
+        rules = Settings2D(*(getattr(settings, name) for name in Settings2D._fields))
+        projected = project_gaussians_2d(*inputs, rules)
+    else:
+        rules = ProjectionSettings(*(getattr(settings, name) for name in ProjectionSettings._fields))
+        projected = project_gaussians(*inputs, rules, antialiased=job.antialiased, per_axis=settings.per_axis)
+    cull = cull and not job.is_2d
     return grid, projected, build_cell_lists(projected, len(cameras), grid, settings.min_alpha, cull=cull)
 
 

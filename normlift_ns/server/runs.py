@@ -120,9 +120,7 @@ class ServedRun:
     def drawn_scene(self) -> GaussianScene:
         """Scene of the drawn Gaussians."""
         whole, rows = self.run.scene.gaussians, torch.from_numpy(self.rows)
-        return GaussianScene(
-            *(x.detach().cpu()[rows] for x in (whole.means, whole.quats, whole.scales, whole.opacities))
-        )
+        return whole.to("cpu").select(rows)
 
     @cached_property
     def geometry(self) -> tuple[bytes, str]:
@@ -303,8 +301,7 @@ class ServedRun:
         gray = (own @ own.new_tensor(_GRAY_WEIGHTS) * _GRAY_DIMMING)[:, None].expand_as(own)
         color = torch.where(table[:, 4:] > 0, gray, own)
         color = color + table[:, 3:4] * (table[:, :3] / 255 - color)
-        whole = self.drawn_scene
-        part = GaussianScene(*(x[kept] for x in (whole.means, whole.quats, whole.scales, whole.opacities)))
+        part = self.drawn_scene.select(kept)
         with _render_lock:
             image, alpha = render(part, camera, color.to(part.means), rasterize_mode=scene.rasterize_mode)
         shown = image + (1 - alpha)[:, :, None] * image.new_tensor(list(background))

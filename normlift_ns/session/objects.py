@@ -163,8 +163,7 @@ def unoccluded_viewpoint(
         near &= ~target.mask.cpu()
         own = means[target.mask.cpu()]
         points, margin = torch.cat([points, own[:: 1 + len(own) // _SIGHT_POINTS]]), target.extent / 4
-    parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
-    occluders, best, least = GaussianScene(*parts), first, np.inf
+    occluders, best, least = scene.to("cpu").select(near), first, np.inf
     for position in _candidates(np.asarray(first), np.asarray(target.center), np.asarray(up, float)):
         start = torch.from_numpy(position)
         occlusion = float(np.mean([_occlusion(occluders, start, point, margin) for point in points]))

@@ -70,7 +70,7 @@ def visible_gaussians(
     """
     small = camera.downscaled(_RENDER_SIZE / max(camera.width, camera.height))
     rows = (drawn & scene.drawable).nonzero().squeeze(1)
-    part = GaussianScene(*(x.detach()[rows] for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
+    part = scene.select(rows)
     row, column, depth, inside = small.project(part.means)
     shown, alpha = render(part, small, depth[:, None], rasterize_mode=rasterize_mode)
     surface = (shown[:, :, 0] / alpha.clamp(min=1e-6))[row, column]

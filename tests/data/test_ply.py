@@ -120,7 +120,7 @@ def test_what_is_not_a_splat_is_refused(tmp_path: Path) -> None:
         (lambda c: {**c, **{f"rot_{i}": 0 * c["x"] for i in range(4)}}, "only zero quaternions"),
         (lambda c: {**c, **{f"scale_{i}": np.exp(c[f"scale_{i}"]) for i in range(3)}}, "linear scales"),
         (lambda c: {**c, "opacity": 1 / (1 + np.exp(-c["opacity"]))}, "opacities .between"),
-        (_without("scale_2"), "2D Gaussians"),
+        (_without("scale_1", "scale_2"), "lack scale_1, scale_2"),
         (_without("f_dc_0", "f_dc_1", "f_dc_2"), "spherical harmonics"),
         (lambda c: {name: value[:0] for name, value in c.items()}, "no vertices"),
         (lambda c: {**c, "packed_position": c["x"]}, "compressed PLY file.* element .chunk. has no valid min_x"),

@@ -81,3 +81,45 @@ def compositing_matrix(
                 weights[row, column, j] = alpha * transmittance
                 transmittance *= 1 - alpha
     return weights
+
+
+def compositing_matrix_2d(scene: GaussianScene, camera: Camera) -> np.ndarray:
+    """A [height, width, N] of one view of 2D Gaussians, float64: rays meet planes, by the rules of gsplat 1.4."""
+    K, pose = camera.K.double().numpy(), camera.world_to_camera.double().numpy()
+    width, height = camera.width, camera.height
+    splats = []
+    for j in range(len(scene)):
+        center = pose[:3, :3] @ scene.means[j].double().numpy() + pose[:3, 3]
+        if not bool(scene.drawable[j]) or not NEAR <= center[2] <= FAR:
+            continue
+        axes = (pose[:3, :3] @ _rotation(scene.quats[j].double().tolist()) * scene.scales[j].double().numpy())[:, :2]
+        # The points center + a axes[:, 0] + b axes[:, 1] with a^2 + b^2 = 1 project to a conic with this dual.
+        columns = K @ np.column_stack([axes, center])
+        dual = columns @ np.diag([1, 1, -1]) @ columns.T
+        u, v = dual[0, 2] / dual[2, 2], dual[1, 2] / dual[2, 2]
+        squares = u * u - dual[0, 0] / dual[2, 2], v * v - dual[1, 1] / dual[2, 2]
+        radius = math.ceil(3 * math.sqrt(max(1e-4, *squares)))
+        if u + radius <= 0 or u - radius >= width or v + radius <= 0 or v - radius >= height:
+            continue
+        tiles = [range(math.floor((x - radius) / TILE), math.ceil((x + radius) / TILE)) for x in (u, v)]
+        splats.append((center[2], j, center, axes, u, v, tiles))
+    splats.sort(key=lambda splat: splat[:2])
+    weights = np.zeros((height, width, len(scene)))
+    for row in range(height):
+        for column in range(width):
+            transmittance = 1.0
+            x, y = column + 0.5, row + 0.5
+            ray = np.linalg.solve(K, [x, y, 1.0])
+            for _, j, center, axes, u, v, tiles in splats:
+                if column // TILE not in tiles[0] or row // TILE not in tiles[1]:
+                    continue
+                a, b, _ = np.linalg.solve(np.column_stack([axes, -ray]), -center)  # where the ray meets the plane
+                square = min(a**2 + b**2, 2 * ((x - u) ** 2 + (y - v) ** 2))
+                alpha = min(CAP, float(scene.opacities[j]) * math.exp(-square / 2))
+                if alpha < SKIP:
+                    continue
+                if transmittance * (1 - alpha) <= STOP:
+                    break
+                weights[row, column, j] = alpha * transmittance
+                transmittance *= 1 - alpha
+    return weights

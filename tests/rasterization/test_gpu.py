@@ -52,6 +52,7 @@ class OnGpu:
     """What `check` looks at, of a scene on a GPU."""
 
     means = torch.zeros(1, 3, device="meta")
+    primitive = "3dgs"
 
 
 @pytest.fixture

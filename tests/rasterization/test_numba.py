@@ -18,7 +18,7 @@ from normlift_ns.rasterization import numba as backend
 from normlift_ns.rasterization import numba_kernels as kernels
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.numba_kernels import cached_njit
-from normlift_ns.rasterization.projection import assign_tiles, project
+from normlift_ns.rasterization.projection import assign_tiles
 from tests.random_scenes import dense, generator, orbit_camera, random_labels, random_scene
 
 DTYPES = [torch.float32, torch.float64]
@@ -36,16 +36,17 @@ def shapes_of_all_kinds(n: int, seed: int, dtype: torch.dtype) -> GaussianScene:
 
 def listed(scene: GaussianScene, camera: Camera, dtype: torch.dtype, rules: RasterSettings):
     job = RasterJob(scene, False, rules, dtype)
-    projected = project(job.prepared, camera, rules, antialiased=False)
+    projected = job.project(camera)
     return job, projected, backend._tiles(projected, camera, rules)
 
 
+@pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 @pytest.mark.parametrize(("dtype", "seed"), [(torch.float32, 0), (torch.float64, 1)])
-def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed):
+def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed, primitive):
     camera = orbit_camera(0.4, width=75, height=53)
     labels = random_labels(camera, 6, seed=seed)
     job, projected, (arrays, limits, (_, culled, shapes)) = listed(
-        shapes_of_all_kinds(300, seed, dtype), camera, dtype, SETTINGS
+        replace(shapes_of_all_kinds(300, seed, dtype), primitive=primitive), camera, dtype, SETTINGS
     )
     tiles = assign_tiles(projected, camera.width, camera.height, 16)
     assert len(culled) < 0.9 * len(tiles.indices)
