@@ -165,6 +165,8 @@ def _render(
     view, divisor = small
     camera = replace(view.camera, K=view.camera.K * torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]]))
     as_trained = divisor < _MAX_DIVISOR_AS_TRAINED
+    if gaussians.primitive == "2dgs" and divisor > 1:  # as thin 3D Gaussians, whose blur can be reduced
+        gaussians, as_trained = replace(gaussians, primitive="3dgs"), False
     small_settings = replace(settings, eps2d=settings.eps2d / divisor**2 if as_trained else _SMALL_EPS2D)
     mode = scene.rasterize_mode if as_trained else "antialiased"
     return render_image(scene, camera, settings=small_settings, mode=mode, gaussians=gaussians)

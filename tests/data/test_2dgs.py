@@ -60,7 +60,7 @@ def test_the_primitive_is_that_of_options_settings_or_file_name(tmp_path: Path) 
     assert opened("a_2dgs.ply") == ("3dgs", None)
 
 
-def test_a_lifted_run_stays_2d(trained: Path, tmp_path: Path) -> None:
+def test_a_lifted_run_stays_2d(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     of_run = nl.open_scene(trained)
     path = write_ply(tmp_path / "room_2dgs.ply", ply_columns(SplatParameters(**of_run.parameters)))
     transforms, world = of_run.location.folder / "transforms.json", trained.parent / "dataparser_transforms.json"
@@ -73,6 +73,8 @@ def test_a_lifted_run_stays_2d(trained: Path, tmp_path: Path) -> None:
     assert again.scene.gaussians.primitive == again.field.manifest["primitive"] == "2dgs"
     assert again.field.manifest["clip_planes"] == [0.2, 1e10]
     assert mean_psnr(again.scene) == pytest.approx(mean_psnr(scene), abs=1e-3)
+    monkeypatch.setattr("normlift_ns.data.alignment._MAX_RENDER_SIDE", 30)
+    assert mean_psnr(scene) > 10
     assert again.scene.gaussians.select(slice(5)).to("cpu").primitive == "2dgs"
     selected = again.field.scalars.reliability > 0
     assert len(again.votes.explain(selected).views) > 0  # its evidence is found in the cache
