@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -238,7 +238,8 @@ def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
     depth = torch.stack([_optical_depth(means, opacities, camera) for camera in world.cameras]).median()
     scales = (SHADE / depth).sqrt() * (0.5 + torch.rand(count, 3, generator=g))
     floaters = GaussianScene(means, torch.randn(count, 4, generator=g), scales, opacities)
-    joined = GaussianScene(*(torch.cat([getattr(x, f.name) for x in (scene, floaters)]) for f in fields(scene)))
+    names = ("means", "quats", "scales", "opacities")
+    joined = replace(scene, **{name: torch.cat([getattr(x, name) for x in (scene, floaters)]) for name in names})
     evidence, cells = cell_evidence(joined, world.cameras, world.cells.maps)
     truth = torch.cat([world.truth, torch.full((count,), NO_CLASS)])
     colors = None if world.colors is None else torch.cat([world.colors, torch.full((count, 3), 0.6)])

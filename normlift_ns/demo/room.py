@@ -134,7 +134,8 @@ def build_room(
     upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)  # z axis to normal
     quats /= row_lengths(quats)[:, None]
-    scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
+    means, quats, scales, opacities = (torch.from_numpy(x).float() for x in (means, quats, scales, opacities))
+    scene = GaussianScene(means, quats, scales, opacities)
     names = tuple(dict.fromkeys(part.name for part in parts))  # in the order of the first part of each class
     classes = np.array([*(names.index(part.name) for part in parts), -1])[labels.astype(int)]
     return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)

@@ -62,7 +62,7 @@ def test_a_picture_and_evidence_are_made_of_them(mode, rules, device):
     how = {"rasterize_mode": mode, "settings": RasterSettings.of_gsplat(rules)}
     precisions = [(torch.float32, 3e-6), *([(torch.float64, 1e-12)] if device == "cpu" else [])]
     for dtype, error in precisions:
-        here = GaussianScene(*(part.to(device, dtype) for part in vars(scene).values()))
+        here = GaussianScene(*(getattr(scene, x).to(device, dtype) for x in ("means", "quats", "scales", "opacities")))
         full = matrix(contributors(here, camera, pixels, **how), 80)
         with pytest.warns(UserWarning, match="4 of 80 Gaussians"):
             rows = rasterize_evidence(here, [camera], [labels], num_regions=[4], **how).rows
