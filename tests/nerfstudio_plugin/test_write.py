@@ -132,7 +132,7 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field:
     source = opened(copied)
     run_dir = write(source, field, timestamp="now")
     strange = replace(field, manifest={**field.manifest, "means_fingerprint": "0"})
-    with pytest.raises(ValueError, match=rf" 60 Gaussians .* 60 of .*{CHECKPOINT}"):
+    with pytest.raises(ValueError, match=rf" 60 Gaussians .* 60 .*{CHECKPOINT}"):
         write(source, strange)
 
     path = run_dir / "nerfstudio_models" / CHECKPOINT
