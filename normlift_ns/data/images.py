@@ -266,8 +266,8 @@ class SplitViews:
         expected = self._sizes[index]
         if list(size) != list(expected):
             raise InputError(
-                f"{self.files[index]} is {size[0]} x {size[1]} pixels (width x height), but its camera has "
-                f"{expected[0]} x {expected[1]}. Use the images that the {self._TRAINED} was trained with."
+                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{expected[1]} (width x height). Use the images that the {self._TRAINED} was trained with."
             )
 
     def _read(self, index: int) -> tuple[Any, Any]:

@@ -172,7 +172,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
         found = file_kind(path)
     except (OSError, InputError):
         raise InputError(
-            f"{path}, given with {flags}, exists but is not a readable regular file; give another name"
+            f"{path}, given with {flags}, is not a regular file, or cannot be read; give another name"
         ) from None
     if found != "" and kind is not None and kind != found:
         raise InputError(

@@ -95,7 +95,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
         views = ("--render-views", "0003") if pictures else ()
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 1
-        assert "holds text" in said(capsys) and existing.read_text() == "mine"
+        assert "contains text" in said(capsys) and existing.read_text() == "mine"
         existing.write_text("")
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
         assert existing.stat().st_size > 100
