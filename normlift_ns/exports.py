@@ -394,13 +394,15 @@ def label_cloud(
     """
     if len(means) == 0:
         raise InputError(
-            "the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255); give another run"
+            "The cloud cannot be labeled because all Gaussians are invisible (opacity below 1/255). Give another run."
         )
     means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     spacing = spacing[spacing.isfinite()]
     if len(spacing) == 0:
-        raise InputError("the cloud cannot be labeled: all visible Gaussians are at one position; give another run")
+        raise InputError(
+            "The cloud cannot be labeled because all visible Gaussians are at one position. Give another run."
+        )
     limit = transfer.max_distance * float(spacing.median())
     row, within = nearest_gaussians(vertex_positions(transfer.cloud), means, limit)
     labels = {name: np.where(within, x[row], 0).astype(x.dtype) for name, x in columns.items()}

@@ -297,7 +297,7 @@ class LiftedRun:
         answer, path = _answer_of(part), check_path("path", path)
         if answer is None:
             raise InputError(
-                f"part must be an answer from this run, or its finding for one prompt, got {type(part).__name__}"
+                f"part must be an Answer of this run or a Finding of such an answer, got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
         cloud = check_path("cloud", cloud)
@@ -379,10 +379,10 @@ class LiftedRun:
     def inventory(self, vocabulary: Sequence[str] | None = None, *, meters_per_unit: float | None = None) -> Inventory:
         """List at most 20 objects of the scene without prompts; see `analysis.inventory`.
 
-        An object is named after the best word of the vocabulary if the verdict on that word is "found" and the word
-        selects more than half of the object. Other objects are called "object 1", "object 2" and so on. Unless the
-        encoder is color, the word must also match better than chance, compared with the 200 unrelated words of the
-        encoder or with a vocabulary of at least 100 words.
+        An object is named after the best word of the vocabulary. The word must have the verdict "found" and select more
+        than half of the object. It must also match better than chance, which is estimated from the 200 unrelated words
+        of the encoder, or from a vocabulary of at least 100 words. The color encoder skips this test. Other objects are
+        called "object 1", "object 2" and so on.
 
         Args:
             vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
@@ -492,8 +492,8 @@ class LiftedRun:
         if mask is None or mask.dtype != torch.bool or mask.shape != (len(self.field),):
             actual = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
             raise InputError(
-                f"part must be an answer from this run, its finding for one prompt, or a mask of {len(self.field)} "
-                f"booleans, got {actual}"
+                f"part must be an Answer of this run, a Finding of such an answer, or a mask of "
+                f"{len(self.field)} booleans, got {actual}"
             )
         return mask
 

@@ -572,11 +572,11 @@ class SplatOptions:
     masks: Path | None = None
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | None = None
-    """File with the similarity transform from camera to splat coordinates: a 4 x 4 matrix, or the
+    """File with the similarity transform from the world of the cameras to that of the splat: a 4 x 4 matrix, or the
     dataparser_transforms.json of the run that exported the PLY file. None: the coordinates are the same."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
-    COLMAP project. A PLY file counts as normalized only if its images then match the splat."""
+    COLMAP project. For a PLY file, the transform is used only if renders match the images better with it."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None

@@ -651,7 +651,7 @@ class OpenedCapture(NamedTuple):
 
 
 def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
-    """Open the capture of a request, and time the stages start and open.
+    """Open the capture of a request, and record the seconds of the stages `start` and `open`.
 
     Args:
         start_time: value of `time.perf_counter` at the start of the command.

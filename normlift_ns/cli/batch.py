@@ -1,7 +1,7 @@
 """ns-normlift-batch: lift many captures with one or several workers.
 
-The name of a run in a batch contains a digest of the scene and the options. It therefore shows whether a capture was
-lifted with the same options, and prevents two processes from writing the same run.
+The name of a run in a batch contains a digest of the scene and the options. The same capture and options always give
+the same name, so workers recognize finished runs and skip them.
 """
 
 from __future__ import annotations

@@ -50,15 +50,15 @@ class NormLiftEval(CheckedOptions):
     """Evaluate the directions after the vote. False: evaluate the directions before the vote."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
     """Additional studies, which load all runs into memory. ablation: scores of variants of the refinement, with and
-    without consensus. sweeps: scores for values of each vote parameter around that of the run, and for its default.
-    signals: the share of Gaussians without evidence, accuracy by R and by norm, and a comparison of R with opacity.
-    timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines: scores of ideas
-    of SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without reliable
-    evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
+    without consensus. sweeps: scores for several values of each vote parameter, around the value of the run, and for
+    the default. signals: the share of Gaussians without evidence, accuracy by R and by norm, and a comparison of R with
+    opacity. timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines: scores
+    of ideas of SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
+    reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None
-    """Current path of the dataset, if it was moved. It needs a single run."""
+    """Current path of the dataset, if it was moved. Works only with a single run in --load-config."""
     device: str = "auto"
     """Device for the text encoder and --study: auto, cpu or cuda."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)

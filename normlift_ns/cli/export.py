@@ -44,9 +44,9 @@ class NormLiftExport(options.CheckedOptions):
     prompt selects. clean: all except likely floaters, which are Gaussians floating in front of the cameras."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. Next to it,
-    <name>_rows.npy contains the index of each Gaussian in the run, <name>_names.json the names of class_id and
-    instance_id values, and <name>_objects.json the objects."""
+    """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The
+    command also writes <name>_rows.npy (index of each Gaussian in the run), <name>_names.json (names of class_id and
+    instance_id) and <name>_objects.json (objects)."""
     masks_dir: Path | None = None
     """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
     swaps the values. The masks fit the undistorted images that the scene was trained with."""

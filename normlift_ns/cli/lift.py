@@ -68,7 +68,7 @@ class NormLift(CheckedOptions):
     """Splat file to use instead of --load-config: PLY, compressed PLY, SPZ, .splat, GLB or glTF. Needs --colmap or
     --transforms."""
     load_gsplat: Path | None = None
-    """Checkpoint of gsplat's simple_trainer to use instead of --load-config, ckpt_<step>_rank0.pt. Needs --colmap."""
+    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, to lift in addition. It must also

@@ -105,13 +105,13 @@ class NormLiftQuery(CheckedOptions):
     Lengths are in capture units."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
-    objects.json, objects.csv, and meshes of the boxes, objects.ply and objects_scene.ply. docs/objects.md explains
-    every column."""
+    objects.json and objects.csv, and the meshes objects.ply and objects_scene.ply of the boxes. docs/objects.md
+    explains every column."""
     meters_per_unit: float | None = None
     """Length of one capture unit in meters for --objects, > 0. If given, positions and sizes are in meters."""
     inventory: bool = False
-    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. The
-    name of an object is the word of the vocabulary that matches it, or else a number such as object 3."""
+    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. Each
+    object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
     classes for imagenet and the names of colors for color. Other encoders have no words."""

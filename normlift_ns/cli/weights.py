@@ -207,7 +207,7 @@ def _show(found: dict[str, Path | None]) -> None:
         columns = (weights.user, weights.size, weights.license, weights.origin, "no" if path is None else "yes")
         table.add_row(name, *map(plain_text, columns))
     CONSOLE.print(table)
-    CONSOLE.print(f"Looked in {weights_folder()} and {hub_folder('').parent}", soft_wrap=True)
+    CONSOLE.print(f"Searched folders: {weights_folder()} and {hub_folder('').parent}.", soft_wrap=True)
     info("Fetch weights with: ns-normlift-weights --get imagenet edges")
     info("Sizes on the hub are approximate. For the terms of the training data, add --output-json FILE.")
 

@@ -62,7 +62,7 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
 
     Args:
         scene: Gaussians, cameras and images.
-        settings: constants of the rasterizer at full size; None: those that the scene records.
+        settings: constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.

@@ -100,9 +100,9 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
         invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
         if len(invalid) > 0:
             raise InputError(
-                f"{file} has {len(invalid):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first "
-                f"in row {int(invalid[0])}. Expected finite numbers. Remove those Gaussians, for example from a PLY "
-                f"file with: splat-transform {file.name} --filter-nan clean.ply"
+                f"In {file}, the {name} of {len(invalid):,} of {len(splat):,} Gaussians are NaN or infinite. The first "
+                f"is in row {int(invalid[0])}. Expected finite numbers. For a PLY file, you can remove these Gaussians "
+                f"with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):

@@ -321,8 +321,8 @@ class LangSplat:
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
     """Return whether a map can show the same image at another resolution.
 
-    The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. If they differ
-    by less than 2 %, they must be equal.
+    The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
+    within 2 % of each other must be equal, because a small difference is probably a crop.
 
     >>> sizes = [(606, 1080, 1079, 1921), (1080, 1920, 1079, 1919), (606, 1090, 1079, 1921)]
     >>> tuple(is_same_image(*size) for size in sizes)

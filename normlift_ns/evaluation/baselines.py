@@ -1,4 +1,4 @@
-"""Baselines that lift the scene, regions and features of a run with the ideas of other methods.
+"""Baselines that apply the lifting ideas of other methods to the scene, regions and features of a run.
 
 Each baseline implements only the idea that distinguishes the method from a plain lift. It is not the authors' code.
 """

@@ -558,7 +558,7 @@ def suggest_poses(
 
     @cache
     def accept(view: int) -> bool:
-        """Return True if a view shows a region and most of its pixels are far enough from the camera."""
+        """Return True if a view shows a region and most pixels of the view are far enough from the camera."""
         if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
             return False
         depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()

@@ -58,9 +58,10 @@ class LerfOptions(CheckedOptions):
     """Options of --protocol lerf, which needs one folder of label files per run in --labels."""
 
     masking: Masking = "background"
-    """Conversion of scores to masks. background selects scores above all background words by --margin. auto applies
-    SFS's threshold from the histogram. langsplat thresholds LERF's relevancy of unit features per pixel, as in
-    LangSplat. langsplat_composited does so for composited scores, without normalizing features."""
+    """Conversion of scores to masks. background selects pixels whose score exceeds that of every background word by
+    more than --margin. auto applies SFS's threshold from the histogram. langsplat thresholds LERF's relevancy of unit
+    features per pixel, as in LangSplat. langsplat_composited does so for composited scores, without normalizing
+    features."""
     margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. SFS's
     code uses 0."""
@@ -80,10 +81,10 @@ class MaskOptions(CheckedOptions):
     """Options of --protocol masks, which needs a folder of PNG or NPY instance masks, named like the images."""
 
     names: Path | None = None
-    """JSON file with the name of every mask value (default: labels.json next to the mask folder)."""
+    """JSON file with the name of every mask value. None: labels.json next to the mask folder."""
     purity: float = 0.75
-    """Smallest share of a Gaussian's weight in masks of one class for which it is scored, in 0..1. Larger values score
-    fewer Gaussians."""
+    """Minimum share of a Gaussian's weight that must lie in masks of one class for the Gaussian to be scored, in 0..1.
+    Larger values score fewer Gaussians."""
     min_weight: float = 1.0
     """Smallest weight of a scored Gaussian, in pixels over all training views, >= 0. Larger values score fewer
     Gaussians."""

@@ -1,4 +1,4 @@
-"""Studies of lifted runs, which are ablation, sweeps, signals, timing and baselines."""
+"""Studies of lifted runs: ablation, sweeps, signals, timing and baselines."""
 
 from __future__ import annotations
 

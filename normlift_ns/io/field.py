@@ -51,8 +51,8 @@ class RowArrays(NamedTuple):
         size = self.column.size
         if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
             raise InputError(
-                f"{name}: offsets must rise from 0 to the number of entries, but their ends are {ends} for {size} "
-                f"columns and {self.weight.size} weights"
+                f"{name}: offsets must not decrease, from 0 to the number of entries. The first and last are {ends}, "
+                f"for {size} columns and {self.weight.size} weights."
             )
         low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
         if low < 0 or high >= num_columns:

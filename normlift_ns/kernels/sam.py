@@ -1,6 +1,6 @@
 """Triton kernels for SAM, which measure masks and compute the upscaling of its mask decoder.
 
-Masks are enlarged by linear, separable interpolation of three neighboring logits along each axis. One program measures
+The kernels combine SAM's two bilinear resizes into one separable filter with three taps per axis. One program measures
 some rows of one mask. It keeps three interpolated lines of logits in registers until a row needs other lines.
 """
 

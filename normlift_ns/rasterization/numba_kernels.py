@@ -47,7 +47,7 @@ parallel_kernel = cached_njit(parallel=True)
 def exp(x: float) -> float:
     """Return e ** x for x <= 0 in the precision of x, with an error below 1e-7 (float32) or 4e-16 (float64).
 
-    Results below e ** -87 (float32) or e ** -700 (float64) are raised to this value.
+    Results are clamped from below to e ** -87 (float32) or e ** -700 (float64).
     """
     return math.exp(x)
 

@@ -38,7 +38,7 @@ class PromptDiagnostics:
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return diagnostics of the first `max_prompts` prompts that select; () if the selection was made by hand."""
+    """Return diagnostics of the first `max_prompts` prompts that select Gaussians, or () for a selection by hand."""
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
