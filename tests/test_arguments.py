@@ -139,7 +139,6 @@ def is_array(kinds: str, axes: list[str], value: Any) -> bool:
 
 
 def is_kind(kind: str, value: Any) -> bool:
-    """Whether a value is of a kind of the table."""
     word, *axes = kind.split()
     if word in ("None", "function"):
         return value is {"None": None, "function": print}[word]

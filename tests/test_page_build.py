@@ -32,7 +32,6 @@ def backend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 
 
 def programs(folder: Path, version: str, result: str = "") -> Path:
-    """Puts a node and an npm into the only folder of PATH, and returns the file with npm's arguments."""
     (folder / "bin").mkdir(exist_ok=True)
     texts = {
         "node": f"#!/bin/sh\necho {version}\n",

@@ -38,7 +38,6 @@ OTHERS |= {"--keep-crs"}  # OpenSplat
 
 
 def python_of(text: str) -> list[str]:
-    """The blocks of Python in a page."""
     return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
 
 
@@ -81,7 +80,6 @@ def test_the_lift_of_bare_tensors_runs(capsys):
 
 
 def commands(text: str) -> list[list[str]]:
-    """The indented command lines of ours in a page, as words."""
     lines = re.sub(r"\\\n +", "", text)
     found = re.findall(r"^    (ns-(?:normlift|train normlift).*)$", lines, flags=re.MULTILINE)
     return [shlex.split(line, comments=True) for line in found]

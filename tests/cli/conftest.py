@@ -28,7 +28,6 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    """Exit code of a command."""
     monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
     try:
         entrypoint()

@@ -16,7 +16,6 @@ from tests.cli.conftest import run_entry, said
 
 @pytest.fixture
 def asked() -> list[str]:
-    """Texts that the network is asked for, image after image."""
     return []
 
 
@@ -37,7 +36,6 @@ def weights(tmp_path, monkeypatch, asked) -> Path:
 
 @pytest.fixture
 def segmented(own: Path, weights: Path) -> tuple[object, ...]:
-    """Flags with the lifted run of `own` and the network."""
     lifted = own.parents[2] / "normlift" / "t" / "config.yml"
     return ("--load-config", lifted, "--segment", "sam3", "--segment-model", weights, "--segment-views", 4)
 

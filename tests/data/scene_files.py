@@ -58,7 +58,6 @@ def write_ply(
 
 
 def write_gsplat(path: Path, splat: SplatParameters, *, step: int = 29999, **more: object) -> Path:
-    """As gsplat's simple_trainer saves it."""
     splats = {"means": splat.means, "quats": splat.quats, "scales": splat.scales, "opacities": splat.opacities[:, 0]}
     splats |= {"sh0": splat.features_dc[:, None], "shN": splat.features_rest}
     torch.save({"step": step, "splats": splats, **more}, path)
@@ -66,7 +65,6 @@ def write_gsplat(path: Path, splat: SplatParameters, *, step: int = 29999, **mor
 
 
 def saved_run(folder: Path, scene: SplatScene) -> Path:
-    """The files of a scene in the folder of its run."""
     content = splatfacto_checkpoint(scene)
     (folder / "nerfstudio_models").mkdir(parents=True)
     torch.save(content, folder / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")

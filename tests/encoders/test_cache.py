@@ -178,7 +178,6 @@ def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
 
 
 def in_eights(encoder: OpenClipEncoder, folder: Path) -> tuple[RegionFeatures, list[int]]:
-    """A source with batches of eight crops, and the number of crops of every call of its network."""
     copy, sizes = replace(encoder), []
 
     def counted(crops):

@@ -37,7 +37,6 @@ T = 7
 
 
 def npy(descr: str, shape: tuple[int, ...], data: bytes) -> bytes:
-    """An NPY file of version 1.0."""
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
     header += " " * (-(len(header) + 11) % 64) + "\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode("latin1") + data

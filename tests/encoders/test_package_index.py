@@ -43,8 +43,6 @@ TINY = described(WHEEL)
 
 
 class Index:
-    """A server of pages by path, which records requests."""
-
     def __init__(self) -> None:
         self.pages: dict[str, bytes] = {}
         self.asked: list[tuple[str, str | None]] = []
@@ -189,8 +187,6 @@ def test_pip_downloads_from_the_index_without_running_anything(
 
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, list[dict]]]:
-    """Runs ns-normlift-weights; its exit code and its JSON."""
-
     def run(*words: str) -> tuple[int, list[dict]]:
         file = tmp_path / "weights.json"
         file.unlink(missing_ok=True)

@@ -22,7 +22,6 @@ STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
 
 @pytest.fixture(params=["lifted", "trained"])
 def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """config.yml of a copy of an old run, which may be changed."""
     shutil.copytree(Path(__file__).with_name("version_0_1"), tmp_path / "old")
     return tmp_path / "old" / "runs" / "scene" / "normlift" / request.param / "config.yml"
 
