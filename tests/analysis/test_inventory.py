@@ -107,17 +107,3 @@ def test_command_writes_a_list_and_a_picture(
     words.write_text("fork\nred\nknife\n", encoding="utf8")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", True) == 1
     assert "2 of the 3 words" in (message := said(capsys)) and "fork, knife" in message
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (("--inventory", "--text", "red"), "cannot be combined"),
-        (("--text", "red", "--image", "a.png"), "--inventory"),
-        (("--inventory", "--vocabulary", "none.txt"), "does not exist"),
-        (("--inventory", "--save-query"), "--text only"),
-    ],
-)
-def test_options_that_do_not_fit(flags, message, lifted: Path, monkeypatch, capsys) -> None:
-    assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, *flags) == 1
-    assert message in said(capsys)

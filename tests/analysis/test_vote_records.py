@@ -29,7 +29,6 @@ def run(request, trained: Path, made_once) -> nl.LiftedRun:
 
 
 def test_the_votes_are_those_of_the_lift(run: nl.LiftedRun) -> None:
-    """Every scalar of some Gaussians comes out again."""
     seen = (run.field.scalars.norm > 0).nonzero().squeeze(1)
     for j in seen[:: len(seen) // 8].tolist():
         mask = torch.zeros(len(run.field), dtype=torch.bool)

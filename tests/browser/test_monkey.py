@@ -132,7 +132,6 @@ class Monkey:
         assert not self.problems, f"seed {SEED}, after\n{last}\n" + "\n".join(self.problems[:5])
 
     def kill(self) -> None:
-        """Kills the server and starts it again."""
         self.killed = True
         self.server.kill()
         self.server.start(MALLOC_ARENA_MAX="1")
@@ -168,7 +167,6 @@ class Monkey:
         self.check()
 
     def press(self, person: OnPage | Tab) -> str | None:
-        """Clicks somewhere on any element."""
         box = person.page.evaluate(_FIND, [PRESSED, self.chance.random()])
         if box is None:
             return None
@@ -222,7 +220,6 @@ class Monkey:
         return key
 
     def renew(self, person: OnPage | Tab) -> str:
-        """Reloads the page, or closes its browser and opens another one."""
         if self.chance.random() < 0.5:
             person.page.reload(wait_until="domcontentloaded")
             return "reload"

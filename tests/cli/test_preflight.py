@@ -81,10 +81,7 @@ LIFT = [
     (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
     ("--consensus False --consensus-power 2", "--consensus-power has no effect without --consensus True"),
     ("--consensus False --consensus-sample 9", "--consensus-sample has no effect without --consensus True"),
-    (
-        "--consensus False --consensus-min-agreement 0",
-        "--consensus-min-agreement has no effect without --consensus True",
-    ),
+    ("--consensus False --consensus-min-agreement 0", "--consensus-min-agreement has no effect without --consensus"),
     ("--vote paper --vote-prior 2", "--vote-prior has no effect without --vote posterior"),
     ("--consensus-power 2 --vote posterior --vote-prior 2 --queries oragne", "oragne"),
 ]
@@ -132,6 +129,10 @@ QUERY = [
     ("--stdin --interactive True", "--stdin", "--interactive"),
     ("--stdin --output-json a.json", "--output-json", "--text", "--stdin"),
     ("--interactive --save-query", "--save-query", "--text", "--interactive"),
+    ("--inventory --text red", "cannot be combined"),
+    ("--text red --image a.png", "--inventory"),
+    ("--inventory --vocabulary none.txt", "does not exist"),
+    ("--inventory --save-query", "--text only"),
 ]
 EXPORT = [
     ("--select selection", "--select selection", "--text"),
