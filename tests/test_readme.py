@@ -192,7 +192,7 @@ def test_the_site_builds_with_examples_as_code_and_loads_nothing_from_elsewhere(
 OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b|\[config\]")
 
 
-@pytest.mark.parametrize("opens_a_run", [False, True])
+@pytest.mark.parametrize("opens_a_run", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_examples(opens_a_run, request, tmp_path, monkeypatch):
     names = {}
     if opens_a_run:  # examples read the run `config` and write to `folder`

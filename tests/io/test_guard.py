@@ -130,6 +130,10 @@ def test_no_output_replaces_a_part_of_a_run_a_data_set_or_a_cache(markers: tuple
                     pytest.fail("nothing is computed")
         direct.unlink()
         assert (home / name).read_bytes() == CONTENT.get(f"a{Path(name).suffix}", b"")
+    for name in set(OWNED[markers]) - {*markers} if markers[0].startswith(("config", "cfg")) else ():
+        (home / name).unlink()  # nor does an output become a part of a run
+        with pytest.raises(InputError, match="part of the run"):
+            refuse_existing(home / name, overwrite=True, flags="--flag")
     for name in ("answers.json", "exports/a.ply", ".cache/new.json"):
         refuse_existing(home / name, overwrite=True, flags="--flag")
     with pytest.raises(InputError, match="part of the"):

@@ -165,7 +165,7 @@ def with_held_out(parser: dict[str, Any], lists: bool) -> dict[str, Any]:
     return {**parser, "train_split_fraction": 0.8} if everything else parser
 
 
-@examples(12)
+@examples(8)
 @given(
     parser=st.fixed_dictionaries(WORLD),
     seed=st.integers(0, 2**32 - 1),
@@ -217,7 +217,7 @@ def test_data_sets_with_transforms(
         assert_equal(config_classes.FullImageDatamanagerConfig(data=folder, **how), folder)
 
 
-@examples(8)
+@examples(6)
 @given(
     parser=st.fixed_dictionaries(WORLD),
     seed=st.integers(0, 2**32 - 1),
