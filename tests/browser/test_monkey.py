@@ -238,9 +238,7 @@ def our_faults(server: Server, kind: type) -> list[str]:
 
 
 @pytest.mark.parametrize(("program", "kind"), [(OWN, OnPage), (STOCK, Tab)], ids=["own", "stock"])
-def test_nothing_breaks_and_nothing_grows(
-    program: str, kind: type, lifted: Path, browser: Browser, tmp_path: Path
-) -> None:
+def test_nothing_breaks_and_nothing_grows(program, kind, lifted: Path, browser: Browser, tmp_path: Path) -> None:
     server = Serving(ASKED + program, copied(lifted, tmp_path), tmp_path / "log", cwd=tmp_path)
     print(f"\n{kind.__name__}: seed {SEED}, {MINUTES:g} minutes")
     try:

@@ -49,9 +49,7 @@ class Command:
 
 
 @pytest.fixture
-def ended(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., tuple[int, str, str]]:
+def ended(monkeypatch, capsys, tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
     """Runs a command in this process, whose main is a function of --word: exit code, output and errors.
 
     Logs are in the folder state of tmp_path.

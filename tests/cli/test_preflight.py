@@ -214,9 +214,7 @@ def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, 
         assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "with --data" in shown
 
 
-def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_early(
-    config, tmp_path, monkeypatch, capsys
-):
+def test_a_cache_that_is_a_file_or_a_locked_folder_is_refused_early(config, tmp_path, monkeypatch, capsys):
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)

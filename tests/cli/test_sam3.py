@@ -58,9 +58,7 @@ def test_sam3_answers_beside_the_run(segmented, tmp_path, monkeypatch, capsys) -
     assert float((share > 0.5).mean()) == pytest.approx(found["fraction"])
 
 
-def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
-    own: Path, segmented, weights: Path, asked: list[str], tmp_path, monkeypatch, capsys
-) -> None:
+def test_what_was_found_before_is_kept(own, segmented, weights, asked, tmp_path, monkeypatch, capsys) -> None:
     table, kept = tmp_path / "table.json", own.parents[2] / "normlift" / ".cache" / "masks"
 
     def ask(*more: str) -> dict:

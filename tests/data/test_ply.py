@@ -129,6 +129,9 @@ def test_what_is_not_a_splat_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message) as caught:
             read_ply(path)
         assert str(path) in str(caught.value)
+    path.write_bytes(write_ply(path, ply_columns(random_splat())).read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"scene\.ply is truncated or damaged"):
+        read_ply(path)
 
 
 def test_scenes_measured_in_millimetres_and_infinite_logits_are_read(tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ def test_lists_of_names_say_what_is_held_out(tmp_path: Path) -> None:
     assert read_transforms(capture(tmp_path, {**INTRINSICS, **split})).held_out == {"images/b.png"}
     only = read_transforms(capture(tmp_path, {**INTRINSICS, "test_filenames": ["images/a.png"]}))
     assert only.held_out == {"images/a.png"}
+    assert only.frames[0].intrinsics[:6] == (50, 51, 20.5, 14.5, 40, 30)
     with pytest.raises(InputError, match=r"train_filenames .*images/c.png"):
         read_transforms(capture(tmp_path, {**INTRINSICS, "train_filenames": ["images/a.png", "images/c.png"]}))
 

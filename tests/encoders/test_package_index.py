@@ -166,9 +166,7 @@ def test_addresses_come_from_the_settings_of_pip_and_uv(index: Index, monkeypatc
 
 
 @pytest.mark.slow
-def test_pip_downloads_from_the_index_without_running_anything(
-    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pip_downloads_from_the_index_without_running_anything(index: Index, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
     pytest.importorskip("pip")
     metadata = b"Metadata-Version: 2.1\nName: Tiny.weights\nVersion: 1.0\nRequires-Dist: nothing-of-that-name\n"

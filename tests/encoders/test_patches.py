@@ -47,6 +47,9 @@ def test_features_are_the_tokens_of_the_scaled_image(clip):
     torch.testing.assert_close(view.features, torch.nn.functional.normalize(tokens, dim=1), rtol=0, atol=1e-5)
     y, x = torch.meshgrid(torch.arange(48) // 16, torch.arange(80) // 16, indexing="ij")
     assert torch.equal(view.labels, (5 * y + x).int())
+    others = (PatchFeatures(clip, 16), PatchFeatures(replace(clip, fill="white"), 15))
+    assert all(other.identity != PatchFeatures(clip, 15).identity for other in others)
+    refused(lambda: others[0].view(IMAGE.float(), "a.jpg"), "a.jpg", "uint8")
 
 
 def test_patches_keep_the_shape_of_the_image(clip):

@@ -122,14 +122,7 @@ def lifted_field(run: NerfstudioScene) -> SemanticField:
     return SemanticField.build(lifted, run.gaussians.means, storage="float16", tolerance=1e-2)
 
 
-def write(
-    scene: NerfstudioScene,
-    field: SemanticField,
-    *,
-    output_dir: Path | None = None,
-    timestamp: str | None = None,
-    **rest: Any,
-) -> Path:
+def write(scene: NerfstudioScene, field: SemanticField, *, output_dir=None, timestamp=None, **rest: Any) -> Path:
     run_dir = run_directory(output_dir or scene.runs_dir, scene.name, timestamp)
     write_run(scene, field, run_dir, **rest)
     return run_dir

@@ -42,9 +42,7 @@ def test_a_lifted_run_is_its_source_with_another_model(copied: Path, field: Sema
     assert question is not None and question.texts == ("a",)
 
 
-def test_it_is_read_and_can_be_lifted_again(
-    copied: Path, field: SemanticField, tmp_path: Path, registered: None
-) -> None:
+def test_it_is_read_and_can_be_lifted_again(copied: Path, field: SemanticField, tmp_path: Path, registered) -> None:
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
 
     source = opened(copied)
