@@ -37,6 +37,7 @@ def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     return score
 
 
+@pytest.mark.slow
 def test_coverage_needs_no_truth(little_lifted, tmp_path, monkeypatch, capsys):
     flags = ("--load-config", little_lifted, "--study", "coverage", "--output-path", tmp_path / "next.json")
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0

@@ -58,6 +58,7 @@ def test_sam3_answers_beside_the_run(segmented, tmp_path, monkeypatch, capsys) -
     assert float((share > 0.5).mean()) == pytest.approx(found["fraction"])
 
 
+@pytest.mark.slow
 def test_what_was_found_before_is_kept(own, segmented, weights, asked, tmp_path, monkeypatch, capsys) -> None:
     table, kept = tmp_path / "table.json", own.parents[2] / "normlift" / ".cache" / "masks"
 
