@@ -20,11 +20,10 @@ KERNELS = import torch; from normlift_ns.rasterization.numba import compile_kern
 	$(BIN)/python -W ignore -c "$(KERNELS)"
 	touch $@
 
+STYLE := $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/codespell && $(BIN)/python -m tests.prose
+
 style: .venv/installed
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/codespell
-	$(BIN)/python -m tests.prose
+	$(STYLE)
 
 lint: style
 	$(BIN)/basedpyright
@@ -41,11 +40,11 @@ QUICK := $(patsubst %,tests/core/test_%.py,lift relevancy neighbors gaussians me
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow and not extra" $(QUICK) tests/test_imports.py
 
-# Types of the package are checked while its tests run; make lint checks those of the benchmarks too
-test: style
-	@$(BIN)/basedpyright normlift_ns > .venv/types.log & types=$$!; \
+# Style and types of the package are checked while its tests run; make lint checks the types of the benchmarks too
+test: .venv/installed
+	@{ $(STYLE) && $(BIN)/basedpyright normlift_ns; } > .venv/checks.log 2>&1 & checks=$$!; \
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow and not extra" --ignore=tests/browser --ignore=tests/torture; tests=$$?; \
-	wait $$types; types=$$?; cat .venv/types.log; exit $$((tests + types))
+	wait $$checks; checks=$$?; cat .venv/checks.log; exit $$((tests + checks))
 
 # A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time
 test-slow: .venv/installed

@@ -36,7 +36,7 @@ ALLOWED = {
 
 def texts(source: str) -> Iterator[tuple[int, str, str]]:
     """Yield the line, kind (docstring, string, name or comment) and text of everything that people read in a module."""
-    seen = set[int]()
+    seen, names = set[int](), dict[str, int]()
     for node in ast.walk(ast.parse(source)):
         line = getattr(node, "lineno", 1)
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
@@ -47,12 +47,15 @@ def texts(source: str) -> Iterator[tuple[int, str, str]]:
             yield line, "string", "".join(str(x.value) if isinstance(x, ast.Constant) else "{}" for x in node.values)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in seen:
             yield line, "string", node.value if " " in node.value else f'"{node.value}"'
-        for name in {getattr(node, kind, None) for kind in ("name", "id", "arg", "attr", "asname")}:
-            if isinstance(name, str):
-                yield line, "name", name
+    comments = re.findall(r"# *(.*)", source)
+    if not (BRITISH.search(source) or any(IS_NO.search(x) or WHERE.search(x) for x in comments)):
+        return  # tokens take most of the time
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield token.start[0], "comment", token.string.lstrip("# ")
+        elif token.type == tokenize.NAME:
+            names.setdefault(token.string, token.start[0])
+    yield from ((line, "name", name) for name, line in names.items())
 
 
 def problems(source: str) -> Iterator[tuple[int, str]]:

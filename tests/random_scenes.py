@@ -93,8 +93,6 @@ def same_evidence(a: Evidence, b: Evidence) -> bool:
 
 @dataclass
 class Photographs:
-    """Images of noise from cameras."""
-
     names: Sequence[str]
     cameras: Sequence[Camera]
     seeds: Sequence[int] = range(99)

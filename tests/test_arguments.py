@@ -139,7 +139,6 @@ def is_array(kinds: str, axes: list[str], value: Any) -> bool:
 
 
 def is_kind(kind: str, value: Any) -> bool:
-    """Whether a value is of a kind of the table."""
     word, *axes = kind.split()
     if word in ("None", "function"):
         return value is {"None": None, "function": print}[word]
@@ -198,9 +197,8 @@ def test_paths_of_no_file_and_tensors_that_are_no_arrays_are_refused_by_name(tmp
     others = [row(nl.SplatOptions, "colmap path"), row(nl.SourceOptions, "regions_dir path")]
     for function, kinds, needed in (*TABLE, *others):
         for name, kind in kinds.items():
-            for wrong in {"path": paths, "float": tensors, "whole": tensors[: 4 * (" " in kind)]}.get(
-                kind.partition("|")[0].split()[0], ()
-            ):
+            wrongs = {"path": paths, "float": tensors, "whole": tensors[: 4 * (" " in kind)]}
+            for wrong in wrongs.get(kind.partition("|")[0].split()[0], ()):
                 with pytest.raises(nl.InputError, match=name):
                     function(**{**dict(zip(kinds, needed)), name: wrong})
     for write, wrong in ((FIELD.save, tmp_path / "file"), (EVIDENCE.save, tmp_path)):

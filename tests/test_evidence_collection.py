@@ -90,17 +90,13 @@ def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path:
     assert same_evidence(found, expected)
 
 
-def evidence_of(
-    shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba", cells: int = 2
-) -> torch.Tensor:
+def evidence_of(shift: int, folder: Path, rules="1.4", backend: BackendName = "numba", cells=2) -> torch.Tensor:
     """Of one view of two regions, whose border is somewhere else for every shift, and cells without a pixel."""
     camera, done = orbit_camera(0.0), []
     labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
     block = ViewBatch([camera], [labels], [torch.arange(cells).int()[None]], [torch.eye(cells)])
-    found = batch_evidence(
-        random_scene(30, dtype=torch.float32), block, folder,
-        RasterConfig(rules, backend, torch.float32, "classic", 1), reuse=True, on_view=lambda: done.append(1),
-    )  # fmt: skip
+    config, scene = RasterConfig(rules, backend, torch.float32, "classic", 1), random_scene(30, dtype=torch.float32)
+    found = batch_evidence(scene, block, folder, config, reuse=True, on_view=lambda: done.append(1))
     assert done == [1]
     return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])
 

@@ -108,16 +108,8 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     stored = opened.ask_stored()
     assert stored is not None and stored.texts == ("red",)
     assert opened.field.manifest["features"]["kind"] == "given"
-    (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
-    flags = (
-        "--load-config",
-        tmp_path / "moved" / "config.yml",
-        "--text",
-        "red",
-        "file",
-        "--output-json",
-        tmp_path / "a.json",
-    )
+    moved = (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
+    flags = ("--load-config", moved / "config.yml", "--text", "red", "file", "--output-json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
@@ -285,7 +277,6 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: Path, monkeypatch) -> None:
-    """Check, evidence, pictures, scores and another lift of the lifted run."""
     drawn: list[nl.RasterSettings] = []
 
     def recording(backend: str, job: RasterJob, **how: Any) -> Any:

@@ -118,7 +118,7 @@ def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their
         RefineConfig(sigma_d=math.nan)
     with (
         named_as_flags(),
-        pytest.raises(InputError, match=r"^--vote-sigma-d must be positive, at least 1e-06, got nan$"),
+        pytest.raises(InputError, match=r"^--vote-sigma-d must be positive, at least 1e-06, got nan"),
     ):
         RefineConfig(sigma_d=math.nan)
     with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):

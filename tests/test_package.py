@@ -29,7 +29,6 @@ def run(*command: object, cwd: Path, **kwargs) -> str:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, Path]:
-    """The wheel, which is built from what the sdist holds, and the sdist; with the setuptools of this environment."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
     (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
@@ -100,7 +99,6 @@ def check_installed(python: Path, folder: Path) -> None:
 
 @pytest.mark.slow
 def test_the_wheel_imports_beside_the_packages_of_this_environment(built, tmp_path):
-    """Our own files are those of the wheel, whatever is installed here."""
     python = tmp_path / "v" / "bin" / "python"
     run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "v", cwd=tmp_path)
     (packages,) = (tmp_path / "v").glob("lib/python*/site-packages")

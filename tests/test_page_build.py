@@ -32,7 +32,6 @@ def backend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 
 
 def programs(folder: Path, version: str, result: str = "") -> Path:
-    """Puts a node and an npm into the only folder of PATH, and returns the file with npm's arguments."""
     (folder / "bin").mkdir(exist_ok=True)
     texts = {
         "node": f"#!/bin/sh\necho {version}\n",
@@ -50,9 +49,7 @@ def asks_for_node(backend: ModuleType) -> bool:
     return asked
 
 
-def test_node_is_asked_for_only_where_it_is_needed(
-    backend: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_node_is_asked_for_only_where_it_is_needed(backend: ModuleType, tmp_path: Path, monkeypatch) -> None:
     assert asks_for_node(backend)
     monkeypatch.setenv("NORMLIFT_NO_PAGE", "1")
     assert not asks_for_node(backend)
@@ -78,13 +75,7 @@ def test_an_unchanged_page_is_not_built_again(backend: ModuleType, tmp_path: Pat
 
 
 @pytest.mark.parametrize("version", ["", "v24.0.0"])
-def test_without_node_or_registry_the_build_goes_on(
-    backend: ModuleType,
-    tmp_path: Path,
-    version: str,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_node_or_registry_the_build_goes_on(backend, tmp_path, version: str, capfd, monkeypatch) -> None:
     if version:
         programs(tmp_path, version, "echo no registry >&2; exit 1")
     built = []

@@ -244,7 +244,6 @@ def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
 
 
 def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
-    """A stage that counts its own steps starts at none and ends with all of them."""
     monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 10)
     told: list[tuple[str, int, int]] = []
     made, given = scene("a.png"), nl.LiftOptions(refine=True, vote=nl.RefineConfig(k=4))
@@ -325,7 +324,6 @@ def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.
 
 
 def test_levels_agree_each_for_itself(tmp_path: Path) -> None:
-    """Two levels at once: wholes and halves of the same pixels are not compared."""
     rows = torch.nn.functional.normalize(torch.rand(3, 4, generator=generator(1)), dim=1)
 
     class Both:

@@ -28,7 +28,6 @@ def test_the_short_list_is_that_of_the_page_and_of_the_project():
 
 
 def typed(folder: Path, *words: object) -> str:
-    """What a command prints that must succeed."""
     done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -38,7 +38,6 @@ OTHERS |= {"--keep-crs"}  # OpenSplat
 
 
 def python_of(text: str) -> list[str]:
-    """The blocks of Python in a page."""
     return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
 
 
@@ -81,7 +80,6 @@ def test_the_lift_of_bare_tensors_runs(capsys):
 
 
 def commands(text: str) -> list[list[str]]:
-    """The indented command lines of ours in a page, as words."""
     lines = re.sub(r"\\\n +", "", text)
     found = re.findall(r"^    (ns-(?:normlift|train normlift).*)$", lines, flags=re.MULTILINE)
     return [shlex.split(line, comments=True) for line in found]
@@ -194,7 +192,7 @@ def test_the_site_builds_with_examples_as_code_and_loads_nothing_from_elsewhere(
 OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b|\[config\]")
 
 
-@pytest.mark.parametrize("opens_a_run", [False, True])
+@pytest.mark.parametrize("opens_a_run", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_examples(opens_a_run, request, tmp_path, monkeypatch):
     names = {}
     if opens_a_run:  # examples read the run `config` and write to `folder`

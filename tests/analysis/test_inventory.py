@@ -90,9 +90,7 @@ def test_things_of_a_room_are_listed_with_boxes_and_names(inventory: Inventory, 
     assert 0 < max(inventory.catalog.objects[best - 1].capture.box.size) < 2
 
 
-def test_command_writes_a_list_and_a_picture(
-    inventory: Inventory, lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_command_writes_a_list_and_a_picture(inventory, lifted, tmp_path, monkeypatch, capsys) -> None:
     words, picture, table = tmp_path / "words.txt", tmp_path / "room.png", tmp_path / "room.json"
     words.write_text("black\n\n yellow \nred\n", encoding="utf8")
     flags = ("--load-config", lifted, "--inventory", "--vocabulary", words, "--image", picture, "--output-json", table)
@@ -107,17 +105,3 @@ def test_command_writes_a_list_and_a_picture(
     words.write_text("fork\nred\nknife\n", encoding="utf8")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", True) == 1
     assert "2 of the 3 words" in (message := said(capsys)) and "fork, knife" in message
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (("--inventory", "--text", "red"), "cannot be combined"),
-        (("--text", "red", "--image", "a.png"), "--inventory"),
-        (("--inventory", "--vocabulary", "none.txt"), "does not exist"),
-        (("--inventory", "--save-query"), "--save-query"),
-    ],
-)
-def test_options_that_do_not_fit(flags, message, lifted: Path, monkeypatch, capsys) -> None:
-    assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, *flags) == 1
-    assert message in said(capsys)

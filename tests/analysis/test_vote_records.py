@@ -29,7 +29,6 @@ def run(request, trained: Path, made_once) -> nl.LiftedRun:
 
 
 def test_the_votes_are_those_of_the_lift(run: nl.LiftedRun) -> None:
-    """Every scalar of some Gaussians comes out again."""
     seen = (run.field.scalars.norm > 0).nonzero().squeeze(1)
     for j in seen[:: len(seen) // 8].tolist():
         mask = torch.zeros(len(run.field), dtype=torch.bool)
@@ -79,9 +78,7 @@ def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Pa
         votes.explain(mask)
 
 
-def test_photographs_that_are_gone_replaced_or_unknown_are_named(
-    run: nl.LiftedRun, trained: Path, tmp_path: Path
-) -> None:
+def test_photographs_that_are_gone_replaced_or_unknown_are_named(run, trained: Path, tmp_path: Path) -> None:
     names = run.field.manifest["views_lifted"]
     for told, message in ((None, "older version"), ([1], "older version"), ([*names, "x.png"], r"1 of 7 .*x\.png")):
         other = replace(run.field, manifest={**run.field.manifest, "views_lifted": told})

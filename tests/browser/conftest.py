@@ -62,7 +62,6 @@ def as_stored(server: Server) -> Iterator[Server]:
 
 @pytest.fixture
 def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
-    """A fresh tab before nerfstudio's viewer."""
     tab = Tab(browser, stock.address)
     tab.fresh()
     yield tab
@@ -71,6 +70,5 @@ def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
 
 @pytest.fixture
 def page(own: Server, browser: Browser) -> Iterator[OnPage]:
-    """A fresh tab before our own page."""
     yield (page := OnPage(browser, own.address))
     page.leave()

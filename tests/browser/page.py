@@ -73,7 +73,6 @@ class OnPage(Person):
         self.page.on("request", lambda one: None if one.url.startswith(local) else self.problems.append(one.url))
 
     def ready(self) -> None:
-        """Waits until the scene is drawn."""
         self.until(lambda: self.page.evaluate("window.page?.state?.details ?? false"), "a state")
         self.page.add_style_tag(content=_BARE)
         self.calm()
@@ -91,7 +90,6 @@ class OnPage(Person):
         self.button(name).first.click()
 
     def does(self, element: str) -> None:
-        """Presses a button by its id."""
         self.page.locator(f"#{element}").click()
 
     @property
@@ -109,7 +107,6 @@ class OnPage(Person):
         return self.page.locator("#answers .chip").all_inner_texts()
 
     def changes(self, act: Callable[[], Any], what: str) -> int:
-        """Number of selected Gaussians after something that changes it."""
         before = self.selected()
         act()
         return self.selects(lambda count: count != before, what)
@@ -150,14 +147,12 @@ class OnPage(Person):
         return shots[-1]
 
     def save(self, element: str, folder: Path) -> Path:
-        """The file that a button downloads."""
         with self.page.expect_download() as waiting:
             self.does(element)
         waiting.value.save_as(folder / waiting.value.suggested_filename)
         return folder / waiting.value.suggested_filename
 
     def toast(self) -> tuple[str, dict[str, float]]:
-        """Text and box of the latest toast."""
         toast = self.page.locator(".toast").last
         toast.wait_for()
         return toast.inner_text(), toast.bounding_box() or {}  # type: ignore[return-value]

@@ -88,7 +88,6 @@ _SHARPNESS = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*\w+\)")
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A headless Chromium that draws in software."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -205,7 +204,6 @@ class Person:
         self.says(ARMED)
 
     def save(self, button: str, folder: Path) -> Path:
-        """The file that a button downloads."""
         with self.page.expect_download() as waiting:
             self.press(button)
         waiting.value.save_as(folder / waiting.value.suggested_filename)
@@ -225,7 +223,6 @@ class Person:
         return self.page.evaluate(f"{some}.filter((image) => image.complete && image.naturalWidth > 0).length")
 
     def until(self, true: Callable[[], Any], what: str) -> None:
-        """Waits until something holds of the page."""
         deadline = time.monotonic() + PATIENCE
         while not true():
             assert time.monotonic() < deadline, f"{what}: never; the page says {self.text()[:900]}"
@@ -243,7 +240,6 @@ class Person:
         return found[-1]
 
     def says(self, pattern: str) -> None:
-        """Waits until the page says something."""
         self.until(lambda: re.search(pattern, self.text()), f"says {pattern!r}")
 
     def sees(self, true: Callable[[np.ndarray], Any], what: str) -> np.ndarray:
@@ -269,7 +265,6 @@ class Person:
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
     def click(self, place: tuple[float, float]) -> None:
-        """Clicks on the picture, pixels from its upper left corner."""
         self.page.mouse.click(place[0], self.top + place[1])
 
     def drag(self, x: float, y: float, button: Any = "left") -> None:

@@ -89,5 +89,4 @@ def copied(config: Path, folder: Path) -> Path:
 
 
 def faults(log: str) -> Sequence[str]:
-    """Tracebacks in what a viewer printed."""
     return re.findall(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*.*", log)

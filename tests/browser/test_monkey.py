@@ -132,7 +132,6 @@ class Monkey:
         assert not self.problems, f"seed {SEED}, after\n{last}\n" + "\n".join(self.problems[:5])
 
     def kill(self) -> None:
-        """Kills the server and starts it again."""
         self.killed = True
         self.server.kill()
         self.server.start(MALLOC_ARENA_MAX="1")
@@ -168,7 +167,6 @@ class Monkey:
         self.check()
 
     def press(self, person: OnPage | Tab) -> str | None:
-        """Clicks somewhere on any element."""
         box = person.page.evaluate(_FIND, [PRESSED, self.chance.random()])
         if box is None:
             return None
@@ -222,7 +220,6 @@ class Monkey:
         return key
 
     def renew(self, person: OnPage | Tab) -> str:
-        """Reloads the page, or closes its browser and opens another one."""
         if self.chance.random() < 0.5:
             person.page.reload(wait_until="domcontentloaded")
             return "reload"
@@ -241,9 +238,7 @@ def our_faults(server: Server, kind: type) -> list[str]:
 
 
 @pytest.mark.parametrize(("program", "kind"), [(OWN, OnPage), (STOCK, Tab)], ids=["own", "stock"])
-def test_nothing_breaks_and_nothing_grows(
-    program: str, kind: type, lifted: Path, browser: Browser, tmp_path: Path
-) -> None:
+def test_nothing_breaks_and_nothing_grows(program, kind, lifted: Path, browser: Browser, tmp_path: Path) -> None:
     server = Serving(ASKED + program, copied(lifted, tmp_path), tmp_path / "log", cwd=tmp_path)
     print(f"\n{kind.__name__}: seed {SEED}, {MINUTES:g} minutes")
     try:

@@ -23,7 +23,6 @@ HIDDEN = "Gaussians are hidden"
 
 @contextmanager
 def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
-    """Address of an ns-viewer that shows a run; its output goes to `log`."""
     with Server(STOCK, config, log, cwd=cwd).running() as address:
         yield address
 
@@ -82,7 +81,6 @@ class Tab(Person):
         return sum(text.count("■") for text in self.page.locator("table:visible").all_inner_texts())
 
     def asks(self, prompts: str, *, answered: int, key: bool = False) -> None:
-        """Asks, and waits for as many answers."""
         self.ask(prompts, key=key)
         self.until(lambda: self.answered() == answered, f"asked {prompts[:20]!r}")
 

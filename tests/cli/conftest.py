@@ -28,7 +28,6 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    """Exit code of a command."""
     monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
     try:
         entrypoint()
@@ -50,9 +49,7 @@ class Command:
 
 
 @pytest.fixture
-def ended(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., tuple[int, str, str]]:
+def ended(monkeypatch, capsys, tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
     """Runs a command in this process, whose main is a function of --word: exit code, output and errors.
 
     Logs are in the folder state of tmp_path.

@@ -54,12 +54,10 @@ class Batch:
         self.configs[number].with_name("what.txt").write_text(what)
 
     def begun(self) -> Counter[str]:
-        """How often each capture was begun."""
         file = self.outputs.parent / "begun.txt"
         return Counter(line.split()[0] for line in file.read_text().splitlines()) if file.exists() else Counter()
 
     def states(self, *options: str) -> list[str]:
-        """The last outcomes, in the order of the list."""
         found = batch.latest_outcomes(read_jsonl(self.results, batch.Outcome))
         return [found[capture.key].state for capture in batch.read_captures(self.list, options)]
 
@@ -362,7 +360,6 @@ def test_the_last_attempt_counts_whatever_the_clocks_say():
 
 
 def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str]:
-    """The variables of a task of a Slurm array."""
     numbers = {"ID": task, "COUNT": count, "MIN": least, "MAX": least + step * (count - 1), "STEP": step}
     return {f"SLURM_ARRAY_TASK_{name}": str(number) for name, number in numbers.items()}
 

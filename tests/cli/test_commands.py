@@ -105,14 +105,6 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
     assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
 
 
-def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
-    before = {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()}
-    for flag in ("--output-json", "--output-npz"):
-        flags = ("--load-config", lifted, "--text", "red", flag, lifted, "--overwrite", True)
-        assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
-
-
 def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
     clock = SimpleNamespace(now=lambda: datetime(2024, 5, 1, 12))
     monkeypatch.setattr("normlift_ns.io.run_dir.datetime", clock)
@@ -152,7 +144,6 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> tuple[object, ...]:
-    """Flags of a small CLIP with random weights."""
     from tests.encoders.tiny import CLIP, write_clip  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("clip")

@@ -94,9 +94,8 @@ def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
     assert cloud.point.reliability.numpy().max() < 1
 
 
-def test_selection_and_rest_make_up_the_scene_and_clean_lacks_floaters(
-    scene_ply, lifted, tmp_path, monkeypatch, capsys
-) -> None:
+@pytest.mark.slow
+def test_selection_and_rest_are_the_scene_and_clean_lacks_floaters(scene_ply, lifted, tmp_path, monkeypatch, capsys):
     rows, whole = {}, np.load(scene_ply.with_name("splat_rows.npy"))
     for part in ("selection", "rest", "clean"):
         text = () if part == "clean" else ("--text", "red")

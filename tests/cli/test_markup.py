@@ -48,7 +48,6 @@ TABLES: dict[str, Callable[[str], Any]] = {
 
 
 def printed(content: Any) -> str:
-    """What a console of colours prints."""
     file = io.StringIO()
     Console(file=file, width=200, force_terminal=True, color_system="truecolor").print(content)
     return file.getvalue()

@@ -31,7 +31,6 @@ def trained(made_once: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def alone(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What one process writes."""
     output = tmp_path_factory.mktemp("alone")
     done = lifted(*words(trained, output, 1))
     assert done.returncode == 0, done.stderr

@@ -81,10 +81,7 @@ LIFT = [
     (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
     ("--consensus False --consensus-power 2", "--consensus-power has no effect without --consensus True"),
     ("--consensus False --consensus-sample 9", "--consensus-sample has no effect without --consensus True"),
-    (
-        "--consensus False --consensus-min-agreement 0",
-        "--consensus-min-agreement has no effect without --consensus True",
-    ),
+    ("--consensus False --consensus-min-agreement 0", "--consensus-min-agreement has no effect without --consensus"),
     ("--vote paper --vote-prior 2", "--vote-prior has no effect without --vote posterior"),
     ("--consensus-power 2 --vote posterior --vote-prior 2 --queries oragne", "oragne"),
 ]
@@ -132,6 +129,10 @@ QUERY = [
     ("--stdin --interactive True", "--stdin", "--interactive"),
     ("--stdin --output-json a.json", "--output-json", "--text", "--stdin"),
     ("--interactive --save-query", "--save-query", "--text", "--interactive"),
+    ("--inventory --text red", "cannot be combined"),
+    ("--text red --image a.png", "--inventory"),
+    ("--inventory --vocabulary none.txt", "does not exist"),
+    ("--inventory --save-query", "--text only"),
 ]
 EXPORT = [
     ("--select selection", "--select selection", "--text"),
@@ -213,9 +214,7 @@ def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, 
         assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "with --data" in shown
 
 
-def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_early(
-    config, tmp_path, monkeypatch, capsys
-):
+def test_a_cache_that_is_a_file_or_a_locked_folder_is_refused_early(config, tmp_path, monkeypatch, capsys):
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)

@@ -16,7 +16,6 @@ from tests.cli.conftest import run_entry, said
 
 @pytest.fixture
 def asked() -> list[str]:
-    """Texts that the network is asked for, image after image."""
     return []
 
 
@@ -37,7 +36,6 @@ def weights(tmp_path, monkeypatch, asked) -> Path:
 
 @pytest.fixture
 def segmented(own: Path, weights: Path) -> tuple[object, ...]:
-    """Flags with the lifted run of `own` and the network."""
     lifted = own.parents[2] / "normlift" / "t" / "config.yml"
     return ("--load-config", lifted, "--segment", "sam3", "--segment-model", weights, "--segment-views", 4)
 
@@ -60,9 +58,8 @@ def test_sam3_answers_beside_the_run(segmented, tmp_path, monkeypatch, capsys) -
     assert float((share > 0.5).mean()) == pytest.approx(found["fraction"])
 
 
-def test_what_was_found_before_is_kept_and_the_least_reliability_counts(
-    own: Path, segmented, weights: Path, asked: list[str], tmp_path, monkeypatch, capsys
-) -> None:
+@pytest.mark.slow
+def test_what_was_found_before_is_kept(own, segmented, weights, asked, tmp_path, monkeypatch, capsys) -> None:
     table, kept = tmp_path / "table.json", own.parents[2] / "normlift" / ".cache" / "masks"
 
     def ask(*more: str) -> dict:

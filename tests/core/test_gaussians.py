@@ -53,6 +53,5 @@ def test_drawable_excludes_rows_that_are_not_finite_and_zero_quaternions():
 
 
 def test_shapes_of_the_core_are_checked_while_testing():
-    """The shape annotations are live here, so that every other test checks them too."""
     with pytest.raises(TypeCheckError):
         facing_pose(torch.zeros(2), torch.ones(3), torch.ones(3))

@@ -94,7 +94,6 @@ def test_chunks_do_not_change_directions(monkeypatch):
 
 
 def told(lifted: Lifted, *names: str) -> list[float]:
-    """Statistics of the first Gaussian."""
     return [getattr(lifted.scalars, name)[0].item() for name in names]
 
 

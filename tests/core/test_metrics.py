@@ -61,10 +61,8 @@ def test_gaussians_without_direction_are_no_class_or_the_first_one(metrics):
     assert metrics.classify(cosine, valid).tolist() == [1, -1, 0]
     assert metrics.classify(cosine, valid, without_direction="first").tolist() == [1, 0, 0]
     truth = torch.tensor([1, 1, 0])
-    ours = metrics.class_scores(metrics.confusion(truth, metrics.classify(cosine, valid), 2))
-    published = metrics.class_scores(
-        metrics.confusion(truth, metrics.classify(cosine, valid, without_direction="first"), 2)
-    )
+    found = (metrics.classify(cosine, valid), metrics.classify(cosine, valid, without_direction="first"))
+    ours, published = (metrics.class_scores(metrics.confusion(truth, x, 2)) for x in found)
     assert ours.iou.tolist() == [1, 0.5]
     assert published.iou.tolist() == [0.5, 0.5]  # the wall pays for points that nobody saw
 

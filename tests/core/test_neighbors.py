@@ -21,7 +21,6 @@ def all_pairs(means: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def lattice() -> torch.Tensor:
-    """Several points at one place."""
     return torch.randint(0, 3, (90, 3), generator=generator(3)).float()
 
 

@@ -73,7 +73,6 @@ def scores(means, u, r, config, own=None) -> Scores:
 
 
 def vote(means, u, r, config, own=None) -> list[int]:
-    """Whose direction every Gaussian copies."""
     source = []
     for i, score in enumerate(scores(means, u, r, config, own)):
         near = [j for j in score if j != i]

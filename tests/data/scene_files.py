@@ -39,15 +39,7 @@ def ply_columns(splat: SplatParameters) -> dict[str, np.ndarray]:
     return {name: value.numpy() for name, value in columns.items()}
 
 
-def write_ply(
-    path: Path,
-    columns: dict[str, np.ndarray],
-    *,
-    order: Sequence[str] | None = None,
-    comments: Sequence[str] = (),
-    text: bool = False,
-    byte_order: str = "<",
-) -> Path:
+def write_ply(path: Path, columns: dict, *, order=None, comments=(), text=False, byte_order="<") -> Path:
     names = list(columns) if order is None else list(order)
     table = np.empty(len(columns[names[0]]), [(name, columns[name].dtype.newbyteorder(byte_order)) for name in names])
     for name in names:
@@ -58,7 +50,6 @@ def write_ply(
 
 
 def write_gsplat(path: Path, splat: SplatParameters, *, step: int = 29999, **more: object) -> Path:
-    """As gsplat's simple_trainer saves it."""
     splats = {"means": splat.means, "quats": splat.quats, "scales": splat.scales, "opacities": splat.opacities[:, 0]}
     splats |= {"sh0": splat.features_dc[:, None], "shN": splat.features_rest}
     torch.save({"step": step, "splats": splats, **more}, path)
@@ -66,7 +57,6 @@ def write_gsplat(path: Path, splat: SplatParameters, *, step: int = 29999, **mor
 
 
 def saved_run(folder: Path, scene: SplatScene) -> Path:
-    """The files of a scene in the folder of its run."""
     content = splatfacto_checkpoint(scene)
     (folder / "nerfstudio_models").mkdir(parents=True)
     torch.save(content, folder / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")
@@ -89,14 +79,7 @@ def camera_parameters(model: str, c: Intrinsics) -> list[float]:
     }[model]
 
 
-def write_colmap(
-    folder: Path,
-    frames: Sequence[Frame],
-    model: str = "OPENCV",
-    *,
-    binary: bool = True,
-    points: np.ndarray | None = None,
-) -> Path:
+def write_colmap(folder: Path, frames: Sequence[Frame], model="OPENCV", *, binary=True, points=None) -> Path:
     """sparse/0 of a COLMAP project, images in another order than their names'; one camera per image."""
     place = folder / "sparse" / "0"
     place.mkdir(parents=True)

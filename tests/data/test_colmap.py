@@ -206,11 +206,8 @@ def test_no_damage_gets_through_as_another_error(tmp_path: Path) -> None:
 
         def load(folder: Path = model) -> None:
             try:
-                _ = (
-                    read_colmap_points(folder),
-                    read_cameras(folder),
-                    [colmap_pose(image) for image in read_images(folder)],
-                )
+                _ = read_colmap_points(folder), read_cameras(folder)
+                _ = [colmap_pose(image) for image in read_images(folder)]
             except (InputError, FileNotFoundError) as error:
                 assert str(folder) in str(error)
                 raise

@@ -60,7 +60,6 @@ def write_any(path: Path, splat: SplatParameters, kind: str) -> tuple[Path, np.n
 
 
 def angles(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Angles between rotations in radians."""
     cosine = (normalize_quats(first.double()) * normalize_quats(second.double())).sum(dim=1).abs()
     return 2 * cosine.clamp(max=1).acos()
 
@@ -152,10 +151,8 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     data = encode_spz(splat)
     _settings(document)["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
     uri = "data:;base64," + base64.b64encode(data).decode()
-    document["buffers"], document["bufferViews"] = (
-        [{"byteLength": len(data), "uri": uri}],
-        [{"buffer": 0, "byteLength": len(data)}],
-    )
+    document["buffers"] = [{"byteLength": len(data), "uri": uri}]
+    document["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
     path.write_text(json.dumps(document))
     assert float((read_gltf(path).splat.means - splat.means).abs().max()) < 1e-5
 
@@ -183,7 +180,6 @@ def _fields(data: bytes, splat: SplatParameters) -> list[bytes]:
 
 
 def _glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON and the binary chunk of a GLB file."""
     (length,) = struct.unpack_from("<I", data, 12)
     return json.loads(data[20 : 20 + length]), data[28 + length :]
 

@@ -44,7 +44,6 @@ CHECKPOINT = "step-000000007.ckpt"
 
 
 def state(**changes: Any) -> dict[Any, Any]:
-    """`pipeline` of a checkpoint."""
     splat = random_splat(N).parameters
     return {f"_model.gauss_params.{name}": changes.get(name, splat[name]) for name in GAUSSIAN_PARAMETERS}
 

@@ -67,7 +67,6 @@ def difference(native, scene, views=(0, 3, 6, 9)) -> float:
 
 @pytest.fixture
 def of_run(native, trained: Path) -> nl.SplatOptions:
-    """Cameras and world of the run."""
     world = trained.parent / "dataparser_transforms.json"
     return nl.SplatOptions(transforms=native.location.folder, world_transform=world)
 
@@ -90,7 +89,6 @@ def test_a_ply_file_with_the_transforms_of_the_run(native, splat, of_run, tmp_pa
 
 @pytest.fixture
 def given(native) -> nl.SplatOptions:
-    """Images and held-out names of the run."""
     return nl.SplatOptions(
         colmap=Path("p"), images=native.location.folder / "images", eval_images=tuple(native.held_out.names),
         gsplat_normalize=False,
@@ -138,7 +136,6 @@ def _normalization(frames: list[Frame], points: np.ndarray, number: int = 0) -> 
 
 
 def _in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
-    """The Gaussians in another world, computed in float64."""
     world = decompose_similarity(matrix, "test")
     turn = torch.from_numpy(world.transform[:, :3])
     quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])

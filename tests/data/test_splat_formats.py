@@ -28,7 +28,6 @@ def points(value: str) -> str:
 
 @pytest.fixture
 def options(tmp_path: Path) -> SplatOptions:
-    """One image and its camera."""
     Image.new("RGB", (8, 6)).save(tmp_path / "a.png")
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     content = {"fl_x": 5, "frames": [{"file_path": "a.png", "transform_matrix": pose}]}

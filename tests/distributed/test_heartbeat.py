@@ -141,9 +141,7 @@ def test_one_that_fails_says_so_and_only_the_first_one_speaks(world: World) -> N
         assert not hearts[r].stop(well=False)
 
 
-def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(world: World, monkeypatch) -> None:
     monkeypatch.setattr(heartbeat, "_GRACE", 0.01)
     world.team(2)
     world.kill(1)

@@ -75,7 +75,6 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
 
 
 def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:
-    """All that follows from evidence, by one process."""
     means, evidence, features = world(seed)
     lifted = lift(evidence, consensus(evidence, features, sample=5).features)
     config, stages = RefineConfig(vote=vote, k=9), StageTimer(lambda stage, done, total: None)  # type: ignore[arg-type]
@@ -84,7 +83,6 @@ def lifted_alone(seed: int, vote: str, storage: Storage) -> SemanticField:
 
 
 def lifted_by(team: Threads, seed: int, vote: str, storage: Storage) -> SemanticField | None:
-    """All that follows from evidence, by the process of a team."""
     means, evidence, features = world(seed)
     portion = Partition.from_means(team, means)
     mine = evidence.select_gaussians(portion.indices)

@@ -71,8 +71,6 @@ def unsure(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def hub_weights(made_once: Callable[..., Path]) -> Path:
-    """A folder for each name of `HUB`."""
-
     def make(folder: Path) -> None:
         for name in HUB:
             import_module("tests.encoders.tiny_hub").write_hub(folder / name, name)

@@ -23,10 +23,8 @@ def test_options_reach_the_regions(tmp_path):
         ({"regions_dir": tmp_path}, LabelFiles(tmp_path)),
         ({"regions": "superpixel", "region_count": 9}, Superpixels(9)),
         ({"regions": "grid", "region_count": 9}, Grid(9)),
-        (
-            {**files, "regions_background": -1, "regions_resample": True},
-            LabelFiles(tmp_path, background=-1, level=2, resample=True),
-        ),
+        ({**files, "regions_background": -1}, LabelFiles(tmp_path, background=-1, level=2)),
+        ({**files, "regions_resample": True}, LabelFiles(tmp_path, level=2, resample=True)),
         ({"regions": "sam"}, SamMasks("facebook/sam-vit-huge", "l", "cpu")),
         ({"regions": "sam", "sam_model": sam, "level": "default"}, SamMasks(sam, "default", "cpu")),
         ({"regions": "sam", "sam_model": sam, "sam_precision": "bfloat16"}, SamMasks(sam, "l", "cpu", "bfloat16")),

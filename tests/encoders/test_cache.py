@@ -17,6 +17,7 @@ from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity
 from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.encoders.tiny import noise
+from tests.io.test_digests import flipped
 
 IMAGE = noise(20, 30)
 
@@ -119,9 +120,7 @@ def test_a_damaged_entry_is_computed_again(counted, tmp_path):
         header = 8 + int.from_bytes(whole[:8], "little")
         names = whole[:header].replace(b'"labels"', b'"nonons"').replace(b'"features"', b'"nonsense"')
         wrong = [whole[: len(whole) // 2], b"", names + whole[header:], whole[:-1] + bytes([whole[-1] ^ 1])]
-        for bit in random.Random(0).sample(range(8 * len(whole)), 12):
-            wrong.append(bytearray(whole))
-            wrong[-1][bit // 8] ^= 1 << bit % 8
+        wrong += [flipped(whole, bit) for bit in random.Random(0).sample(range(8 * len(whole)), 12)]
         for content in wrong:
             path.write_bytes(content)
             assert_same(source.view(IMAGE, "a.jpg"), expected)
@@ -178,7 +177,6 @@ def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
 
 
 def in_eights(encoder: OpenClipEncoder, folder: Path) -> tuple[RegionFeatures, list[int]]:
-    """A source with batches of eight crops, and the number of crops of every call of its network."""
     copy, sizes = replace(encoder), []
 
     def counted(crops):

@@ -33,7 +33,6 @@ def shading_coordinates(colours: torch.Tensor) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def survey() -> dict[str, str]:
-    """Names of colours as matplotlib ships them, and their hexadecimal numbers."""
     return import_module("matplotlib.colors").XKCD_COLORS
 
 

@@ -149,7 +149,6 @@ def test_the_identity_changes_with_any_weight(name: str, clip_weights: Path, hub
 
 
 def use(folder: Path, name: str = "siglip2") -> None:
-    """All that reads a file."""
     encoder = make_encoder(options_of(name, folder))
     json.dumps(encoder.identity)
     encoder.text(TEXTS)

@@ -115,13 +115,6 @@ def test_any_header_of_an_array_raises_our_errors_only(tmp_path: Path) -> None:
     fuzz(25, header, tmp_path / "a.npy", lambda: read_npy(tmp_path / "a.npy", "map"))
 
 
-def test_headers_of_absurd_size_allocate_nothing(tmp_path: Path) -> None:
-    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (4, 1000000000, 1000000), }".ljust(117) + "\n"
-    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.encode() + bytes(80))
-    shape = "4 x 1000000000 x 1000000 float64"
-    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "a.npy", shape, "32,000,000,000,000,000", "80")
-
-
 def test_bombs_programs_and_lossy_pictures_are_refused_by_name(tmp_path: Path) -> None:
     """Pictures of few bytes have any size; and Pillow gives PostScript to Ghostscript, whatever the file is called."""
     path = tmp_path / "a.png"

@@ -73,7 +73,6 @@ def saved(state: dict[str, torch.Tensor]) -> bytes:
 
 @pytest.fixture
 def encoder(state: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ImageNetEncoder:
-    """The encoder with random weights."""
     content = saved(state)
     described = replace(IMAGENET, size=len(content), sha256=hashlib.sha256(content).hexdigest())
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -22,6 +22,7 @@ from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.encoders.tiny import noise, refused
 from tests.examples import FACTOR
+from tests.io.test_digests import flipped
 
 NAME = "images/frame_00001.jpg"
 HEIGHT, WIDTH, D = 3, 4, 512
@@ -37,7 +38,6 @@ T = 7
 
 
 def npy(descr: str, shape: tuple[int, ...], data: bytes) -> bytes:
-    """An NPY file of version 1.0."""
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
     header += " " * (-(len(header) + 11) % 64) + "\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode("latin1") + data
@@ -354,9 +354,7 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
     whole = file.read_bytes()
     # What is no vector may change, such as the date of an entry
     for bit in range(0, 8 * len(whole), max(1, 41 // FACTOR)):
-        changed = bytearray(whole)
-        changed[bit // 8] ^= 1 << bit % 8
-        file.write_bytes(changed)
+        file.write_bytes(flipped(whole, bit))
         try:
             assert TextEmbeddingFile(file).text(["fox", "file"]).tolist() == expected
         except ValueError as error:

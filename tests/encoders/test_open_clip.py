@@ -33,7 +33,6 @@ MAPS = LABELS[None]
 
 
 def publish(monkeypatch, hub, weights, **settings) -> str:
-    """Makes the weights those of a tag of the model, downloaded earlier; returns the tag."""
     published = import_open_clip().pretrained._PRETRAINED
     monkeypatch.setitem(published, NAME, {"tag": {"hf_hub": "someone/tiny/", **settings}})
     put(hub, "someone/tiny", "open_clip_model.safetensors", (weights / "tiny.safetensors").read_bytes())

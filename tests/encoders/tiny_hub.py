@@ -59,7 +59,6 @@ def siglip2_tokenizer() -> Any:
 
 
 def metaclip_tokenizer() -> Any:
-    """The library's own tokenizer of XLM-RoBERTa."""
     vocabulary, _ = _pieces(["<s>", "<pad>", "</s>", "<unk>"], bytes_too=False)
     scores = [(name, 0.0 if number < 4 else -20.0 + len(name)) for name, number in vocabulary.items()]
     return transformers.XLMRobertaTokenizer(vocab=[*scores, ("<mask>", 0.0)])

@@ -23,7 +23,6 @@ NONE = Photographs([], [])
 
 
 def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=64, height=48) -> Camera:
-    """A camera at a place, z up."""
     eye_, target_ = torch.tensor(eye).double(), torch.tensor(target).double()
     forward = torch.nn.functional.normalize(target_ - eye_, dim=0)
     right = torch.nn.functional.normalize(forward.cross(torch.tensor([0.0, 0, 1]).double(), dim=0), dim=0)
@@ -76,7 +75,6 @@ def lifted(scene: Any, used: list[int], *, blank: tuple[int, ...] = ()) -> Seman
 
 @pytest.fixture(scope="module")
 def one_side() -> coverage.Coverage:
-    """What is said of a lift that saw the near side."""
     scene = wall()
     return coverage.coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)))
 
@@ -137,7 +135,6 @@ def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[coverage.Reliabi
 
 
 def looped(known: coverage.ReliabilityModel, columns: Tensor, view: int, chosen: list[int]) -> float:
-    """The gain by the formula, one Gaussian after the other."""
     total = 0.0
     for j in range(len(known.norm)):
         reliabilities = []

@@ -48,7 +48,6 @@ SHAPED = {
 
 
 def random_map(seed: int) -> np.ndarray:
-    """Of one of eight kinds."""
     random = np.random.RandomState(seed)  # its numbers never change
     height, width = random.randint(1, 140, 2)
     kinds = (
@@ -65,7 +64,6 @@ def random_map(seed: int) -> np.ndarray:
 
 
 def maps() -> Iterator[tuple[str, np.ndarray]]:
-    """Maps by name: of given histograms, and random ones."""
     for name, counts in SHAPED.items():
         yield name, of_histogram(counts)
     for seed in range(48):
@@ -90,7 +88,6 @@ def shapes() -> Iterator[tuple[str, np.ndarray]]:
 
 
 def summary(mask: np.ndarray) -> list[object]:
-    """How many pixels are selected, and a digest of which."""
     return [int(mask.sum()), hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:16]]
 
 

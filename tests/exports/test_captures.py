@@ -62,7 +62,6 @@ def test_a_capture_comes_back(name: str, tmp_path: Path) -> None:
 
 
 def errors(found: SplatParameters, expected: SplatParameters) -> dict[str, torch.Tensor]:
-    """Errors of each Gaussian."""
     scales = [splat.scales.clamp(min=-10) for splat in (found, expected)]
     opacities = [splat.opacities[:, 0].sigmoid() for splat in (found, expected)]
     return {

@@ -30,20 +30,8 @@ from normlift_ns.encoders.color import _names, embed_colors
 
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
-VOTE = (
-    "--vote",
-    "paper",
-    "--vote-k",
-    36,
-    "--vote-sigma-d",
-    1,
-    "--vote-tau",
-    0.95,
-    "--vote-gamma",
-    0.4,
-    "--vote-delta",
-    0,
-)
+VOTE = ("--vote", "paper", "--vote-k", 36, "--vote-sigma-d", 1, "--vote-tau", 0.95)
+VOTE += ("--vote-gamma", 0.4, "--vote-delta", 0)
 """Of version 0.1, which knew no consensus."""
 SINCE = {"verdict", "nearest", "suggested_threshold", "histogram", "read_as"}
 """What an answer tells since."""
@@ -123,13 +111,8 @@ def without_numbers(found: Any) -> Any:
 
 
 def machine() -> dict[str, str]:
-    """What rounding depends on."""
-    facts = Path("/proc/cpuinfo")
-    lines = (
-        re.findall(r"^(?:cpu family|model|model name|stepping)\s*: (.*)", facts.read_text(), re.M)
-        if facts.exists()
-        else []
-    )
+    facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    lines = re.findall(r"^(?:cpu family|model|model name|stepping)\s*: (.*)", facts, re.MULTILINE)
     model = " ".join(lines[:4]) or platform.processor()
     return {"torch": torch.__version__, "instructions": torch.backends.cpu.get_cpu_capability(), "processor": model}
 
@@ -173,26 +156,19 @@ def differences(found: Any, golden: Any, tolerance: float, path: str = "", *, lo
     all; loosely, whole numbers differ as floats do, by that share of them or a few."""
     if loose and isinstance(found, int) and isinstance(golden, int) and not isinstance(found, bool):
         return [] if abs(found - golden) <= max(FEW, tolerance * golden) else [f"{path}: {found} is not {golden}"]
+    pairs: Any = None
     if isinstance(found, dict) and isinstance(golden, dict):
-        names = sorted({*found, *golden})
-        return [
-            line
-            for name in names
-            for line in differences(found.get(name), golden.get(name), tolerance, f"{path}/{name}", loose=loose)
-        ]
+        pairs = [(name, found.get(name), golden.get(name)) for name in sorted({*found, *golden})]
     if isinstance(found, list) and isinstance(golden, list) and len(found) == len(golden):
-        return [
-            line
-            for i, (a, b) in enumerate(zip(found, golden))
-            for line in differences(a, b, tolerance, f"{path}/{i}", loose=loose)
-        ]
+        pairs = [(i, a, b) for i, (a, b) in enumerate(zip(found, golden))]
+    if pairs is not None:
+        return [x for name, a, b in pairs for x in differences(a, b, tolerance, f"{path}/{name}", loose=loose)]
     if isinstance(found, float) and isinstance(golden, float):
         return [] if abs(found - golden) <= tolerance * max(1.0, abs(golden)) else [f"{path}: {found} is not {golden}"]
     return [] if found == golden else [f"{path}: {found} is not {golden}"]
 
 
 def main(folders: Sequence[str]) -> None:
-    """Prints the summaries of all scenes below a folder."""
     found = {name: summarize(Path(folders[0]) / name) for name in TEXTS}
     print("{\n" + ",\n".join(f'"{name}": {json.dumps(summary)}' for name, summary in found.items()) + "\n}")
 

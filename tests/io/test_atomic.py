@@ -306,7 +306,6 @@ def test_what_a_running_process_writes_is_left_alone(tmp_path: Path):
 
 
 def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """As on Windows and on some network drives."""
     monkeypatch.setattr(atomic, "acquire_lock", lambda folder: None)
     ages = {f".normlift-{'1' * 16}": 23 * 3600, f".normlift-{'2' * 16}": 25 * 3600, ".other": 10**9}
     for name, seconds in ages.items():

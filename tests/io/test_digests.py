@@ -190,7 +190,6 @@ WRONG_ROWS = {
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
 def test_arrays_that_lead_outside_are_refused(form: str, tmp_path: Path) -> None:
-    """Also where somebody wrote them with right digests."""
     for name, (change, message) in (WRONG | WRONG_ROWS if form == "evidence" else WRONG).items():
         folder = tmp_path / name
         change(example(form)).save(folder)
@@ -247,11 +246,8 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
 def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     evidence.save(path)
-    save_file(
-        load_file(path),
-        path,
-        metadata={k: v for k, v in load_arrays(path).metadata.items() if k != "digest"},
-    )
+    facts = {k: v for k, v in load_arrays(path).metadata.items() if k != "digest"}
+    save_file(load_file(path), path, metadata=facts)
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
     with pytest.raises(ValueError, match="its metadata has none"):
         Evidence.load(path, key="a")
@@ -386,7 +382,6 @@ def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unchecked")
 def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
-    """With right digests."""
     path = tmp_path / "e.safetensors"
     random_evidence(15, VIEWS, 3).save(path)
     tensors, facts, _ = load_arrays(path, framework="pt")

@@ -146,10 +146,7 @@ def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, dr
 
 def test_what_is_free():
     assert module.BEATS_PER_TIMEOUT == 6
-    assert (
-        is_claimable(UNCLAIMED, UNCLAIMED)
-        and is_claimable(ClaimState(1, ABANDONED), UNCLAIMED)
-        and is_claimable(ClaimState(2, "done"), ClaimState(2, "done"))
-    )
+    assert is_claimable(UNCLAIMED, UNCLAIMED) and is_claimable(ClaimState(1, ABANDONED), UNCLAIMED)
+    assert is_claimable(ClaimState(2, "done"), ClaimState(2, "done"))
     assert not any(is_claimable(ClaimState(2, outcome), ClaimState(1, outcome)) for outcome in ("done", "failed"))
     assert not is_claimable(ClaimState(1, None), ClaimState(1, None))

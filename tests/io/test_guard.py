@@ -100,6 +100,7 @@ def test_what_is_no_file_is_not_replaced_and_exports_change_together(tmp_path: P
 OWNED = {
     ("config.yml", "nerfstudio_models/a.ckpt"): (
         "config.yml", "splat.json", "nerfstudio_models/a.json", "normlift/a.ply", "dataparser_transforms.json",
+        "transforms.json", "normlift/field.safetensors", "normlift/sub/a.png",
     ),
     ("cfg_args",): ("cameras.json", "input.ply", "point_cloud/iteration_7/point_cloud.ply"),
     ("cfg.yml", "ckpts/a.pt"): ("ckpts/a.json", "ply/a.ply", "stats/a.json"),
@@ -120,13 +121,19 @@ def test_no_output_replaces_a_part_of_a_run_a_data_set_or_a_cache(markers: tuple
         (home / name).write_bytes(CONTENT.get(f"a{Path(name).suffix}", b""))
     link.symlink_to(home)
     for name in OWNED[markers]:
-        for path in (home / name, link / name, home / "exports" / ".." / name):
+        (direct := tmp_path / f"direct{Path(name).suffix}").symlink_to(home / name)
+        for path in (home / name, link / name, home / "exports" / ".." / name, direct):
             for overwrite in (True, False):
                 with pytest.raises(InputError, match=r"part of the (run|data set|cache) .*another --flag"):
                     refuse_existing(path, overwrite=overwrite, flags="--flag")
                 with pytest.raises(InputError, match="part of the"), atomic_file(path, overwrite=overwrite):
                     pytest.fail("nothing is computed")
+        direct.unlink()
         assert (home / name).read_bytes() == CONTENT.get(f"a{Path(name).suffix}", b"")
+    for name in set(OWNED[markers]) - {*markers} if markers[0].startswith(("config", "cfg")) else ():
+        (home / name).unlink()  # nor does an output become a part of a run
+        with pytest.raises(InputError, match="part of the run"):
+            refuse_existing(home / name, overwrite=True, flags="--flag")
     for name in ("answers.json", "exports/a.ply", ".cache/new.json"):
         refuse_existing(home / name, overwrite=True, flags="--flag")
     with pytest.raises(InputError, match="part of the"):

@@ -10,8 +10,6 @@ import torch
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
 from normlift_ns.io import run_dir
-from normlift_ns.io.atomic import refuse_existing
-from normlift_ns.io.guard import refuse_inputs
 from tests.hostile import no_files
 from tests.io.test_digests import as_version_0_1, example, flipped
 
@@ -39,12 +37,8 @@ def test_the_manifest_knows_the_files_of_the_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     digests = run_dir.read_manifest(run / "normlift")[1]
     assert digests is not None
-    assert set(digests) == {
-        "field.safetensors",
-        "texts.npz",
-        "../dataparser_transforms.json",
-        "../nerfstudio_models/step-000000007.ckpt",
-    }
+    beside = {"../dataparser_transforms.json", "../nerfstudio_models/step-000000007.ckpt"}
+    assert set(digests) == {"field.safetensors", "texts.npz"} | beside
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run_dir.check_run(run)
@@ -107,22 +101,6 @@ def test_what_is_no_file_is_refused_or_absent(tmp_path: Path) -> None:
         else:
             with pytest.raises(InputError, match=r"manifest\.json"):
                 run_dir.check_run(run)
-
-
-def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run")
-    parts = ("config.yml", "dataparser_transforms.json", "splat.json", "transforms.json", "nerfstudio_models/new.json")
-    (tmp_path / "other").symlink_to(run)
-    for i, name in enumerate((*parts, "normlift/field.safetensors", "normlift/sub/a.png")):
-        link = tmp_path / f"link{i}.json"
-        link.symlink_to(run / name)
-        for path in (run / name, link, tmp_path / "other" / name, run / "normlift" / ".." / name):
-            for overwrite in (True, False):
-                with pytest.raises(InputError, match=r"part of the run .* --output-json"):
-                    refuse_existing(path, overwrite=overwrite, flags="--output-json")
-    for fine in (run / "answers.json", run / "ply" / "config.yml", tmp_path / "config.yml", run / "pictures" / "a.png"):
-        refuse_existing(fine, overwrite=False, flags="--output-json")
-        refuse_inputs([fine], instead="--output-json")
 
 
 def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:

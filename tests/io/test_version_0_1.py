@@ -20,9 +20,8 @@ QUERIES = {"lifted": ("red", "sky blue", "--threshold", 0.4), "trained": ("red",
 STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
 
 
-@pytest.fixture(params=["lifted", "trained"])
+@pytest.fixture(params=[pytest.param("lifted", marks=pytest.mark.slow), "trained"])
 def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """config.yml of a copy of an old run, which may be changed."""
     shutil.copytree(Path(__file__).with_name("version_0_1"), tmp_path / "old")
     return tmp_path / "old" / "runs" / "scene" / "normlift" / request.param / "config.yml"
 

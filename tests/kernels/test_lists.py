@@ -25,7 +25,6 @@ def see(scene, cameras, rules="1.4", antialiased=False, cull=True):
 
 
 def pairs(lists):
-    """(cell, splat) of every pair."""
     cell = torch.repeat_interleave(torch.arange(len(lists.offsets) - 1), lists.offsets.diff())
     return list(zip(cell.tolist(), lists.members.tolist()))
 

@@ -21,7 +21,6 @@ def job(scene, antialiased=False, weight_power=1, settings=SETTINGS):
 
 
 def kernel_evidence(scene, cameras, labels, counts, weight_power=1):
-    """Evidence by the kernels, all views in flight at once."""
     batch = RasterBatch(cameras, [x.to(DEVICE) for x in labels], counts)
     entries = triton.views_evidence(job(scene, weight_power=weight_power), batch)
     return Evidence.from_entries([entries], len(scene), weight_power=weight_power).to("cpu")
@@ -38,7 +37,6 @@ def assert_same(found, expected, regions_in_all, tolerance=2e-6):
 
 
 def compare(scene, cameras, labels, counts, weight_power=1):
-    """Checks the kernels' evidence; returns the reference's."""
     expected = rasterize_evidence(
         scene, cameras, labels, num_regions=counts, backend="torch", weight_power=weight_power
     )

@@ -35,9 +35,7 @@ def numbers(config: RefineConfig, neighbors: Neighbors) -> dict[str, float]:
     return {"tau": found.tau, "gamma": found.gamma, "width": width, "delta": found.delta}
 
 
-def cast(
-    neighbors: Neighbors, directions, reliability, config: RefineConfig, voters: int | None = None, **options: Any
-):
+def cast(neighbors: Neighbors, directions, reliability, config: RefineConfig, voters=None, **options: Any):
     """The winners of the first voters or of all, with `own_evidence` in a posterior vote; -1 if unwritten."""
     n = len(reliability)
     every = torch.arange(n, dtype=torch.int32)

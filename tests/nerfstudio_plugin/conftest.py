@@ -30,7 +30,6 @@ def _imported(nerfstudio: Any) -> None:
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
-    """The directory of a user, with a dataset in scene/."""
     write_dataset(tmp_path / "user" / "scene")
     return tmp_path / "user"
 
@@ -88,8 +87,6 @@ def capture(request: pytest.FixtureRequest) -> Path:
 
 
 def trained_once(made_once: Callable[..., Path], name: str, write: Callable[[Path], Any], **how: Any) -> StockRun:
-    """A run of a dataset, by its name in `made_once`; `how` are keywords of `train_splatfacto`."""
-
     def make(folder: Path) -> None:
         write(folder / "scene")
         train_splatfacto(folder, Path("scene"), **how)
@@ -125,15 +122,7 @@ def lifted_field(run: NerfstudioScene) -> SemanticField:
     return SemanticField.build(lifted, run.gaussians.means, storage="float16", tolerance=1e-2)
 
 
-def write(
-    scene: NerfstudioScene,
-    field: SemanticField,
-    *,
-    output_dir: Path | None = None,
-    timestamp: str | None = None,
-    **rest: Any,
-) -> Path:
-    """Writes a lifted run where ns-normlift would; returns its directory."""
+def write(scene: NerfstudioScene, field: SemanticField, *, output_dir=None, timestamp=None, **rest: Any) -> Path:
     run_dir = run_directory(output_dir or scene.runs_dir, scene.name, timestamp)
     write_run(scene, field, run_dir, **rest)
     return run_dir

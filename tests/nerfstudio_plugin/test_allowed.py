@@ -229,14 +229,6 @@ def test_a_bomb_of_references_costs_nothing(tmp_path: Path, texts: tuple[str, st
         assert problem in refusal(tmp_path, f"{bare}\n{line}\n"), line
 
 
-def test_no_folder_is_no_config(tmp_path: Path) -> None:
-    (tmp_path / "config.yml").mkdir()
-    os.mkfifo(tmp_path / "pipe.yml")
-    for name in ("config.yml", "pipe.yml"):
-        with pytest.raises(FileNotFoundError, match=name):
-            read_trainer_config(tmp_path / name)
-
-
 def test_a_run_that_was_moved_is_lifted_below_the_current_directory(tmp_path: Path, monkeypatch, config: Any) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene").mkdir()

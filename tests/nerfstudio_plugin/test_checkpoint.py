@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from normlift_ns.data.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
+from tests.io.test_digests import flipped
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto
 
@@ -88,9 +89,7 @@ def test_cut_files_and_flipped_bits_are_noticed_or_change_nothing(full: Path, tm
             read_checkpoint(path)
     noticed = 0
     for bit in random.Random(0).sample(range(8 * len(whole)), 40):
-        changed = bytearray(whole)
-        changed[bit // 8] ^= 1 << bit % 8
-        path.write_bytes(changed)
+        path.write_bytes(flipped(whole, bit))
         try:
             found = read_checkpoint(path).model
         except ValueError as error:

@@ -1,3 +1,4 @@
+import os
 import re
 import shutil
 from pathlib import Path, PureWindowsPath
@@ -48,8 +49,11 @@ def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
         ("method_name: splatfacto", "no method_name"),  # not an object of nerfstudio's
     ):
         assert re.search(problem, refusal(tmp_path, text))
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
-        read_trainer_config(tmp_path / "nowhere.yml")
+    (tmp_path / "folder.yml").mkdir()
+    os.mkfifo(tmp_path / "pipe.yml")
+    for name in ("nowhere.yml", "folder.yml", "pipe.yml"):
+        with pytest.raises(FileNotFoundError, match=name):
+            read_trainer_config(tmp_path / name)
     with pytest.raises(FileNotFoundError, match=f"at {stock.config}"):
         read_trainer_config(stock.config.parent)
 

@@ -14,7 +14,6 @@ NAMES = {"normlift", "normlift-lerf-ovs", "normlift-scannet"}
 
 
 def discovered() -> tuple[dict[str, Any], dict[str, str]]:
-    """What nerfstudio finds by the entry points that pyproject.toml declares."""
     from nerfstudio.plugins import registry  # noqa: PLC0415
 
     group = "nerfstudio.method_configs"

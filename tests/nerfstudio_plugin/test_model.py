@@ -223,9 +223,8 @@ def test_a_crop_box_crops_the_scalars_too(pipeline: Any) -> None:
     model.show(make_display(model.field, everyone))
     for on_cpu in (False, True):
         with renderer(pipeline, on_cpu):
-            everything, cropped, empty, again = (
-                _outputs(pipeline, obb_box=box) for box in (None, above, nowhere, None)
-            )
+            boxes = (None, above, nowhere, None)
+            everything, cropped, empty, again = (_outputs(pipeline, obb_box=box) for box in boxes)
         torch.testing.assert_close(cropped["selection"], cropped["accumulation"], atol=1e-5, rtol=0)
         assert cropped["accumulation"].sum() < everything["accumulation"].sum()
         assert {name: value.shape for name, value in empty.items()} == {n: v.shape for n, v in cropped.items()}

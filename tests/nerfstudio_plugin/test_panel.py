@@ -20,7 +20,6 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.exports import TrainedSplat
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
@@ -373,17 +372,6 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert panel._widgets.histograms.content == ""
 
 
-def test_floaters_are_selected(panel: Any, pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, likely = pipeline.model.scene(), button(panel, "Select likely floaters")
-    means = scene.means.clone()
-    means[7] += 1000
-    strayed = replace(scene, means=means)
-    expected = find_floaters(strayed, pipeline.model.field.scalars).mask
-    monkeypatch.setattr(pipeline.model, "scene", lambda: strayed)
-    press(likely)
-    assert 0 < int(expected.sum()) < 30 and torch.equal(chosen(pipeline), expected)
-
-
 def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_path: Path, panel: Any) -> None:
     import normlift_ns as nl  # noqa: PLC0415
     from normlift_ns.nerfstudio_plugin.panel import explanation_of_run  # noqa: PLC0415
@@ -508,18 +496,6 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     event.ray_direction = tuple(-x for x in event.ray_direction)
     browser._scene_pointer_cb(event)
     assert "semantics" in said(panel) and panel.answer.texts == ("like click 2",)
-
-
-def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipeline: Any) -> None:
-    browser, event = Browser(), ray(pipeline)
-    weights = pipeline.model.ray_weights(torch.tensor(event.ray_origin) / 10, torch.tensor(event.ray_direction))
-    for name, mode in (("Select", "select"), ("Remove", "remove"), ("Add", "add")):
-        expected = actions.click(panel.state, weights, mode).selection  # type: ignore[arg-type]
-        panel.act(Action(name), client=browser)
-        browser._scene_pointer_cb(event)
-        assert torch.equal(chosen(pipeline), expected), name
-    assert expected.any()
-    assert "by hand" in said(panel)
 
 
 def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any, pipeline: Any, viewer: Any) -> None:

@@ -69,9 +69,8 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     field, question = field_of(run), load_query(run_dir / "normlift")
     assert len(field) == 60 and field.scalars.reliability.max() > 0.2
     assert question is not None and question.texts == ("red", "sky blue")
-    expected = run_query(
-        field, run.gaussians.means, make_query(field, text_encoder_for(field).rows, ["red", "sky blue"])
-    )
+    asked = make_query(field, text_encoder_for(field).rows, ["red", "sky blue"])
+    expected = run_query(field, run.gaussians.means, asked)
 
     model = trained.pipeline.model  # the viewer of the training
     assert torch.equal(model.normlift.answer.relevancy.cpu(), expected.relevancy)
@@ -89,9 +88,7 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
 
 
 @pytest.mark.parametrize("broken", ["lift_scene", "save_query"])
-def test_a_failing_lift_leaves_the_training_whole(
-    train: Callable[..., StockRun], registered: None, monkeypatch, capsys, tmp_path: Path, broken: str
-) -> None:
+def test_a_failing_lift_leaves_the_training_whole(train, registered, monkeypatch, capsys, tmp_path, broken) -> None:
     def fail(*args: Any, **kwargs: Any) -> None:
         raise RuntimeError("out of luck")
 

@@ -68,6 +68,7 @@ def arias(folder: Path, *, masks: bool = False, **more: object) -> None:
     path.write_text(json.dumps(meta | {"camera_model": "FISHEYE624", "distortion_params": lens, **more}))
 
 
+@pytest.mark.slow
 def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> None:
     arias(tmp_path / "scene", fisheye_crop_radius=15.0)
     run = train_splatfacto(tmp_path, Path("scene"))
@@ -85,7 +86,7 @@ def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> N
             _ = opened(run.config).train.cameras
 
 
-@pytest.mark.parametrize("mode", ["SO3xR3", "SE3"])
+@pytest.mark.parametrize("mode", ["SO3xR3", pytest.param("SE3", marks=pytest.mark.slow)])
 def test_optimized_poses_are_applied(stock: StockRun, workspace: Path, mode: str) -> None:
     def configure(config) -> None:
         config.pipeline.model.camera_optimizer.mode = mode

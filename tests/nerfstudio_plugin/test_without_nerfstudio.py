@@ -60,9 +60,8 @@ def test_mirrors_have_the_fields_and_defaults_of_nerfstudios_classes() -> None:
 
 
 def test_configs_of_splats_have_nerfstudios_defaults() -> None:
-    made = as_nerfstudios(
-        config_classes.TrainerConfig(method_name="normlift", pipeline=config_classes.VanillaPipelineConfig())
-    )
+    pipeline = config_classes.VanillaPipelineConfig()
+    made = as_nerfstudios(config_classes.TrainerConfig(method_name="normlift", pipeline=pipeline))
     for part in (made.pipeline.model, made.pipeline.datamanager, made.viewer, made.logging):  # of splats
         assert part == type(part)() and type(part).__module__.startswith("nerfstudio.")
 
@@ -165,7 +164,7 @@ def with_held_out(parser: dict[str, Any], lists: bool) -> dict[str, Any]:
     return {**parser, "train_split_fraction": 0.8} if everything else parser
 
 
-@examples(12)
+@examples(8)
 @given(
     parser=st.fixed_dictionaries(WORLD),
     seed=st.integers(0, 2**32 - 1),
@@ -177,9 +176,7 @@ def with_held_out(parser: dict[str, Any], lists: bool) -> dict[str, Any]:
         {"orientation_override": "none"},
     ]),
 )  # fmt: skip
-def test_data_sets_with_transforms(
-    parser: dict[str, Any], seed: int, model: Any, flags: Any, mode: str, extra: Any
-) -> None:
+def test_data_sets_with_transforms(parser, seed: int, model: Any, flags: Any, mode: str, extra: Any) -> None:
     per_frame, distorted, masks, shrunk, lists = flags
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as name:
@@ -217,7 +214,7 @@ def test_data_sets_with_transforms(
         assert_equal(config_classes.FullImageDatamanagerConfig(data=folder, **how), folder)
 
 
-@examples(8)
+@examples(6)
 @given(
     parser=st.fixed_dictionaries(WORLD),
     seed=st.integers(0, 2**32 - 1),

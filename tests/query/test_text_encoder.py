@@ -33,7 +33,6 @@ def field_with(settings: dict[str, Any], features: dict[str, Any]) -> SemanticFi
 
 
 def lifted(kind: str, tmp_path: Path) -> SemanticField:
-    """A field that was lifted with the weight file w.pt."""
     path = tmp_path / "w.pt"
     path.write_bytes(b"weights" * 1000)
     source = SourceOptions(encoder_pretrained=str(path))

@@ -20,9 +20,7 @@ def _rotation(q: list[float]) -> np.ndarray:
     )
 
 
-def compositing_matrix(
-    scene: GaussianScene, camera: Camera, antialiased: bool = False, rules: str = "1.4"
-) -> np.ndarray:
+def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased=False, rules="1.4") -> np.ndarray:
     """A [height, width, N] of one view, float64, by the rules of a version of gsplat."""
     cap = 0.99 if rules == "1.6" else CAP
     floor = 0.005 if rules == "1.6" else 0.0

@@ -20,7 +20,6 @@ def some_pixels(count: int, width: int, height: int, seed: int) -> torch.Tensor:
 
 
 def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
-    """[P, N]."""
     pixel = torch.repeat_interleave(torch.arange(len(found.offsets) - 1), found.offsets.diff().cpu())
     full = torch.zeros(len(found.offsets) - 1, num_gaussians, dtype=torch.float64)
     full[pixel, found.gaussian.cpu()] = found.weight.double().cpu()

@@ -49,8 +49,6 @@ def job(scene, **constants):
 
 
 class OnGpu:
-    """What `check` looks at, of a scene on a GPU."""
-
     means = torch.zeros(1, 3, device="meta")
     primitive = "3dgs"
 

@@ -60,7 +60,8 @@ def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
 @pytest.mark.parametrize(
     ("rules", "antialiased"),
     [
-        *(("1.4", False), ("1.6", True)),
+        pytest.param("1.4", False, marks=pytest.mark.slow),
+        ("1.6", True),
         *(pytest.param(*x, marks=pytest.mark.extra) for x in (("1.4", True), ("1.5", False), ("1.5", True))),
         pytest.param("1.6", False, marks=pytest.mark.extra),
     ],
@@ -150,7 +151,7 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
 
 
 def test_pictures_of_any_number_of_channels():
-    scene, (camera,) = hard_scene(), orbit(1, width=18, height=17)
+    scene, (camera,) = hard_scene(), orbit(1, width=10, height=9)
     job = RasterJob(scene.to(DEVICE), False, RasterSettings(), torch.float32)
     for channels in (0, 19):
         values = torch.rand(len(scene), channels, generator=generator(0))

@@ -108,7 +108,6 @@ def test_both_ends_are_drawn():
 
 @pytest.fixture
 def without_gsplat(monkeypatch):
-    """No module of gsplat can be imported."""
     for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "gsplat", None)

@@ -29,7 +29,6 @@ IMAGE, NAME = photograph(40, 60), "a.png"
 
 @pytest.fixture(scope="module")
 def folders(sam_weights, library_weights, tmp_path_factory) -> dict[str, Path]:
-    """Of the weights, or of the files."""
     files = tmp_path_factory.mktemp("files")
     values = np.array([0, 7, 3, 200], np.uint8)[(IMAGE[:, :, 0] // 64).numpy()]
     Image.fromarray(values).save(files / NAME)

@@ -28,7 +28,6 @@ def embedding(checkpoint):
 
 @pytest.fixture(scope="module")
 def expected(checkpoint, embedding):
-    """The answers of transformers in float64."""
     return by_transformers(str(checkpoint), embedding, torch.float64)
 
 
@@ -41,7 +40,6 @@ def by_transformers(path: str, embedding: torch.Tensor, dtype: torch.dtype) -> t
 
 
 def close(found, expected, bound: float) -> None:
-    """Logits, as a share of the largest, and predicted IoU."""
     for ours, exact, scale in zip(found, expected, (float(expected[0].abs().max()), 1.0)):
         assert float((ours.cpu().double() - exact).abs().max()) < bound * scale
 

@@ -73,7 +73,6 @@ def test_label_files_of_every_integer_type(tmp_path):
 
 
 def grey_png(width: int, height: int, bits: int, rows: bytes) -> bytes:
-    """A grey PNG, put together byte by byte."""
     head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
     parts = [(b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
     chunks = [

@@ -79,7 +79,6 @@ def write_tiny(folder: Path, kind: str, seed: int = 0) -> Any:
 
 
 def write_tokenizer(folder: Path) -> None:
-    """CLIP's tokenizer with letters and a few words."""
     letters = [chr(x) for x in range(ord("a"), ord("z") + 1)]
     pieces, merges = [*letters, *(f"{x}</w>" for x in letters)], []
     for word in ("mug", "red"):

@@ -35,8 +35,6 @@ def make_served(folder: Path, scene: Any = None, space: Any = None) -> ServedRun
 
 
 class Images(list):
-    """Training images, each of one color."""
-
     def __init__(self, cameras: Any) -> None:
         super().__init__(cameras)
         self.cameras, self.names = list(cameras), [f"images/{i}.png" for i in range(len(cameras))]
@@ -46,8 +44,6 @@ class Images(list):
 
 
 class OneRun:
-    """A store of one open run."""
-
     def __init__(self, served: ServedRun) -> None:
         self.ids, self.get = [served.id], lambda name: served
 

@@ -26,7 +26,6 @@ RUN = "/api/runs/cubes"
 
 @pytest.fixture(scope="module")
 def served_room(lifted):
-    """A server that listens, and the run that it serves."""
     server = WarmServer(RunStore([lifted], open_run), ServerOptions(port=0))
     port = server.start()
     yield server.runs.get(server.runs.ids[0]).run, connect(f"127.0.0.1:{port}")

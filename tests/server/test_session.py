@@ -61,9 +61,8 @@ def test_questions_colors_and_history(page):
     found = {row["text"]: row for row in page.state["prompts"]}
     assert (found["red"]["count"], found["blue"]["count"]) == (2 * BLOCK, BLOCK)
     assert "unknown" in found["zebra"]["error"] and found["zebra"]["count"] is None
-    assert (
-        page.state["selected"] == page.state["selected_visible"] == 3 * BLOCK and page.state["color_mode"] == "overlay"
-    )
+    assert page.state["selected"] == page.state["selected_visible"] == 3 * BLOCK
+    assert page.state["color_mode"] == "overlay"
     for gaussian, prompt in ((0, "red"), (BLOCK, "blue")):  # one scheme: the chip has the color of the picture
         assert page.color(gaussian)[:3] == [round(255 * x) for x in found[prompt]["color"]]
     assert page.color(3 * BLOCK)[3:] == [0, 1]  # gray
@@ -263,7 +262,8 @@ def test_saved_prompts(client, served, tmp_path):
     stored = load_query(tmp_path / FIELD_FOLDER)
     assert stored is not None and stored.texts == ("red",)
     with opened(client, "two") as page:
-        assert page.state["line"] == "red" and any("Ask" in one.get("text", "") for one in page.told if "text" in one)
+        assert page.state["line"] == "red"
+        assert any("Ask" in one.get("text", "") for one in page.told if "text" in one)
     for options, access, allowed in (
         ({"read_only": True}, "", False),
         ({"host": "0.0.0.0", "access_token": "secret"}, "", False),

@@ -104,18 +104,10 @@ def test_every_step_of_growth_holds_the_one_before(some, steps):
 
 
 def test_every_deed_is_undone_and_done_again():
-    deeds = (
-        asked_red := lambda s: asked("red", s),
-        lambda s: actions.click(s, ray(0), "add"),
-        lambda s: actions.click(s, ray(BLOCK), "add"),
-        lambda s: actions.add_layer(s, "both"),
-        actions.hide,
-        asked_red,
-        lambda s: actions.set_threshold(s, 0.95),
-        lambda s: actions.resize(s, 1),
-        actions.clear,
-        actions.show_all,
-    )
+    clicks = [lambda s, at=at: actions.click(s, ray(at), "add") for at in (0, BLOCK)]
+    settings = [lambda s: actions.set_threshold(s, 0.95), lambda s: actions.resize(s, 1)]
+    ask, layer = (lambda s: asked("red", s)), (lambda s: actions.add_layer(s, "both"))
+    deeds = (ask, *clicks, layer, actions.hide, ask, *settings, actions.clear, actions.show_all)
     history, seen = History.of(State(world()), lean=State.without_caches), [(rows(), ~rows())]
     for deed in deeds:
         history = history.do(deed(history.now))

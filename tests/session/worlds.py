@@ -44,10 +44,8 @@ def read(texts) -> np.ndarray:
 
 
 def rows(*numbers: int) -> torch.Tensor:
-    """The Gaussians of some of the cubes."""
     return torch.isin(torch.arange(4 * BLOCK) // BLOCK, torch.tensor(numbers))
 
 
 def ray(gaussian: int) -> torch.Tensor:
-    """Weights on a ray that meets one Gaussian."""
     return torch.nn.functional.one_hot(torch.tensor(gaussian), 4 * BLOCK).float()

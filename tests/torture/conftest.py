@@ -28,15 +28,9 @@ class Server:
         environment = os.environ | one | {"NUMBA_THREADING_LAYER": "workqueue", "CUDA_VISIBLE_DEVICES": ""}
         environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "tests.torture.server"],
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-            )
+            words = [sys.executable, "-m", "tests.torture.server"]
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
+            self.process = subprocess.Popen(words, cwd=folder, env=environment, text=True, **pipes)
         assert self.process.stdout is not None
         if self.process.stdout.readline() != "ready\n":
             pytest.fail(self.log.read_text())
@@ -67,7 +61,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Record:
-    """Adds a row to the table: what was done, how often, and what came of it."""
     return lambda what, tried, outcome: request.node.user_properties.append((ROW, (what, str(tried), outcome)))
 
 

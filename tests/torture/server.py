@@ -44,14 +44,12 @@ class Job:
 
 
 def make_room(folder: Path) -> None:
-    """A small capture and a run of stock splatfacto, room/ and outputs/."""
     room = plain_room(4000)
     write_capture(room, folder / "room", views=5, held_out=1, width=80, height=60)
     write_splatfacto_run(room, folder / "room", folder / "outputs")
 
 
 def work(words: tuple[str, ...]) -> int:
-    """Exit code of a command."""
     name, *flags = words
     if name == "room":
         make_room(Path(flags[0]))
@@ -92,7 +90,6 @@ def watch(job: Job, count: mmap.mmap) -> None:
 
 
 def start(job: Job, count: mmap.mmap) -> int:
-    """The process of a job."""
     pid = os.fork()
     if pid > 0:
         return pid

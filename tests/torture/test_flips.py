@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.torture.conftest import SHORT, Record, Server
-from tests.torture.test_kills import Place
+from tests.torture.test_kills import COMMON, Place
 
 pytestmark = pytest.mark.slow
 
@@ -27,20 +27,8 @@ def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, re
     splat = ("export", "--load-config", place.config, "--output-dir", place.folder / "out")
     server.command(*splat)
     cameras = ("--transforms", place.folder / "room", "--world-transform", place.trained.parent / TRANSFORMS)
-    common = (
-        "--encoder",
-        "color",
-        "--check-alignment",
-        False,
-        "--device",
-        "cpu",
-        "--vote-k",
-        6,
-        "--storage",
-        "evidence",
-    )
-    output = ("--timestamp", "ply", "--output-dir", place.folder / "outputs")
-    server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *common, *output)
+    more = ("--vote-k", 6, "--storage", "evidence", "--timestamp", "ply", "--output-dir", place.folder / "outputs")
+    server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *COMMON, *more)
     result = tmp_path / "flips.json"
     server.command("flips", place.folder, 0, FLIPS, result)
     found: dict[str, dict[str, int]] = json.loads(result.read_text())

@@ -16,6 +16,7 @@ from tests.torture.conftest import INSTANTS, SHORT, Record, Server
 pytestmark = pytest.mark.slow
 
 Tree = dict[str, Any]
+COMMON = ("--encoder", "color", "--check-alignment", False, "--device", "cpu")
 
 
 def tree(folder: Path) -> Tree:
@@ -48,8 +49,7 @@ class Place:
         self.config = self.runs / "one" / "config.yml"
 
     def lift(self, *flags: object) -> tuple[object, ...]:
-        common = ("--encoder", "color", "--check-alignment", False, "--device", "cpu")
-        return ("lift", "--load-config", self.trained, *common, *flags)
+        return ("lift", "--load-config", self.trained, *COMMON, *flags)
 
     def save(self) -> None:
         shutil.rmtree(self.saved, ignore_errors=True)
@@ -117,12 +117,9 @@ def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record)
         assert differing(tree(watched), new) == [], moment
         assert list(place.folder.rglob(".normlift-*")) == []
     assert set(seen) == {"old", "new"} or SHORT, seen
-    record(
-        f"kill -9 during `{name}`",
-        INSTANTS,
-        "nothing lost or left over; run again it equals an undisturbed one. Found, with "
-        f"{terms} SIGTERM: {seen['old']} times what was there before, {seen['new']} times the new",
-    )
+    found = f"{terms} SIGTERM: {seen['old']} times what was there before, {seen['new']} times the new"
+    whole = "nothing lost or left over; run again it equals an undisturbed one. Found, with"
+    record(f"kill -9 during `{name}`", INSTANTS, f"{whole} {found}")
 
 
 def spread(draw: random.Random, steps: int, count: int) -> list[int]:

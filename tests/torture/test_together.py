@@ -103,11 +103,8 @@ def test_exports_never_mix(place: Place, tmp_path: Path, record: Record) -> None
     assert sorted(codes) == [0] + [1] * (EIGHT - 1), logs
     assert all("exists" in log for code, log in zip(codes, logs) if code == 1), logs
     assert tree(place.folder / "out") in known
-    record(
-        f"{EIGHT} exports at once into one folder, with and without `--overwrite True`",
-        2 * EIGHT,
-        "files of one of them",
-    )
+    what = f"{EIGHT} exports at once into one folder, with and without `--overwrite True`"
+    record(what, 2 * EIGHT, "files of one of them")
 
 
 @pytest.mark.extra

@@ -21,7 +21,6 @@ def spheres(means: torch.Tensor, scale: float = 1.0, opacity: float | torch.Tens
 
 
 def scene_of(gaussians: GaussianScene, rgb: torch.Tensor | None = None, cameras: tuple[Camera, ...] = ()) -> Any:
-    """What viewers need of a scene."""
     n = len(gaussians)
     colours = torch.full((n, 3), 0.5) if rgb is None else rgb
     parameters = {
