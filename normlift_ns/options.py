@@ -569,12 +569,13 @@ class SplatOptions:
     paths in transforms.json."""
     masks: Path | None = None
     """Folder with one mask per image; pixels whose mask value is zero are ignored."""
-    world_transform: Path | None = None
-    """File with the similarity transform from camera to splat coordinates: a 4 x 4 matrix, or the
-    dataparser_transforms.json of the run that exported the PLY file. Default: the coordinates are the same."""
+    world_transform: Path | Literal["auto"] | None = "auto"
+    """Transform from camera to splat coordinates. auto: none, unless the splat fits its images only in one of the
+    worlds that tools produce, which is used then. A path: a file with a similarity transform as a 4 x 4 matrix, or the
+    dataparser_transforms.json of the run that exported the PLY file. None: no transform, without a search."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, as it does by default; the transform is computed again from
-    the COLMAP project. A PLY file counts as normalized only if the images then match the splat."""
+    the COLMAP project. For a PLY file, it is one of the worlds that --world-transform auto tries."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None

@@ -590,7 +590,7 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     return WorldTransform(matrix[:3] / scale, scale)
 
 
-def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) -> list[WorldTransform]:
+def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> WorldTransform:
     """Recompute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
 
     The steps are those of its datasets/normalize.py and datasets/colmap.py (1.5). First, put the cameras upright around
@@ -603,8 +603,8 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
     Raises:
         ValueError: if the normalization cannot be computed, or the trainer's formula mirrors the world.
     Returns:
-        The trainer's similarity, followed by the three that differ from it by half a turn about an axis. gsplat before
-        1.5 did not flip, and the signs of the axes depend on the linear algebra library of the training.
+        The trainer's similarity. That of a training may differ from it by half a turn about an axis: gsplat before 1.5
+        did not flip, and the signs of the axes depend on the linear algebra library of the training.
     """
     poses = np.array([np.concatenate([frame.pose, [[0, 0, 0, 1]]]) for frame in frames]) * [1, -1, -1, 1]
     with np.errstate(all="ignore"):
@@ -622,10 +622,9 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
         )
     aligned = _principal_axes(_apply(upright, points.astype(np.float32))) @ upright
     height = _apply(aligned, points.astype(np.float32))[:, 2]
-    half_turns = [np.diag(signs) for signs in ([1, 1, 1, 1], [1, -1, -1, 1], [-1, 1, -1, 1], [-1, -1, 1, 1])]
     if np.median(height) > np.mean(height):
-        half_turns[:2] = half_turns[1::-1]
-    return [decompose_similarity(half_turn @ aligned, "the normalization") for half_turn in half_turns]
+        aligned = np.diag([1.0, -1, -1, 1]) @ aligned
+    return decompose_similarity(aligned, "the normalization")
 
 
 def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
