@@ -102,9 +102,9 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         "early"
         if trained_cameras
         else "cameras of another capture; cameras in a world that --world-transform auto does not try (give a file "
-        "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with cameras "
-        "for undistorted ones; a different exposure from the training images; much smaller copies of the training "
-        "images; another --rasterize-mode or --background"
+        "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
+        "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
+        "training images; another --rasterize-mode or --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(

@@ -76,7 +76,7 @@ class _Points(NamedTuple):
         )
         image = view.image.permute(2, 0, 1)[None].float() / 255
         image = functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
-        used = torch.ones(image.shape[2:]) if view.mask is None else view.mask.float()
+        used = torch.ones_like(image[:, :1]) if view.mask is None else view.mask[None, None].float()
         variance = _centered(image, used).square().sum()
         weight = used * (drawn[:, 3:] > 0)
         first = _centered(drawn[:, :3] / drawn[:, 3:].clamp(min=1e-6), weight)
@@ -84,9 +84,8 @@ class _Points(NamedTuple):
         return covariance / (first.square().sum(dim=(1, 2, 3)) * variance).sqrt().clamp(min=1e-6)
 
 
-def _centered(image: Float[Tensor, "b c h w"], weight: Tensor) -> Float[Tensor, "b c h w"]:
+def _centered(image: Float[Tensor, "#b c h w"], weight: Float[Tensor, "#b 1 h w"]) -> Float[Tensor, "#b c h w"]:
     """Return the difference from the mean color of the pixels of weight 1; 0 at those of weight 0."""
-    weight = weight.expand(len(image), 1, *image.shape[2:])
     total = weight.sum(dim=(2, 3), keepdim=True).clamp(min=1)
     return (image - (image * weight).sum(dim=(2, 3), keepdim=True) / total) * weight
 
