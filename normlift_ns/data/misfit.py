@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from normlift_ns.data.reduced_views import ReducedView
 
-_SIDES = (50, 100, 200, 400)
-"""Longer sides of the images in pixels, from the coarsest search to the finest."""
+_SIDES, _ROUNDS = (50, 100, 200), 2
+"""Longer sides of the images in pixels, from the coarsest search to the finest, and refinements on each of them."""
 _MIN_GAIN = 1.0
 """Gain in dB that counts. A focal length that is 2 % off costs about 15 dB on a sharp scene, so 1 dB is well beyond
 chance."""
@@ -84,7 +84,7 @@ class _Search(NamedTuple):
 
 _SEARCHES = (
     _Search(lambda log: Lens(focal=float(np.exp(log))), [np.arange(-18, 19) * 0.04], 0.04),
-    _Search(lambda x, y: Lens(x=x, y=y), [np.arange(-12, 13) * 0.02] * 2, 0.02),
+    _Search(lambda x, y: Lens(x=x, y=y), [np.arange(-6, 7) * 0.04] * 2, 0.04),
     _Search(lambda k1: Lens(k1=k1), [np.arange(-8, 9) * 0.05], 0.05),
 )
 
@@ -151,11 +151,11 @@ def _fit(levels: Sequence[Sequence[_Pair]], search: _Search) -> Lens:
     """Return the lens with the highest PSNR, found on the coarsest images and refined on finer ones."""
     best = max(product(*search.values), key=lambda values: _mean(levels[0], search.make(*values)))
     step = search.step
-    for level in levels[1:]:
-        for _ in range(2):
+    for level in levels:
+        for _ in range(_ROUNDS):
+            step /= 2
             around = product(*((value - step, value, value + step) for value in best))
             best = max(around, key=lambda values: _mean(level, search.make(*values)))
-            step /= 2
     return search.make(*best)
 
 
@@ -179,9 +179,9 @@ def _describe(lens: Lens, views: Sequence[ReducedView]) -> str:
             "images {gain}. Are these images distorted and the cameras those of undistorted ones, or the reverse?"
         )
     width = views[0].view.camera.width * views[0].divisor
-    x, y = round(lens.x * width), round(lens.y * width)
+    shifts = (lens.x, "right", "left"), (lens.y, "down", "up")
+    pixels = [f"{abs(width * shift):.1f} pixels {more if shift > 0 else less}" for shift, more, less in shifts if shift]
     return (
-        f"A principal point that lies {abs(x)} pixels further {'right' if x > 0 else 'left'} and {abs(y)} pixels "
-        f"further {'down' if y > 0 else 'up'} fits the images {{gain}}. Were the images cropped since the training? "
-        "Inria's trainer puts the principal point at the center of the image."
+        f"A principal point that lies {' and '.join(pixels)} of the present one fits the images {{gain}}. Were the "
+        "images cropped since the training? Inria's trainer puts the principal point at the center of the image."
     )

@@ -144,7 +144,9 @@ def _applied_worlds(cameras: CameraFile) -> Iterator[CandidateWorld]:
 
 
 def _ns_train_worlds(options: SplatOptions, cameras: CameraFile) -> Iterator[CandidateWorld]:
-    """Yield the world to which ns-train rotates, centers and scales these cameras by default."""
+    """Yield the world to which ns-train rotates, centers and scales these cameras by default, if they differ."""
+    if len({tuple(frame.pose[:, 3].astype(np.float32)) for frame in cameras.frames}) == 1:
+        return
     applied = np.eye(4)
     if options.colmap is not None:
         applied[:3, :3] = _Y_DOWN_TO_Z_UP

@@ -16,11 +16,20 @@ from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.splat import SplatParameters
-from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_transforms, write_transforms
+from normlift_ns.data.transforms import gsplat_normalization, read_transforms, write_transforms
 from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from tests.captures import SHARED, needs_shared
-from tests.data.scene_files import in_file_world, ply_columns, rows_of, saved_run, write_colmap, write_gsplat, write_ply
+from tests.data.scene_files import (
+    in_file_world,
+    in_world,
+    ply_columns,
+    rows_of,
+    saved_run,
+    write_colmap,
+    write_gsplat,
+    write_ply,
+)
 from tests.random_scenes import generator
 
 ROUNDED = 5e-4
@@ -124,30 +133,17 @@ def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, ki
         matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
         frames, back = in_file_world(frames, matrix), np.linalg.inv(matrix)
         points = points @ back[:3, :3].T + back[:3, 3]
-        write_gsplat(path, _in_world(splat, _normalization(frames, points) @ back))
+        write_gsplat(path, in_world(splat, _normalization(frames, points) @ back))
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
     scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=kind == "normalized"))
     assert scene.step == 29999
     assert difference(native, scene) < (ROUNDED if kind == "normalized" else 1e-5)
 
 
-def _normalization(frames: list[Frame], points: np.ndarray, number: int = 0) -> np.ndarray:
-    """[4, 4]: one of the worlds in which gsplat may have trained."""
-    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[number]
+def _normalization(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """[4, 4]: the world in which gsplat trains."""
+    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)
     return np.vstack([world.scale * world.transform, [0, 0, 0, 1]])
-
-
-def _in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
-    """The Gaussians in another world, computed in float64."""
-    world = decompose_similarity(matrix, "test")
-    turn = torch.from_numpy(world.transform[:, :3])
-    quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
-    return replace(
-        splat,
-        means=(world.scale * (splat.means.double() @ turn.T + torch.from_numpy(world.transform[:, 3]))).float(),
-        quats=torch.from_numpy(quats.as_quat()[:, [3, 0, 1, 2]]).float(),
-        scales=(splat.scales.double() + np.log(world.scale)).float(),
-    )
 
 
 def _before(frames: list[Frame], moves: torch.Tensor, kept: tuple[str, ...]) -> list[Frame]:
@@ -174,14 +170,17 @@ def test_a_normalized_world_is_found(native, splat, frames, given, tmp_path: Pat
     points = splat.means.numpy()[::3]
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
     for number in numbers:
-        there = _in_world(splat, _normalization(frames, points, number))
+        half_turn = np.diag([*np.where(np.arange(3) == number - 1, 1.0, -1.0 if number else 1.0), 1])
+        there = in_world(splat, half_turn @ _normalization(frames, points))
         if number == 0:
             path = write_ply(tmp_path / "point_cloud_29999.ply", ply_columns(there))
         else:
             path = write_gsplat(tmp_path / f"ckpt_{number}_rank0.pt", there)
         said: list[str] = []
         scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
-        assert any(("normalized world" if number == 0 else "half a turn") in text for text in said)
+        axis = f" after half a turn about {'xyz'[number - 1]}" if number else ""
+        assert scene.identity["source_world"]["name"] == f"gsplat's normalized world{axis}"
+        assert any(f"gsplat's normalized world{axis} (" in text for text in said)
         assert not any("have no camera" in text for text in said)
         assert difference(native, scene) < ROUNDED
 
