@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import SplatScene, save_splat, splatfacto_checkpoint
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import decompose_similarity
@@ -77,6 +78,17 @@ def saved_run(folder: Path, scene: SplatScene) -> Path:
 
 def rows_of(splat: SplatParameters, rows: slice) -> SplatParameters:
     return SplatParameters(**{name: value[rows] for name, value in splat.parameters.items()})
+
+
+def frames_of(scene: NerfstudioScene) -> list[Frame]:
+    """The cameras of a run whose images have no distortion, in the world of its splat."""
+    found = []
+    for views in (scene.train, scene.held_out):
+        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
+            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+            intrinsics = Intrinsics(fx, fy, cx, cy, camera.width, camera.height)
+            found.append(Frame(file, name, pose.double().numpy(), intrinsics))
+    return found
 
 
 def in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:

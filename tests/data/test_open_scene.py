@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import normlift_ns as nl
-from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.frames import Frame
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.splat import SplatParameters
@@ -21,6 +21,7 @@ from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from tests.captures import SHARED, needs_shared
 from tests.data.scene_files import (
+    frames_of,
     in_file_world,
     in_world,
     ply_columns,
@@ -53,13 +54,7 @@ def splat(native) -> SplatParameters:
 @pytest.fixture(scope="module")
 def frames(native) -> list[Frame]:
     """The cameras of the run, as nerfstudio has them, in the world of the splat."""
-    found = []
-    for views in (native.train, native.held_out):
-        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
-            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-            intrinsics = Intrinsics(fx, fy, cx, cy, camera.width, camera.height)
-            found.append(Frame(file, name, pose.double().numpy(), intrinsics))
-    return found
+    return frames_of(native)
 
 
 def difference(native, scene, views=(0, 3, 6, 9)) -> float:
