@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,7 +80,7 @@ class Case:
             self.frames = [replace(frame, file=_pale_image(frame, folder)) for frame in self.frames]
 
     def open(
-        self, matrix: np.ndarray | None = None, frames: list[Frame] | None = None, **options: object
+        self, matrix: np.ndarray | None = None, frames: list[Frame] | None = None, **options: Any
     ) -> tuple[SplatScene, Stopwatch]:
         """Open the splat in another world, with cameras, and tell the seconds of the search."""
         self.count += 1
@@ -95,7 +96,7 @@ class Case:
         path.unlink()
         return scene, watch
 
-    def worlds(self) -> Iterator[tuple[str, str, np.ndarray | None, dict[str, object]]]:
+    def worlds(self) -> Iterator[tuple[str, str, np.ndarray | None, dict[str, Any]]]:
         """Yield key and part of the name of every world, the change of the splat, and options of its cameras."""
         for key, linear in TURNS.items():
             yield key, "", _square(linear), {}
@@ -132,7 +133,7 @@ def _pale_image(frame: Frame, folder: Path) -> Path:
     return path
 
 
-def _first(case: Case, matrix: np.ndarray | None, options: dict[str, object]) -> Alignment:
+def _first(case: Case, matrix: np.ndarray | None, options: dict[str, Any]) -> Alignment:
     """Return the alignment without a search."""
     scene, _ = case.open(matrix, **{**options, "world_transform": None})
     return measure_alignment(scene, explain=False)
@@ -159,9 +160,9 @@ def measure(case: Case, report: Report, *, quick: bool) -> None:
         report.add(f"{name}.{key}.psnr", measure_alignment(scene, explain=False).psnr, "dB")
         report.add(f"{name}.{key}.seconds", watch.seconds, "s")
         print(name, key, world["name"], found, f"{watch.seconds:.1f} s", flush=True)
-    taken, rotations = 0, 4 if quick else ROTATIONS
-    for seed in range(rotations):
-        turn = Rotation.random(random_state=1000 * CAPTURES.index(name) + seed).as_matrix()
+    taken, rotations, generator = 0, 4 if quick else ROTATIONS, np.random.default_rng(CAPTURES.index(name))
+    for number in range(rotations):
+        turn = Rotation.from_quat(generator.normal(size=4)).as_matrix()
         frames = in_file_world(case.frames, _square(turn))
         scene, watch = case.open(frames=frames)
         taken += scene.alignment is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import fmean, median
 from typing import NamedTuple
 
 from jaxtyping import Bool, Float, UInt8
@@ -35,14 +36,11 @@ class Alignment(NamedTuple):
     visible_fraction: float
     """Largest fraction of the Gaussians that lies in one view, in 0..1."""
     mean_color_psnr: float
-    """PSNR in dB of a constant image in the mean color of each image."""
+    """Mean over the views of the PSNR in dB of a constant image in the mean color of the image."""
+    margin: float
+    """Median over the views of the distance in dB of the render from that constant image."""
     cause: str | None = None
     """Sentence about another lens or primitive that fits the images better; None if none was found."""
-
-    @property
-    def margin(self) -> float:
-        """Distance in dB of the renders from the images' mean color."""
-        return self.psnr - self.mean_color_psnr
 
     @property
     def is_usual(self) -> bool:
@@ -84,8 +82,9 @@ def _compare(
     visible = max(float(in_frustum(gaussians.means, small.view.camera).float().mean()) for small in views)
     psnrs = {small.view.name: small.psnr(image) for small, image in zip(views, renders)}
     worst = min(psnrs, key=lambda name: psnrs[name])
-    constant = sum(small.psnr(small.mean_color()) for small in views) / len(views)
-    return Alignment(sum(psnrs.values()) / len(psnrs), (worst, psnrs[worst]), visible, constant)
+    constants = {small.view.name: small.psnr(small.mean_color()) for small in views}
+    margin = median(psnrs[name] - constants[name] for name in psnrs)
+    return Alignment(fmean(psnrs.values()), (worst, psnrs[worst]), visible, fmean(constants.values()), margin)
 
 
 def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
@@ -115,8 +114,8 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     if match.margin < MIN_MARGIN:
         problem = (
             f"The splat does not show what its images show: renders from three of the cameras reach {match.psnr:.1f} "
-            f"dB, and the mean color of the images {match.mean_color_psnr:.1f} dB. Expected a render that is better "
-            f"than the mean color by at least {MIN_MARGIN:.0f} dB. {reason}"
+            f"dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
+            f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
         if not trained_cameras:
             raise InputError(f"{problem} --check-alignment False lifts anyway.")

@@ -20,7 +20,7 @@ from normlift_ns.data.worlds import CandidateWorld
 from normlift_ns.rasterization.projection import rotation_matrices
 from normlift_ns.rasterization.settings import RasterSettings
 
-_SIDE, _POINTS, _BATCH = 48, 20_000, 32
+_SIDE, _POINTS, _BATCH = 32, 8000, 64
 """Longer side in pixels of the images that points are compared with, their number, and cameras compared together."""
 _MAX_SAMPLED = 2**20
 """Number of Gaussians among which the points are drawn."""
@@ -28,11 +28,11 @@ _SAME_DEPTH = 1.05
 """Distance of a visible point, relative to that of the nearest point in the same pixel."""
 _LIKELY, _MAX_LIKELY = 0.7, 4
 """Agreement of worlds that are rendered, relative to the best one, and their largest number."""
-_SCALES = 1.2 ** np.arange(-38, 39)
+_SCALES = 1.12 ** np.arange(-61, 62)
 """Uniform scales that are tried, 0.001 to 1000."""
-_SHRINKING = (0.08, 0.04, 0.02, 0.01)
+_SHRINKING = (0.04, 0.02, 0.01)
 """Steps of the logarithm of a scale, in which points refine it."""
-_GAUSS_NEWTON = ((100, 0.01), (100, 0.01), (400, 0.003), (400, 0.003))
+_GAUSS_NEWTON = ((50, 0.02), (100, 0.01), (400, 0.003), (400, 0.003))
 """Longer side of the renders that refine a scale, and the change of its logarithm for their derivative."""
 _MAX_STEP, _MIN_START = 0.05, 2.0
 """Largest step of that logarithm, and distance in dB from the mean color of an image that a first render needs."""
@@ -135,7 +135,9 @@ class _Search:
 
     def likely_scales(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
         """Return worlds that may fit with another uniform scale, the best first."""
-        unscaled = [candidate for candidate in candidates if candidate.world.scale == 1]
+        unscaled = [
+            candidate for candidate in candidates if candidate.world.scale == 1 and not candidate.opencv_cameras
+        ]
         scaled = [candidate.scaled(float(scale)) for candidate in unscaled for scale in _SCALES]
         grid = self.agreement(scaled).view(len(unscaled), len(_SCALES))
         best, column = grid.max(dim=1)
@@ -145,7 +147,7 @@ class _Search:
 
     def _is_near(self, candidate: CandidateWorld) -> bool:
         """Return whether a small render beats the mean color of an image."""
-        small = self._farthest(candidate).reduced(_GAUSS_NEWTON[0][0])
+        small = self._farthest(candidate).reduced(_GAUSS_NEWTON[1][0])
         return small.psnr(self._render(small, candidate)) >= small.psnr(small.mean_color()) + _MIN_START
 
     def _farthest(self, candidate: CandidateWorld) -> ReducedView:

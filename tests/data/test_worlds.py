@@ -156,6 +156,7 @@ def test_a_given_world_or_none_is_not_searched(splat, transforms, tmp_path: Path
         assert scene.alignment is None and scene.identity["source_world"]["name"] == name
 
 
+@pytest.mark.slow
 def test_a_repeated_lift_takes_its_evidence_from_the_cache(splat, transforms, tmp_path: Path, monkeypatch) -> None:
     options = {"source": nl.SourceOptions(encoder="color", regions="grid"), "lift": nl.LiftOptions(max_views=3)}
     there, counts, first = in_world(splat, square(1.37 * TURNS["after half a turn about y"])), [], 0
