@@ -167,9 +167,7 @@ def measure(case: Case, report: Report, *, quick: bool) -> None:
         scene, watch = case.open(frames=frames)
         taken += scene.alignment is not None
         wrong.append(measure_alignment(scene, explain=False).margin)
-        print(
-            name, "random", seed, f"{wrong[-1]:.1f} dB {watch.seconds:.1f} s", scene.alignment is not None, flush=True
-        )
+        print(name, "random", number, f"{wrong[-1]:.1f} dB, {watch.seconds:.1f} s, {taken} taken", flush=True)
     report.add(f"{name}.wrong.margin", max(wrong), "dB")
     report.add(f"{name}.random.rotations", rotations, "rotations")
     report.add(f"{name}.random.taken", taken, "rotations")
