@@ -270,7 +270,9 @@ def announce(prepared: PreparedLift) -> None:
 def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
     """Compare training images with renders of the scene; return a warning if they differ, and raise if nothing fits."""
     settings = RasterSettings.recorded({**scene.identity, "gsplat_rules": resolve_gsplat_version(scene, options)})
-    match = measure_alignment(scene, settings, device=device)
+    measured_with = RasterSettings.recorded(scene.identity)
+    match = scene.alignment if isinstance(scene, SplatScene) and settings == measured_with else None
+    match = match or measure_alignment(scene, settings, device=device)
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 

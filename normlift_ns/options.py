@@ -571,12 +571,14 @@ class SplatOptions:
     transforms.json."""
     masks: Path | None = None
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
-    world_transform: Path | None = None
-    """File with the similarity transform from the world of the cameras to that of the splat: a 4 x 4 matrix, or the
-    dataparser_transforms.json of the run that exported the PLY file. None: the coordinates are the same."""
+    world_transform: Path | Literal["auto"] | None = "auto"
+    """Transform from the world of the cameras to that of the splat. auto: none, unless the splat fits its images only
+    in one of the worlds that tools produce; that world is then used. A path: a file with a similarity transform as a
+    4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no transform, without a
+    search."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
-    COLMAP project. For a PLY file, the transform is used only if renders match the images better with it."""
+    COLMAP project. For a PLY file, it is one of the worlds that --world-transform auto tries."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None

@@ -238,7 +238,7 @@ class NormLift(CheckedOptions):
 
         splat = self.load_ply or self.load_gsplat
         if splat is not None:
-            scene: Any = open_splat(splat, self.splat, say=common.info_progress)
+            scene: Any = open_splat(splat, self.splat, device=self.device, say=common.info_progress)
         else:
             scene = open_scene(cast(Path, self.load_config), data=self.data, load_step=self.load_step)
         if self.add_images is None:

@@ -178,7 +178,8 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
         check_readable_folder(getattr(splat, name), f"--{name}")
     if splat.transforms is not None and not splat.transforms.is_dir():
         check_readable_file(splat.transforms, "--transforms")
-    check_readable_file(splat.world_transform, "--world-transform")
+    if isinstance(splat.world_transform, Path):
+        check_readable_file(splat.world_transform, "--world-transform")
 
 
 def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:

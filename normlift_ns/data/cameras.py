@@ -1,4 +1,4 @@
-"""Cameras of a splat without a nerfstudio run: camera files, world transforms and learned pose adjustments."""
+"""Cameras of a splat without a nerfstudio run: camera files and learned pose adjustments."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.colmap import read_colmap, read_colmap_points
-from normlift_ns.data.frames import GIVE_IMAGES, Frame, WorldTransform, check_frames, rescale_intrinsics
-from normlift_ns.data.splat import SplatFile
-from normlift_ns.data.transforms import CameraFile, gsplat_normalization, read_transforms, read_world_transform
+from normlift_ns.data.colmap import read_colmap
+from normlift_ns.data.frames import GIVE_IMAGES, Frame, check_frames, rescale_intrinsics
+from normlift_ns.data.transforms import CameraFile, read_transforms
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
-_MIN_POINTS, _PARALLEL = 4, 1e-6
+_PARALLEL = 1e-6
 
 
 def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
@@ -50,53 +49,6 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
         cameras = read_colmap(options.colmap.absolute(), options.images, options.masks, advice=advice)
     check_frames(cameras.frames, cameras.source)
     return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source, advice) for frame in cameras.frames])
-
-
-_TURNED = "The splat matches its images after a rotation of gsplat's normalized world by half a turn, which is used."
-_NORMALIZED = "The splat matches its images in gsplat's normalized world, which is used instead of the cameras' world."
-
-
-def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[tuple[str, WorldTransform]]:
-    """Return possible transforms from the world of the cameras to the world of the splat.
-
-    If there are several, the caller compares renders with the images, and shows the message of the transform that it
-    chooses. PLY files may come from gsplat's trainer, so its normalized world is an alternative for PLY files too.
-    """
-    if options.world_transform is not None:
-        world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
-        return [("", world)]
-    same = [("", WorldTransform(np.eye(4)[:3], 1.0))]
-    if not options.gsplat_normalize or not (file.by_gsplat or options.colmap):
-        return same
-    try:
-        first, *turned = _normalizations(options, cameras)
-    except (ValueError, FileNotFoundError):
-        if not file.by_gsplat:
-            return same
-        raise
-    worlds = [("", first)] if file.by_gsplat else [*same, (_NORMALIZED, first)]
-    return [*worlds, *((_TURNED, world) for world in turned)]
-
-
-def _normalizations(options: SplatOptions, cameras: CameraFile) -> list[WorldTransform]:
-    """Compute the normalizations that gsplat's trainer may have applied to its COLMAP project."""
-    if options.colmap is None:
-        raise InputError(
-            "gsplat's trainer normalized the world of the splat with the points of its COLMAP project, which a "
-            "transforms.json does not contain. Give the project with --colmap, or a known transform with "
-            "--world-transform. If the training used --no-normalize-world-space, give --gsplat-normalize False."
-        )
-    try:
-        points = read_colmap_points(cameras.source)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{error} gsplat's trainer used points3D to normalize the world.") from error
-    if len(points) < _MIN_POINTS:
-        raise InputError(
-            f"{cameras.source} has {len(points)} points, too few to compute the normalization of gsplat's trainer. "
-            "Give the project that the splat was trained with. If the training used --no-normalize-world-space, give "
-            "--gsplat-normalize False."
-        )
-    return gsplat_normalization(cameras.frames, points)
 
 
 def adjust_poses(

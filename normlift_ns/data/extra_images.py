@@ -14,6 +14,7 @@ from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import WorldTransform, transform_frames
 from normlift_ns.data.open_scene import AnyScene, SplatScene, with_frames
 from normlift_ns.data.transforms import CameraFile, relative_name
+from normlift_ns.data.worlds import with_opengl_axes
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
@@ -41,6 +42,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
         SplatOptions(transforms=path, images=images) if is_transforms else SplatOptions(colmap=path, images=images)
     )
     extended = read_camera_file(options, f"remove them from {path}")
+    if scene.identity.get("source_world", {}).get("opencv_cameras", False):  # so the extended file has them, too
+        extended = extended._replace(frames=with_opengl_axes(extended.frames))
     splits = (scene.train, scene.held_out)
     known = {_key(name): camera for views in splits for name, camera in zip(views.names, views.cameras)}
     new = [frame for frame in extended.frames if _key(frame.name) not in known]

@@ -20,6 +20,7 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View, Views, camera_summary, cameras_differ
+from normlift_ns.data.alignment import Alignment
 from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, check_frames
 from normlift_ns.data.images import ImageViews
@@ -55,6 +56,8 @@ class SplatScene:
     background_name: Background
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
+    alignment: Alignment | None = None
+    """Agreement with the images by the rules of gsplat 1.4, if it was measured to find the world."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""
@@ -223,7 +226,7 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
     remarks = (*scene.remarks, *views.check_files())
     if isinstance(scene, SplatScene):
         train = sorted([*scene.train.frames, *frames], key=lambda frame: frame.file)
-        return replace(scene, train=ImageViews(train, scene.background), remarks=remarks)
+        return replace(scene, train=ImageViews(train, scene.background), remarks=remarks, alignment=None)
     return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, extra_frames=tuple(frames))
 
 

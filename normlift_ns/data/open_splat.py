@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from normlift_ns.core.arguments import check_arguments
-from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
-from normlift_ns.data.cameras import adjust_poses, candidate_worlds, read_camera_file
-from normlift_ns.data.frames import WorldTransform, transform_frames
+from normlift_ns.core.device import choose_device
+from normlift_ns.data.cameras import adjust_poses, read_camera_file
 from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names
@@ -21,6 +20,8 @@ from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, SplatParameters, flatten_splat, validate_splat
 from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
 from normlift_ns.data.transforms import CameraFile
+from normlift_ns.data.world_search import find_world
+from normlift_ns.data.worlds import CandidateWorld, candidate_worlds
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
 from normlift_ns.options import Primitive, SplatOptions
@@ -32,14 +33,19 @@ _MAX_STEP = 0.1
 
 @check_arguments
 def open_splat(
-    path: str | Path, options: SplatOptions, *, say: Callable[[str], None] = lambda text: None
+    path: str | Path,
+    options: SplatOptions,
+    *,
+    device: str = "auto",
+    say: Callable[[str], None] = lambda text: None,
 ) -> SplatScene:
-    """Open a trained splat and its images.
+    """Open a trained splat and its images, in the world in which it fits them.
 
     Args:
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
             simple_trainer. The format is detected by the first bytes. Installed packages may add formats by suffix.
         options: Paths of the cameras and images, and settings of the splat.
+        device: auto, cpu or cuda; device of the renders that find the world.
         say: Function that is called with one sentence per assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
@@ -68,8 +74,8 @@ def open_splat(
     for text in _assumptions(path, options, file, held_out, cameras):
         say(text)
 
-    def scene_in(world: WorldTransform) -> SplatScene:
-        placed = transform_frames(cameras.frames, world)
+    def scene_in(candidate: CandidateWorld) -> SplatScene:
+        placed, world = candidate.place(cameras.frames), candidate.world
         if file.pose_adjust is not None:
             placed = adjust_poses(placed, held_out, file.pose_adjust, path)
         train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), options.background)
@@ -86,7 +92,12 @@ def open_splat(
                 "source_splat": str(path),
                 "source_cameras": str(cameras.source),
                 "source_step": file.step,
-                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+                "source_world": {
+                    "name": candidate.name,
+                    "transform": world.transform.tolist(),
+                    "scale": float(world.scale),
+                    "opencv_cameras": candidate.opencv_cameras,
+                },
                 **({"primitive": "2dgs", "clip_planes": file.clip_planes} if file.primitive == "2dgs" else {}),
             },
             options.rasterize_mode or file.rasterize_mode or "classic",
@@ -94,18 +105,13 @@ def open_splat(
             train.check_files(),
         )
 
-    (_, first), *others = candidate_worlds(file, options, cameras)
-    if len(others) == 0:
-        positions = np.array([frame.pose[:, 3] for frame in transform_frames(cameras.frames, first)])
-        _check_coordinates(file.splat, positions, f"The cameras of {cameras.source}", options)
-    scene = scene_in(first)
-    if len(others) == 0 or mean_psnr(scene) >= MIN_PSNR:
-        return scene
-    for text, world in others:
-        other = scene_in(world)
-        if mean_psnr(other) >= MIN_PSNR:  # renders match the images
-            say(text)
-            return other
+    candidates = candidate_worlds(file, options, cameras)
+    if len(candidates) == 1:
+        scene = scene_in(candidates[0])
+    else:
+        scene = find_world(candidates, scene_in, device=choose_device(device), say=say)
+    positions = np.array([frame.pose[:, 3] for frame in (*scene.train.frames, *scene.held_out.frames)])
+    _check_coordinates(file.splat, positions, f"The cameras of {cameras.source}", options)
     return scene
 
 
@@ -131,7 +137,7 @@ def _check_coordinates(
         f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
         f"zone. The step of float32 is {step:.2g} there, too coarse for Gaussians {width:.2g} wide. Subtract the same "
         f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Splat: export it with this offset "
-        f"from the program that wrote it.{place if options.world_transform is None else ''}"
+        f"from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
     )
 
 

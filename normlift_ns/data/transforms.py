@@ -606,7 +606,7 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     return WorldTransform(matrix[:3] / scale, scale)
 
 
-def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) -> list[WorldTransform]:
+def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> WorldTransform:
     """Compute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
 
     The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step turns the cameras
@@ -617,8 +617,8 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer, followed by the three that differ from it by half a turn about an axis. The signs
-        of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip the points.
+        The similarity of the trainer. That of a training may differ from it by half a turn about an axis. The signs of
+        the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip the points.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """
@@ -638,10 +638,9 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
         )
     aligned = _principal_axes(_apply(upright, points.astype(np.float32))) @ upright
     height = _apply(aligned, points.astype(np.float32))[:, 2]
-    half_turns = [np.diag(signs) for signs in ([1, 1, 1, 1], [1, -1, -1, 1], [-1, 1, -1, 1], [-1, -1, 1, 1])]
     if np.median(height) > np.mean(height):
-        half_turns[:2] = half_turns[1::-1]
-    return [decompose_similarity(half_turn @ aligned, "the normalization") for half_turn in half_turns]
+        aligned = np.diag([1.0, -1, -1, 1]) @ aligned
+    return decompose_similarity(aligned, "the normalization")
 
 
 def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

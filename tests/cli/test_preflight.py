@@ -132,7 +132,7 @@ QUERY = [
     ("--inventory --text red", "cannot be combined"),
     ("--text red --image a.png", "--inventory"),
     ("--inventory --vocabulary none.txt", "does not exist"),
-    ("--inventory --save-query", "--text only"),
+    ("--inventory --save-query", "--save-query"),
 ]
 EXPORT = [
     ("--select selection", "--select selection", "--text"),

@@ -11,8 +11,10 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import SplatScene, save_splat, splatfacto_checkpoint
 from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.transforms import decompose_similarity
 
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
@@ -66,6 +68,42 @@ def saved_run(folder: Path, scene: SplatScene) -> Path:
 
 def rows_of(splat: SplatParameters, rows: slice) -> SplatParameters:
     return SplatParameters(**{name: value[rows] for name, value in splat.parameters.items()})
+
+
+def frames_of(scene: NerfstudioScene) -> list[Frame]:
+    """The cameras of a run whose images have no distortion, in the world of its splat."""
+    found = []
+    for views in (scene.train, scene.held_out):
+        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
+            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+            intrinsics = Intrinsics(fx, fy, cx, cy, camera.width, camera.height)
+            found.append(Frame(file, name, pose.double().numpy(), intrinsics))
+    return found
+
+
+def in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
+    """The Gaussians and their colors in another world, computed in float64."""
+    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (slow)
+
+    world, degree = decompose_similarity(matrix, "test"), splat.degree
+    turn = torch.from_numpy(world.transform[:, :3])
+    quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
+    directions = torch.from_numpy(Rotation.random(64, random_state=0).as_matrix()[:, 0])
+    basis = torch.eye((degree + 1) ** 2, dtype=torch.float64)[:, None, :, None].expand(-1, 64, -1, 3)
+    here, there = (
+        torch.stack([_spherical_harmonics(degree, along, one)[:, 0] for one in basis[1:]], dim=1)
+        if degree > 0
+        else torch.zeros(64, 0, dtype=torch.float64)
+        for along in (directions @ turn, directions)
+    )
+    change = torch.linalg.lstsq(there, here).solution
+    return replace(
+        splat,
+        means=(world.scale * (splat.means.double() @ turn.T + torch.from_numpy(world.transform[:, 3]))).float(),
+        quats=torch.from_numpy(quats.as_quat()[:, [3, 0, 1, 2]]).float(),
+        scales=(splat.scales.double() + np.log(world.scale)).float(),
+        features_rest=(change @ splat.features_rest.double()).float(),
+    )
 
 
 def camera_parameters(model: str, c: Intrinsics) -> list[float]:

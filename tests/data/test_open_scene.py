@@ -12,15 +12,25 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import normlift_ns as nl
-from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.frames import Frame
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.splat import SplatParameters
-from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_transforms, write_transforms
+from normlift_ns.data.transforms import gsplat_normalization, read_transforms, write_transforms
 from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from tests.captures import SHARED, needs_shared
-from tests.data.scene_files import in_file_world, ply_columns, rows_of, saved_run, write_colmap, write_gsplat, write_ply
+from tests.data.scene_files import (
+    frames_of,
+    in_file_world,
+    in_world,
+    ply_columns,
+    rows_of,
+    saved_run,
+    write_colmap,
+    write_gsplat,
+    write_ply,
+)
 from tests.random_scenes import generator
 
 ROUNDED = 5e-4
@@ -44,13 +54,7 @@ def splat(native) -> SplatParameters:
 @pytest.fixture(scope="module")
 def frames(native) -> list[Frame]:
     """The cameras of the run, as nerfstudio has them, in the world of the splat."""
-    found = []
-    for views in (native.train, native.held_out):
-        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
-            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-            intrinsics = Intrinsics(fx, fy, cx, cy, camera.width, camera.height)
-            found.append(Frame(file, name, pose.double().numpy(), intrinsics))
-    return found
+    return frames_of(native)
 
 
 def difference(native, scene, views=(0, 3, 6, 9)) -> float:
@@ -122,29 +126,17 @@ def test_a_checkpoint_of_gsplat(native, splat, frames, given, tmp_path: Path, ki
         matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
         frames, back = in_file_world(frames, matrix), np.linalg.inv(matrix)
         points = points @ back[:3, :3].T + back[:3, 3]
-        write_gsplat(path, _in_world(splat, _normalization(frames, points) @ back))
+        write_gsplat(path, in_world(splat, _normalization(frames, points) @ back))
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
     scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=kind == "normalized"))
     assert scene.step == 29999
     assert difference(native, scene) < (ROUNDED if kind == "normalized" else 1e-5)
 
 
-def _normalization(frames: list[Frame], points: np.ndarray, number: int = 0) -> np.ndarray:
-    """[4, 4]: one of the worlds in which gsplat may have trained."""
-    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[number]
+def _normalization(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """[4, 4]: the world in which gsplat trains."""
+    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)
     return np.vstack([world.scale * world.transform, [0, 0, 0, 1]])
-
-
-def _in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
-    world = decompose_similarity(matrix, "test")
-    turn = torch.from_numpy(world.transform[:, :3])
-    quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
-    return replace(
-        splat,
-        means=(world.scale * (splat.means.double() @ turn.T + torch.from_numpy(world.transform[:, 3]))).float(),
-        quats=torch.from_numpy(quats.as_quat()[:, [3, 0, 1, 2]]).float(),
-        scales=(splat.scales.double() + np.log(world.scale)).float(),
-    )
 
 
 def _before(frames: list[Frame], moves: torch.Tensor, kept: tuple[str, ...]) -> list[Frame]:
@@ -171,14 +163,17 @@ def test_a_normalized_world_is_found(native, splat, frames, given, tmp_path: Pat
     points = splat.means.numpy()[::3]
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
     for number in numbers:
-        there = _in_world(splat, _normalization(frames, points, number))
+        half_turn = np.diag([*np.where(np.arange(3) == number - 1, 1.0, -1.0 if number else 1.0), 1])
+        there = in_world(splat, half_turn @ _normalization(frames, points))
         if number == 0:
             path = write_ply(tmp_path / "point_cloud_29999.ply", ply_columns(there))
         else:
             path = write_gsplat(tmp_path / f"ckpt_{number}_rank0.pt", there)
         said: list[str] = []
         scene = nl.open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
-        assert any(("normalized world" if number == 0 else "half a turn") in text for text in said)
+        axis = f" after half a turn about {'xyz'[number - 1]}" if number else ""
+        assert scene.identity["source_world"]["name"] == f"gsplat's normalized world{axis}"
+        assert any(f"gsplat's normalized world{axis} (" in text for text in said)
         assert not any("have no camera" in text for text in said)
         assert difference(native, scene) < ROUNDED
 

@@ -89,8 +89,7 @@ def test_gsplats_normalization_undoes_any_similarity(seed: int) -> None:
     """However the world of the project is turned and scaled: cameras at distance 1 over a level floor."""
     tilt = Rotation.random(random_state=seed)
     frames, points = _ring(tilt, 0.1 + seed)
-    worlds = gsplat_normalization(frames, points)
-    world = worlds[0]
+    world = gsplat_normalization(frames, points)
     there = world.scale * (points @ world.transform[:, :3].T + world.transform[:, 3])
     assert np.allclose(np.median(there, axis=0), 0, atol=0.05)  # medians do not turn with the axes
     spread = there.std(axis=0)
@@ -98,8 +97,6 @@ def test_gsplats_normalization_undoes_any_similarity(seed: int) -> None:
     assert np.mean(there[:, 2]) >= np.median(there[:, 2])  # the tail points up
     poses = np.array([frame.pose for frame in transform_frames(frames, world)])
     assert np.allclose(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1), 1, atol=0.01)
-    turns = {tuple(np.round(np.diag(w.transform[:, :3] @ world.transform[:, :3].T)).astype(int)) for w in worlds}
-    assert turns == {(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)}
 
 
 def test_a_world_that_gsplat_mirrors_is_refused() -> None:

@@ -1,0 +1,87 @@
+"""Some training views at reduced size, with renders of the same size, for checks before a lift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.scene import Scene, View
+from normlift_ns.errors import InputError
+from normlift_ns.rasterization.rasterize import render_image
+from normlift_ns.rasterization.settings import RasterSettings
+
+_MAX_SIDE = 400
+"""Longer side in pixels."""
+_MAX_DIVISOR_AS_TRAINED = 4.0
+"""Divisor of an image's size below which it is compared with a render in the trained mode, with the rasterizer's 0.3
+square pixels scaled down. Above it, that render would be too thick. An antialiased one is used instead, which preserves
+the mean of Gaussians smaller than a pixel."""
+_SMALL_EPS2D = 0.1
+"""Square pixels that the antialiased renders add to projected Gaussians."""
+
+
+class ReducedView(NamedTuple):
+    """A view at no more than 400 pixels."""
+
+    view: View
+    divisor: float
+    """Divisor of the sides of the image, at least 1."""
+
+    def reduced(self, side: int) -> ReducedView:
+        """Return the view at no more than `side` pixels, by averaging pixels, which needs no further filter."""
+        camera = self.view.camera
+        divisor = max(1.0, max(camera.width, camera.height) / side)
+        width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
+        return ReducedView(self.view.downscaled(height, width), self.divisor * divisor)
+
+    def psnr(self, image: UInt8[Tensor, "h w 3"]) -> float:
+        """Return the PSNR in dB of a render, outside the mask of the view."""
+        difference = (self.view.image.float() - image.float()) / 255
+        if self.view.mask is not None:
+            difference = difference[self.view.mask]
+        return float(-10 * difference.square().mean().clamp(min=1e-9).log10()) if difference.numel() > 0 else 0.0
+
+    def mean_color(self) -> UInt8[Tensor, "h w 3"]:
+        """Return a constant image in the mean color of the image."""
+        view = self.view
+        pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
+        color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
+        return color.round().to(torch.uint8).expand_as(view.image)
+
+    def render(self, scene: Scene, gaussians: GaussianScene, settings: RasterSettings) -> UInt8[Tensor, "h w 3"]:
+        """Render the scene so that it looks like a downscaled render at full size.
+
+        Args:
+            scene: the scene.
+            gaussians: its Gaussians on the rendering device.
+            settings: constants of the rasterizer at full size.
+        """
+        as_trained = self.divisor < _MAX_DIVISOR_AS_TRAINED
+        if gaussians.primitive == "2dgs" and self.divisor > 1:  # as thin 3D Gaussians, whose blur can be reduced
+            gaussians, as_trained = replace(gaussians, primitive="3dgs"), False
+        eps2d = settings.eps2d / self.divisor**2 if as_trained else _SMALL_EPS2D
+        mode = scene.rasterize_mode if as_trained else "antialiased"
+        settings = replace(settings, eps2d=eps2d)
+        return render_image(scene, self.view.camera, settings=settings, mode=mode, gaussians=gaussians)
+
+
+def sample_views(scene: Scene) -> list[ReducedView]:
+    """Return the first, the middle and the last training view at no more than 400 pixels.
+
+    Raises:
+        FileNotFoundError, ValueError: if an image is missing or cannot be read, or the masks leave no pixels.
+    """
+    last = len(scene.train) - 1
+    views = [ReducedView(scene.train[index], 1.0).reduced(_MAX_SIDE) for index in sorted({0, last // 2, last})]
+    usable = [small for small in views if small.view.mask is None or bool(small.view.mask.any())]
+    if len(usable) == 0:
+        raise InputError(
+            f"The masks of {', '.join(small.view.name for small in views)} leave no pixels. Expected masks that are "
+            "zero at pixels to ignore; are they inverted?"
+        )
+    return usable

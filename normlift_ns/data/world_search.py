@@ -1,0 +1,262 @@
+"""Search for the world in which a splat fits its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from normlift_ns.core.scene import View
+from normlift_ns.data.alignment import Alignment, measure_alignment
+from normlift_ns.data.open_scene import SplatScene
+from normlift_ns.data.reduced_views import ReducedView, sample_views
+from normlift_ns.data.worlds import CandidateWorld
+from normlift_ns.rasterization.projection import rotation_matrices
+from normlift_ns.rasterization.settings import RasterSettings
+
+_SIDE, _POINTS, _BATCH = 32, 8000, 64
+"""Longer side in pixels of the images that points are compared with, their number, and cameras compared together."""
+_MAX_SAMPLED = 2**20
+"""Number of Gaussians among which the points are drawn."""
+_SAME_DEPTH = 1.05
+"""Distance of a visible point, relative to that of the nearest point in the same pixel."""
+_LIKELY, _MAX_LIKELY = 0.7, 4
+"""Agreement of worlds that are rendered, relative to the best one, and their largest number."""
+_SCALES = 1.12 ** np.arange(-61, 62)
+"""Uniform scales that are tried, 0.001 to 1000."""
+_SHRINKING = (0.04, 0.02, 0.01)
+"""Steps of the logarithm of a scale, in which points refine it."""
+_GAUSS_NEWTON = ((50, 0.02), (100, 0.01), (400, 0.003), (400, 0.003))
+"""Longer side of the renders that refine a scale, and the change of its logarithm for their derivative."""
+_MAX_STEP, _MIN_START = 0.05, 2.0
+"""Largest step of that logarithm, and distance in dB from the mean color of an image that a first render needs."""
+_SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic."""
+_ROUND = 1e-3
+"""Relative distance from a number of two digits within which a scale is that number."""
+
+
+class _Points(NamedTuple):
+    """Points drawn from the Gaussians of a scene, and the small images that they are compared with."""
+
+    positions: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    """RGB in 0..1, the same from all sides."""
+    views: list[View]
+
+    def agreement(self, worlds: Sequence[_Motion]) -> Float[Tensor, " w"]:
+        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in other worlds."""
+        values = torch.zeros(len(worlds))
+        for view in self.views:
+            poses = torch.stack([world.move(view.camera.world_to_camera) for world in worlds])
+            values += torch.cat([self._correlation(view, part) for part in poses.split(_BATCH)])
+        return values / len(self.views)
+
+    def _correlation(self, view: View, poses: Float[Tensor, "b 4 4"]) -> Float[Tensor, " b"]:
+        camera, count = view.camera, view.camera.width * view.camera.height
+        seen = self.positions @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+        depth = seen[..., 2]
+        u, v = (camera.K[i, i] * seen[..., i] / depth + camera.K[i, 2] for i in (0, 1))
+        inside = (depth > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        pose, point = inside.nonzero(as_tuple=True)
+        pixel = (pose * camera.height + v[inside].long()) * camera.width + u[inside].long()
+        depth = depth[inside]
+        nearest = depth.new_full((len(poses) * count,), torch.inf).scatter_reduce(0, pixel, depth, "amin")
+        is_front = depth <= _SAME_DEPTH * nearest[pixel]
+        colors = torch.cat([self.colors, self.colors.new_ones(len(self.colors), 1)], dim=1)[point[is_front]]
+        sums = colors.new_zeros(len(poses) * count, 4).index_add_(0, pixel[is_front], colors)
+        drawn = functional.avg_pool2d(
+            sums.view(len(poses), camera.height, camera.width, 4).permute(0, 3, 1, 2), 3, 1, 1
+        )
+        image = view.image.permute(2, 0, 1)[None].float() / 255
+        image = functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
+        used = torch.ones_like(image[:, :1]) if view.mask is None else view.mask[None, None].float()
+        variance = _centered(image, used).square().sum()
+        weight = used * (drawn[:, 3:] > 0)
+        first = _centered(drawn[:, :3] / drawn[:, 3:].clamp(min=1e-6), weight)
+        covariance = (first * _centered(image, weight)).sum(dim=(1, 2, 3))
+        return covariance / (first.square().sum(dim=(1, 2, 3)) * variance).sqrt().clamp(min=1e-6)
+
+
+def _centered(image: Float[Tensor, "#b c h w"], weight: Float[Tensor, "#b 1 h w"]) -> Float[Tensor, "#b c h w"]:
+    """Return the difference from the mean color of the pixels of weight 1; 0 at those of weight 0."""
+    total = weight.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+    return (image - (image * weight).sum(dim=(2, 3), keepdim=True) / total) * weight
+
+
+class _Motion(NamedTuple):
+    """Change from one candidate world to another."""
+
+    matrix: Float[np.ndarray, "4 4"]
+    """Similarity between the two worlds."""
+    flipped: bool
+    """True if only one of the worlds has cameras with the axes of OpenCV."""
+
+    def move(self, world_to_camera: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+        """Return the pose of a camera in the other world."""
+        pose = world_to_camera.double().numpy()
+        if self.flipped:
+            pose = np.diag([1.0, -1, -1, 1]) @ pose
+        moved = pose @ np.linalg.inv(self.matrix)
+        moved[:3] *= np.cbrt(np.linalg.det(self.matrix[:3, :3]))
+        return torch.from_numpy(moved).to(world_to_camera)
+
+
+class _Search:
+    """Comparison of candidate worlds with the images of a scene.
+
+    Args:
+        scene: the scene in one of the worlds.
+        here: this world.
+        device: torch device to render on.
+    """
+
+    def __init__(self, scene: SplatScene, here: CandidateWorld, device: str) -> None:
+        self._scene, self._views, self._gaussians = scene, sample_views(scene), scene.gaussians.to(device)
+        self._points = _draw_points(scene, self._views)
+        self._back, self._flipped = np.linalg.inv(here.matrix), here.opencv_cameras
+
+    def _motion(self, candidate: CandidateWorld) -> _Motion:
+        return _Motion(candidate.matrix @ self._back, candidate.opencv_cameras != self._flipped)
+
+    def agreement(self, candidates: Sequence[CandidateWorld]) -> Float[Tensor, " w"]:
+        """Return how well points of the splat agree with the images in each world, in -1..1."""
+        return self._points.agreement([self._motion(candidate) for candidate in candidates])
+
+    def likely(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
+        """Return the worlds that may fit, without the first one, the best first."""
+        return [candidates[i] for i in _likely(self.agreement(candidates)) if i > 0 and self._is_near(candidates[i])]
+
+    def likely_scales(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
+        """Return worlds that may fit with another uniform scale, the best first."""
+        unscaled = [
+            candidate for candidate in candidates if candidate.world.scale == 1 and not candidate.opencv_cameras
+        ]
+        scaled = [candidate.scaled(float(scale)) for candidate in unscaled for scale in _SCALES]
+        grid = self.agreement(scaled).view(len(unscaled), len(_SCALES))
+        best, column = grid.max(dim=1)
+        logs = {i: self._refine(unscaled[i], float(np.log(_SCALES[column[i]]))) for i in _likely(best)}
+        found = [unscaled[i].scaled(_rounded(float(np.exp(log)))) for i, log in logs.items() if log is not None]
+        return [candidate for candidate in found if candidate.world.scale != 1]
+
+    def _is_near(self, candidate: CandidateWorld) -> bool:
+        """Return whether a small render beats the mean color of an image."""
+        small = self._farthest(candidate).reduced(_GAUSS_NEWTON[1][0])
+        return small.psnr(self._render(small, candidate)) >= small.psnr(small.mean_color()) + _MIN_START
+
+    def _farthest(self, candidate: CandidateWorld) -> ReducedView:
+        """Return the view whose camera is farthest from the origin, so that a scale changes its image most."""
+        motion = self._motion(candidate)
+        return max(self._views, key=lambda small: float(motion.move(small.view.camera.world_to_camera)[:3, 3].norm()))
+
+    def _render(self, small: ReducedView, candidate: CandidateWorld) -> UInt8[Tensor, "h w 3"]:
+        """Render a view of the scene in a world."""
+        camera = small.view.camera
+        camera = replace(camera, world_to_camera=self._motion(candidate).move(camera.world_to_camera))
+        return small._replace(view=small.view._replace(camera=camera)).render(
+            self._scene, self._gaussians, RasterSettings()
+        )
+
+    def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
+        """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
+
+        Points refine it to a few percent, and the Gauss-Newton method on renders of one view beyond that.
+        """
+        for step in _SHRINKING:
+            near = [log - step, log, log + step]
+            log = near[int(self.agreement([candidate.scaled(float(np.exp(value))) for value in near]).argmax())]
+        if not self._is_near(candidate.scaled(float(np.exp(log)))):
+            return None
+        view = self._farthest(candidate)
+        for side, change in _GAUSS_NEWTON:
+            small = view.reduced(side)
+            first, second = (
+                self._render(small, candidate.scaled(float(np.exp(value)))).float() for value in (log, log + change)
+            )
+            slope, rest = (second - first) / change, small.view.image.float() - first
+            if small.view.mask is not None:
+                slope, rest = slope[small.view.mask], rest[small.view.mask]
+            log += float(((slope * rest).sum() / slope.square().sum().clamp(min=1e-6)).clamp(-_MAX_STEP, _MAX_STEP))
+        return log
+
+
+def _rounded(scale: float) -> float:
+    """Return a scale with two digits if it is close to such a number, otherwise with five.
+
+    >>> _rounded(1.9997), _rounded(0.157858)
+    (2.0, 0.15786)
+    """
+    short = float(f"{scale:.2g}")
+    return short if abs(short - scale) < _ROUND * scale else float(f"{scale:.5g}")
+
+
+def _likely(agreement: Float[Tensor, " w"]) -> list[int]:
+    """Return the indices of the worlds that agree nearly as well as the best one, which is first."""
+    values, order = agreement.sort(descending=True)
+    return order[values >= _LIKELY * values[0].clamp(min=1e-6)][:_MAX_LIKELY].tolist()
+
+
+def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
+    """Draw points of the Gaussians, more of large and opaque ones, always the same."""
+    gaussians, generator = scene.gaussians, torch.Generator().manual_seed(0)
+    rows = gaussians.drawable.nonzero().squeeze(1)
+    rows = rows[:: len(rows) // _MAX_SAMPLED + 1]
+    areas = gaussians.scales[rows].sort(dim=1).values[:, 1:].prod(dim=1) * gaussians.opacities[rows]
+    rows = rows[torch.multinomial(areas.double().sqrt() + 1e-30, _POINTS, replacement=True, generator=generator)]
+    offsets = torch.randn(_POINTS, 3, generator=generator) * gaussians.scales[rows]
+    axes = rotation_matrices(gaussians.quats[rows])
+    colors = (0.5 + _SH_C0 * scene.splat.features_dc[rows]).clamp(0, 1)
+    small = [view.reduced(_SIDE).view for view in views]
+    return _Points(gaussians.means[rows] + (axes @ offsets[:, :, None])[:, :, 0], colors, small)
+
+
+def find_world(
+    candidates: Sequence[CandidateWorld],
+    scene_in: Callable[[CandidateWorld], SplatScene],
+    *,
+    device: str,
+    say: Callable[[str], None],
+) -> SplatScene:
+    """Return the scene in the world in which its renders reach the usual PSNR.
+
+    That is the first world if it fits, and then no other one is tried. Otherwise it is the only other one that fits; if
+    none or several fit, the scene in the first world is returned.
+
+    Args:
+        candidates: possible worlds.
+        scene_in: function that returns the scene in a world.
+        device: torch device to render on.
+        say: function that is called with a sentence if another world fits.
+    """
+    here = candidates[0]
+    scene = scene_in(here)
+    match = measure_alignment(scene, device=device, explain=False)
+    if match.is_usual:
+        return replace(scene, alignment=match)
+
+    def fitting(worlds: Sequence[CandidateWorld]) -> list[tuple[CandidateWorld, SplatScene, Alignment]]:
+        scenes = [(world, scene_in(world)) for world in worlds]
+        found = [(world, other, measure_alignment(other, device=device, explain=False)) for world, other in scenes]
+        return [item for item in found if item[2].is_usual]
+
+    search = _Search(scene, here, device)
+    found = fitting(search.likely(candidates)) or fitting(search.likely_scales(candidates))
+    if len(found) == 0:
+        return scene
+    before = f"{match.psnr:.1f} dB in {here.name}"
+    fits = "; ".join(f"{world.name} ({other.psnr:.1f} dB)" for world, _, other in found)
+    if len(found) > 1:
+        say(
+            f"The splat fits its images in several worlds: {fits}. So it stays in {here.name} ({match.psnr:.1f} dB). "
+            "Name the right one by a file with --world-transform."
+        )
+        return scene
+    _, other, other_match = found[0]
+    say(f"The splat fits its images in {fits}, so this world is used. It has {before}.")
+    return replace(other, alignment=other_match)
