@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import normlift_ns as nl
-from normlift_ns.data.alignment import mean_psnr
+from normlift_ns.data.alignment import measure_alignment
 from normlift_ns.data.open_splat import _read, _with_primitive
 from normlift_ns.data.splat import SplatParameters, read_ply
 from normlift_ns.errors import InputError
@@ -72,9 +72,9 @@ def test_a_lifted_run_stays_2d(trained: Path, tmp_path: Path, monkeypatch: pytes
     again = nl.open_run(run.config)
     assert again.scene.gaussians.primitive == again.field.manifest["primitive"] == "2dgs"
     assert again.field.manifest["clip_planes"] == [0.2, 1e10]
-    assert mean_psnr(again.scene) == pytest.approx(mean_psnr(scene), abs=1e-3)
-    monkeypatch.setattr("normlift_ns.data.alignment._MAX_RENDER_SIDE", 30)
-    assert mean_psnr(scene) > 10
+    assert measure_alignment(again.scene).psnr == pytest.approx(measure_alignment(scene).psnr, abs=1e-3)
+    monkeypatch.setattr("normlift_ns.data.reduced_views._MAX_SIDE", 30)
+    assert measure_alignment(scene).psnr > 10
     assert again.scene.gaussians.select(slice(5)).to("cpu").primitive == "2dgs"
     selected = again.field.scalars.reliability > 0
     assert len(again.votes.explain(selected).views) > 0  # its evidence is found in the cache

@@ -100,7 +100,7 @@ def distorted(k1: float):
     ],
 )
 def test_the_cause_of_a_loss_is_named(scene, change, cause: str) -> None:
-    assert re.search(cause, warning_of(scene, change))
+    assert re.search(cause, warning_of(scene, change)), warning_of(scene, change)
 
 
 def test_flat_gaussians_are_told_from_others(scene) -> None:
@@ -123,11 +123,7 @@ def test_a_render_must_beat_the_mean_color_by_three_decibels() -> None:
     for psnr, refused in ((28.9, True), (29.1, False)):
         warning = alignment_warning(match(psnr), trained_cameras=True)  # the cameras of the training are believed
         assert (warning is not None) is refused
-        with (
-            pytest.raises(InputError, match=r"28\.9 dB, and the mean color of the images 26\.0 dB")
-            if refused
-            else nullcontext()
-        ):
+        with pytest.raises(InputError, match=r"28\.9 dB, 2\.9 dB more") if refused else nullcontext():
             assert alignment_warning(match(psnr), trained_cameras=False) is None
 
 

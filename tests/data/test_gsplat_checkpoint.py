@@ -61,7 +61,7 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
     with pytest.raises(InputError, match=r"`app_module`.*--app_opt"):
         read_gsplat_checkpoint(path)
     for name, value, message in (
-        ("means", torch.full((200, 3), torch.nan), "means are NaN"),
+        ("means", torch.full((200, 3), torch.nan), "means .* NaN"),
         ("means", torch.zeros(200, 2), r"means is torch.float32 \(200, 2\)"),
         ("means", torch.zeros(200, 3, dtype=torch.int64), "means is torch.int64"),
         ("quats", torch.zeros(100, 4), r"quats is torch.float32 \(100, 4\)"),
