@@ -1,1 +1,1 @@
-"""Atomic file operations and checksummed data files."""
+"""Atomic file operations, data files with digests, and memory limits."""

@@ -1,8 +1,8 @@
-"""Files of arrays: safetensors with a digest of their whole content, and NPY files of other programs.
+"""Files of arrays: safetensors files with a digest of their whole content, and NPY files of other programs.
 
-The digest is checked before any content is used. NumPy arrays need no torch. The digest is the 128-bit XXH3: it detects
-damaged and misplaced files, but it does not protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3
-and 0.9 GB/s with BLAKE2b. For a field of 44 MB, this is 1.5 ms instead of 50 ms.
+Loading checks the digest before it returns any content. NumPy arrays do not need torch. The digest is the 128-bit XXH3.
+It detects damaged and misplaced files, but does not protect against forgery. One core of an AMD EPYC hashes 31 GB/s
+with XXH3 and 0.9 GB/s with BLAKE2b. A field of 44 MB takes 1.5 ms instead of 50 ms.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from normlift_ns.io.guard import check_regular, open_regular
 from normlift_ns.io.memory import check_free_memory
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-"""Largest number allowed in a file."""
+"""Largest number that a file may contain."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
 _Array = Any
@@ -34,17 +34,17 @@ _Array = Any
 
 
 class ArrayFile(NamedTuple):
-    """Content of a file."""
+    """Content of a file that `save_arrays` wrote."""
 
     arrays: dict[str, _Array]
     metadata: dict[str, str]
     """Metadata, without the digest."""
     digest: str | None
-    """None for files of version 0.1."""
+    """Digest of the content; None for files of version 0.1."""
 
 
 def array_digest(arrays: Mapping[str, _Array], facts: Mapping[str, str], key: str = "") -> str:
-    """Return the digest of metadata, a key, and the names, types, shapes and values of arrays or tensors.
+    """Return a digest over metadata, a key, and the names, types, shapes and values of arrays or tensors.
 
     >>> import torch
     >>> table = {"a": np.eye(2)}
@@ -64,10 +64,10 @@ def array_digest(arrays: Mapping[str, _Array], facts: Mapping[str, str], key: st
 def _bytes(array: _Array) -> memoryview | bytes:
     if isinstance(array, np.ndarray):
         return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-    import torch  # noqa: PLC0415 (a query without torch loads this module)
+    import torch  # noqa: PLC0415 (queries without torch import this module)
 
     flat = array.detach().cpu().reshape(-1).contiguous()
-    # a single element may have any stride
+    # a tensor of one element may have any stride
     return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data if array.numel() > 0 else b""
 
 
@@ -79,21 +79,21 @@ def save_arrays(
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Write a safetensors file and return its digest, which its metadata also records.
+    """Write a safetensors file, and return the digest that its metadata also contains.
 
     Args:
         arrays: NumPy arrays only, or tensors only.
-        facts: further metadata.
-        key: key of the file in a cache; loading with a different key raises an error.
-        overwrite: replace an existing file.
+        facts: Further metadata.
+        key: Key of the file in a cache. Loading the file with a different key raises an error.
+        overwrite: Replace an existing file.
     Raises:
-        FileExistsError, OSError: as in `atomic_files`.
-        ValueError: the metadata cannot be encoded.
+        FileExistsError, OSError: The errors of `atomic_files`.
+        ValueError: The metadata cannot be encoded as UTF-8.
     """
     if invalid := next((text for text in (facts or {}).values() if re.search("[\ud800-\udfff]", text)), ""):
-        raise InputError(f"the metadata of {path} cannot be encoded: {invalid!a}")
+        raise InputError(f"the metadata of {path} contains {invalid!a}, expected text that UTF-8 can encode; change it")
     if all(isinstance(array, np.ndarray) for array in arrays.values()):
-        from safetensors.numpy import save_file  # noqa: PLC0415 (one of the two)
+        from safetensors.numpy import save_file  # noqa: PLC0415 (only one of the two is needed)
 
         content: dict[str, Any] = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     else:
@@ -109,26 +109,26 @@ def save_arrays(
 
 
 def sort_metadata(path: Path) -> None:
-    """Sort the metadata in a file's header, so that equal content gives bit-for-bit equal files.
+    """Sort the metadata in the header of a safetensors file, so that equal contents give bit-for-bit equal files.
 
-    safetensors itself writes metadata in arbitrary order.
+    The safetensors library itself writes metadata in arbitrary order.
     """
     with path.open("r+b") as file:
         size = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(size))
         header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
         ordered = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode().ljust(size)
-        if len(ordered) == size:  # otherwise this release of safetensors formats its header differently
+        if len(ordered) == size:  # otherwise the installed safetensors formats headers differently
             file.seek(8)
             file.write(ordered)
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """Read the metadata in a file's header without checking the digest, which covers the whole file.
+    """Read the metadata in the header of a safetensors file. The digest of the file is not checked.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or not a safetensors file.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is damaged or not a safetensors file.
     """
     try:
         check_regular(path)
@@ -151,20 +151,21 @@ def load_arrays(
     """Read a file of `save_arrays` and check its digest.
 
     Args:
-        key: the key that the file was saved with.
-        legacy_keys: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
-            these keys is read without a check. None: every file must have a digest.
-        remedy: what the error message suggests if the file is missing or damaged.
+        key: Key that the file was saved with.
+        legacy_keys: Metadata keys of this kind of file in version 0.1, which wrote no digests. A file with exactly
+            these keys is read without a check. If None, every file must have a digest.
+        remedy: Advice in the error message if the file is missing or damaged.
         framework: "np" for NumPy arrays, "pt" for tensors.
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the digest does not match, or the file is not a safetensors file.
+        FileNotFoundError: The file does not exist.
+        ValueError: The digest does not match, or the file is not a safetensors file.
+        MemoryError: The file does not fit into memory.
     """
     try:
         check_regular(path)
         size = path.stat().st_size
         with safe_open(path, framework=framework) as file:
-            check_free_memory(size, f"Reading {path}", {"ulimit -v": 2 * size})  # safetensors panics without memory
+            check_free_memory(size, f"Reading {path}", {"ulimit -v": 2 * size})  # safetensors aborts if memory runs out
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
         expected = facts.pop(DIGEST_KEY, None)
@@ -175,7 +176,7 @@ def load_arrays(
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise InputError(f"{path} is damaged or not a safetensors file ({error}); {remedy}") from error
     if actual != expected:
-        problem = f"expected {expected}" if expected else "but the file does not record one"
+        problem = f"expected {expected}" if expected else "but its metadata has none"
         raise InputError(f"{path} is damaged: its content has digest {actual}, {problem}; {remedy}")
     return ArrayFile(arrays, facts, actual)
 
@@ -186,10 +187,10 @@ def check_array(
     """Raise if the type, shape or value range of an array is not as expected.
 
     Args:
-        name: name of the array, for the error message.
-        low, high: bounds of its values, both inclusive; NaN and infinity are always out of range.
+        name: Name of the array, for the error message.
+        low, high: Bounds of its values, both inclusive. NaN and infinity are always out of range.
     Raises:
-        ValueError: the array differs; the message has the actual and the expected properties.
+        ValueError: The array differs. The message gives the actual and the expected properties.
 
     >>> check_array("means", np.zeros((2, 3), np.float32), "float32", (2, 3), 0)
     """
@@ -200,29 +201,29 @@ def check_array(
         raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
 
 
-# NPY files: their size is compared with their header before NumPy allocates anything, and pickles are never loaded.
+# NPY files: their size is compared with their header before NumPy allocates memory, and pickles are never loaded.
 
 
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
-    (3, 0): np.lib.format.read_array_header_2_0,  # differs in the names of records only, which are not read
+    (3, 0): np.lib.format.read_array_header_2_0,  # differs only in the names of records, which are not read
 }
 _NUMERIC_KINDS = "biuf"
-"""Booleans, integers and floats, of at most 64 bits."""
+"""NumPy's codes of booleans, signed and unsigned integers, and floats."""
 _MAX_NUMBERS = 2**60
-"""Largest product of the side lengths of an array, in which lengths of 0 count as 1."""
+"""Upper limit for the product of the dimensions of an array, with dimensions of 0 counted as 1."""
 
 
 def read_npy(path: Path, description: str) -> np.ndarray:
     """Return the numeric array in an NPY file, memory-mapped and read-only.
 
     Args:
-        description: Kind of file, for messages.
+        description: Kind of file, for error messages.
     Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If the file is not an NPY file, holds anything but numbers, or is shorter or longer than its header
-            says.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not an NPY file, contains anything except numbers, or does not have the size that its
+            header declares.
     """
     if not os.path.isfile(path):
         if os.path.lexists(path):
@@ -239,23 +240,27 @@ def read_npy(path: Path, description: str) -> np.ndarray:
 
 
 def read_npy_bytes(data: bytes) -> np.ndarray:
-    """Return the numeric array in the bytes of an NPY file; raises ValueError as `read_npy` does."""
+    """Return the numeric array in the bytes of an NPY file, in native byte order.
+
+    Raises:
+        ValueError: As for `read_npy`.
+    """
     _check_npy(io.BytesIO(data))
     values = np.load(io.BytesIO(data), allow_pickle=False)
     return values.astype(values.dtype.newbyteorder("="))
 
 
 def _check_npy(file: IO[bytes]) -> None:
-    """Raise InputError unless a file holds numbers, and exactly as many bytes of them as its header declares."""
+    """Raise InputError unless an NPY file contains only numbers and has the size that its header declares."""
     try:
         shape, _, dtype = _HEADER_READERS[np.lib.format.read_magic(file)](file)
-    except Exception as error:  # a header is a Python literal; its parsers raise any kind of exception
+    except Exception as error:  # a header is a Python literal, and its parser raises any kind of exception
         raise InputError(f"its NPY header cannot be read: {type(error).__name__}") from None
     if dtype.kind not in _NUMERIC_KINDS or dtype.itemsize > 8:
         kind = "objects" if dtype.hasobject else str(dtype)[:80]
-        raise InputError(f"it holds {kind}; expected integers or floats")
+        raise InputError(f"it contains {kind}, expected integers or floats of at most 64 bits")
     if len(shape) > 8 or min(shape, default=0) < 0 or math.prod(length or 1 for length in shape) > _MAX_NUMBERS:
-        raise InputError("its header has an invalid shape: too many dimensions, or negative or too large sizes")
+        raise InputError("the shape in its header has more than 8 dimensions, or negative or too large ones")
     start, expected = file.tell(), math.prod(shape) * dtype.itemsize
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:

@@ -1,4 +1,4 @@
-"""Atomic writes of files and folders, their journal, and digests of files."""
+"""Atomic writes of files and folders, a journal for interrupted writes, and file digests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from normlift_ns.io.guard import file_kind, open_regular, read_file, refuse_inpu
 
 _BLOCK_SIZE = 2**20
 _LEGACY_PREFIX = "blake2b:"
-"""Prefix of the digests that version 0.1 computed of weight files."""
+"""Prefix of the digests of weight files in version 0.1."""
 
 
 def text_digest(text: str) -> str:
@@ -44,15 +44,15 @@ def text_digest(text: str) -> str:
 
 
 def file_digest(*files: Path, compare_to: str = "") -> str:
-    """Return the digest of the concatenated content of files, regardless of their paths.
+    """Return the digest of the concatenated contents of files. Their paths have no influence.
 
-    One core reads about 10 GB/s.
+    One core hashes about 10 GB/s.
 
     Args:
-        compare_to: digest to compare the result with. If version 0.1 wrote it, the result uses the hash of version
-            0.1, at a tenth of the speed.
+        compare_to: Digest that the caller compares with the result. For a digest of version 0.1, the function uses the
+            hash of that version, which is ten times slower.
     Raises:
-        OSError: a file cannot be read.
+        OSError: A file cannot be read.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.txt"
@@ -72,55 +72,55 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
 
 # Atomic system calls: locks that end with their process, renames that never overwrite, and exchanges of two paths.
 #
-# Some systems do not support them (Windows, some network drives). The functions then return None or False, and the
-# caller uses a fallback.
+# Windows and some network drives do not support them. The functions then return None or False, and their callers use a
+# fallback.
 
 
 _NO_REPLACE, _EXCHANGE = 1, 2
 _AT_FDCWD = -100
-"""Relative paths start at the working directory."""
+"""Linux constant for renameat2: relative paths start at the working directory."""
 _LOCK_TIMEOUT = 60.0
-"""Seconds to wait for a lock; normlift_ns itself holds one only briefly."""
+"""Maximum time to wait for a lock, in seconds. normlift_ns itself holds locks only briefly."""
 _UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
-"""Errors of kernels, file systems and containers that do not support renameat2."""
+"""Error codes of renameat2 if the kernel, the file system or the container does not support it."""
 
 
 def acquire_lock(folder: Path) -> int | None:
-    """Lock a folder until `release_lock` or until the process ends, even if it is killed.
+    """Lock a folder until the caller calls `release_lock` or the process ends or is killed.
 
     Returns:
-        A file descriptor for `release_lock`; None if the system does not support locks.
+        The file descriptor for `release_lock`, or None if the system does not support locks.
     Raises:
-        BlockingIOError: another process holds the lock.
-        OSError: the folder does not exist.
+        BlockingIOError: Another process holds the lock.
+        OSError: The folder does not exist.
     """
     if sys.platform == "win32":
         return None
     import fcntl  # noqa: PLC0415 (not available on Windows)
 
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # opening a pipe would block forever
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # without O_DIRECTORY, a pipe would block
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
         raise
-    except OSError:  # a file system without locks
+    except OSError:  # the file system does not support locks
         os.close(descriptor)
         return None
     return descriptor
 
 
 def release_lock(descriptor: int | None) -> None:
-    """Release a lock of `acquire_lock`."""
+    """Release the lock that `acquire_lock` returned; do nothing if the descriptor is None."""
     if descriptor is not None:
         os.close(descriptor)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, after waiting for it for at most a minute.
+    """Hold the lock of a folder within a `with` block, after waiting for the lock for at most 60 s.
 
-    If the lock is still taken then, continue without it: another program may hold it for as long as it runs.
+    If another process still holds the lock after that time, continue without it.
     """
     descriptor, deadline = None, time.monotonic() + _LOCK_TIMEOUT
     while time.monotonic() < deadline:
@@ -160,7 +160,7 @@ def _rename(source: Path, target: Path, flag: int) -> bool:
         return False
     try:
         function = ctypes.CDLL(None, use_errno=True).renameat2
-    except AttributeError:  # a C library without it
+    except AttributeError:  # the C library has no renameat2
         return False
     function.argtypes = [ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint]
     if function(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
@@ -171,11 +171,10 @@ def _rename(source: Path, target: Path, flag: int) -> bool:
     raise OSError(error, os.strerror(error), str(source), None, str(target))
 
 
-# Write-ahead journal for replacing several files or a folder, so that a crash in the middle can be completed.
+# Write-ahead journal for replacing several files or a folder. After a crash, a later process completes its steps.
 #
-# A journal moves and deletes files, so `complete_journal` follows only journals that the same user's programs wrote.
-# Each is signed with a key in the user's state folder. A folder received from somebody else cannot contain a valid
-# signature.
+# These steps move and delete files, so `complete_journal` accepts only journals of the same user. The signature of a
+# journal is made with a key in the user's state folder. A folder from somebody else cannot contain a valid signature.
 
 
 JOURNAL_SUFFIX = ".journal"
@@ -183,12 +182,11 @@ _KEY_FILE, _KEY_BYTES, _MAX_JOURNAL_BYTES = "key", 32, 2**20
 
 
 def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
-    """Write the journal of the steps that are about to move files from a temporary folder into its parent.
-
-    The journal itself is written atomically.
+    """Write a journal atomically, before files move from a temporary folder into its parent; return its path.
 
     Args:
-        steps: `files`, `remove` and `overwrite`; or `place`, `new` and `old`. All names are without folders.
+        temporary: Temporary folder with the new files, in which the journal is written.
+        steps: Either `files`, `remove` and `overwrite`, or `place`, `new` and `old`. File names have no folder part.
     """
     draft, journal = temporary / "steps.json", temporary / f"steps{JOURNAL_SUFFIX}"
     text = json.dumps(steps)
@@ -199,9 +197,10 @@ def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
 
 
 def complete_journal(temporary: Path) -> bool:
-    """Complete or undo the steps of a journal; return False if this user did not write it.
+    """Complete or undo the steps in the journal of a temporary folder.
 
-    Without a journal, do nothing and return True.
+    Returns:
+        True if all steps are done or there is no journal; False if this user did not write the journal.
     """
     journal = temporary / f"steps{JOURNAL_SUFFIX}"
     if not os.path.lexists(journal):
@@ -209,8 +208,8 @@ def complete_journal(temporary: Path) -> bool:
     steps = _read(journal)
     if steps is None:
         warnings.warn(
-            f"{temporary} holds files that another user or another machine was moving into {temporary.parent} when it "
-            "was stopped. They are left unchanged; run that command there again, or delete the folder",
+            f"{temporary} contains new files for {temporary.parent} from an interrupted command of another user or "
+            "machine. These files are unchanged. Run that command again as that user, or delete the folder.",
             stacklevel=2,
         )
         return False
@@ -240,14 +239,17 @@ def _read(journal: Path) -> dict[str, Any] | None:
 
 
 def _signature(temporary: Path, text: str) -> str:
-    """Return the signature of a journal, which includes its path: moving a journal invalidates it."""
+    """Return the signature of the text of a journal and its folder, so that moving a journal invalidates it."""
     message = f"{temporary.resolve()}\n{text}".encode("utf8", "surrogateescape")
     return hmac.new(_key(), message, "sha256").hexdigest()
 
 
 @cache
 def _key() -> bytes:
-    """Return the user's key, created at its first use; a key for this process alone if it cannot be stored."""
+    """Return the user's key of 32 bytes, which is created at the first call.
+
+    If the key cannot be stored, return a new key that only this process uses.
+    """
     folder, new = user_state_folder(), secrets.token_bytes(_KEY_BYTES)
     if folder is None:
         return new
@@ -258,7 +260,7 @@ def _key() -> bytes:
             descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(new)
-            rename_if_absent(draft, path)  # another process may have been faster
+            rename_if_absent(draft, path)  # another process may have created the key first
             draft.unlink(missing_ok=True)
         stored = read_file(path) if path.is_file() else b""
         if len(stored) == _KEY_BYTES and (os.name == "nt" or path.stat().st_uid == os.getuid()):
@@ -266,40 +268,40 @@ def _key() -> bytes:
     return new
 
 
-# Atomic file writes, which replace existing files only if asked to.
+# Atomic file writes, which replace existing files only if the caller allows it.
 #
 # New files are written into a temporary folder next to their destination, flushed to the disk and renamed. A process
-# holds the lock of its temporary folder for as long as it runs; later processes remove folders that are not locked.
+# holds the lock of its temporary folder while it writes. Later processes delete temporary folders without a lock.
 
 
 _TEMPORARY_PREFIX = ".normlift-"
 _TEMPORARY_NAME = re.compile(r"\.normlift-[0-9a-f]{16}")
 _MAX_AGE = 86400
-"""Seconds after which a temporary folder counts as left over on systems without locks."""
+"""Age in seconds after which temporary folders are deleted on systems without locks."""
 
 
 class NotWrittenError(OSError):
-    """Failure to write a file or folder; the message has its final path and the reason."""
+    """Failure to write a file or folder; the message gives the final path and the reason."""
 
 
 @contextmanager
 def atomic_files(
     *paths: Path, overwrite: bool = False, delete: Sequence[Path] = (), own: bool = False
 ) -> Iterator[tuple[Path, ...]]:
-    """Yield a temporary path for each path; when the block ends, rename all of them to their final paths together.
+    """Yield a temporary path for each path; when the block ends, rename all files to their final paths together.
 
     If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
     first rename and the last, the next process that writes to the folder completes the renames.
 
     Args:
-        paths: the final paths, all in one folder.
-        overwrite: replace existing files of the same kind.
-        delete: existing files of the kind of their suffix, to delete in the same step.
-        own: the paths are parts of a run or a cache that belong to this package, which may replace them.
+        paths: Final paths, all in one folder.
+        overwrite: Replace existing files of the same kind.
+        delete: Files to delete in the same step, if they exist and their content matches their suffix.
+        own: Skip the checks of inputs and kinds, for files of runs and caches that this package wrote itself.
     Raises:
-        FileExistsError: a path exists, and `overwrite` is False.
-        ValueError: as in `refuse_inputs`; or `overwrite` would replace a file of another kind. Nothing has changed.
-        NotWrittenError: writing failed, for instance because the disk is full; nothing has changed then.
+        FileExistsError: A path exists, and `overwrite` is False.
+        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind. No file has changed.
+        NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "new folder" / "a.txt"
@@ -326,18 +328,18 @@ def atomic_files(
                 existing = _rename_drafts(temporary, drafts, overwrite, delete)
         _flush_names(folder)
     if existing is not None:
-        raise FileExistsError(f"{existing} exists; give another name, or allow overwriting it")
+        raise FileExistsError(f"{existing} exists; give another name, or set overwrite to True")
 
 
 @contextmanager
 def atomic_file(path: Path, *, overwrite: bool = False, own: bool = False) -> Iterator[Path]:
-    """Yield a temporary path for a single file; see `atomic_files`."""
+    """Yield a temporary path for a single file; see `atomic_files` for the arguments and errors."""
     with atomic_files(path, overwrite=overwrite, own=own) as (draft,):
         yield draft
 
 
 def write_text_file(path: Path, text: str, *, overwrite: bool = False, own: bool = False) -> None:
-    """Write a UTF-8 text file atomically; see `atomic_files`."""
+    """Write a UTF-8 text file atomically; see `atomic_files` for the other arguments and errors."""
     with atomic_file(path, overwrite=overwrite, own=own) as draft:
         draft.write_text(text, "utf8")
 
@@ -347,7 +349,7 @@ def draft_directory(path: Path) -> Iterator[Path]:
     """Yield an empty temporary folder, which `commit_directory` can rename to `path` or to another name next to it.
 
     Raises:
-        NotWrittenError: writing failed, for instance because the disk is full.
+        NotWrittenError: Writing failed, for instance because the disk is full.
     """
     with _draft_folder(path) as temporary:
         draft = temporary / path.name
@@ -356,16 +358,16 @@ def draft_directory(path: Path) -> Iterator[Path]:
 
 
 def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Collection[str]] | None = None) -> bool:
-    """Rename a folder of `draft_directory` to its final path; return False if that exists and `replaced` is None.
+    """Rename a folder of `draft_directory` to its final path; return False if that path exists and `replaced` is None.
+
+    The system exchanges an existing folder with the new one, so the path exists at every instant. If the system cannot
+    exchange folders, a journal records the steps. The next command that opens or writes the run then completes them.
 
     Args:
-        replaced: function that returns the files of an existing folder, relative to it, that the new one replaces. All
-            others are kept.
+        replaced: Function that returns the files of an existing folder that the new folder replaces, as relative
+            paths. All other files are kept.
     Raises:
-        ValueError: both folders have a file that is not in `replaced`; nothing has changed then.
-
-    A replaced folder exists at every instant, old or new, because the two are exchanged. If the system cannot exchange
-    folders, a journal records the steps, and the next command that opens or writes the run completes them.
+        ValueError: Both folders have a file that is not in `replaced`. No file has changed.
     """
     _flush(draft)
     with locked(path.parent):
@@ -374,7 +376,7 @@ def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Coll
                 return False
             old, names = draft, replaced(path)
             _link_others(path, draft, names)
-            if not _rename(draft, path, _EXCHANGE):  # not supported
+            if not _rename(draft, path, _EXCHANGE):  # the system does not support exchanges
                 temporary = draft.parent
                 old = temporary / f"{path.name}.old"
                 write_journal(temporary, {"place": path.name, "new": draft.name, "old": old.name})
@@ -384,13 +386,13 @@ def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Coll
                     os.rename(draft, path)
                 finally:
                     complete_journal(temporary)
-            _link_others(old, path, names, keep_new=True)  # written meanwhile
+            _link_others(old, path, names, keep_new=True)  # files written after the first call
     _flush_names(path.parent)
     return True
 
 
 def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: bool = False) -> None:
-    """Link the files of an old folder that are not replaced into a new one; copy them where links are not supported."""
+    """Hard-link the files that are not replaced from an old folder into a new one; copy a file if linking it fails."""
     for parent, folders, files in os.walk(old):
         source, target = Path(parent), new / Path(parent).relative_to(old)
         if not target.is_dir():
@@ -401,7 +403,7 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
             if file.relative_to(new).as_posix() in replaced or (keep_new and os.path.lexists(file)):
                 continue
             if os.path.lexists(file):
-                raise InputError(f"{source / name} is not a file of the run, but the new run has one; move it away")
+                raise InputError(f"{source / name} is not part of the old run, but of the new one; move it elsewhere")
             try:
                 os.link(source / name, file, follow_symlinks=False)
             except OSError:
@@ -410,32 +412,29 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
 
 
 def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
-    """Rename drafts to their final paths; return a path that another program has created meanwhile, if any."""
+    """Rename drafts to their final paths; return the path that another program has created meanwhile, or None."""
     journal, folder = None, temporary.parent
     if len(drafts) + len(remove) > 1:
-        complete_interrupted_writes(folder)  # an older export, which would overwrite this one if completed later
+        complete_interrupted_writes(folder)  # if completed later, an older export would overwrite this one
         names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
         journal = write_journal(temporary, names | {"overwrite": overwrite})
         _flush_names(temporary)
     for draft in drafts:
         if overwrite:
             os.replace(draft, folder / draft.name)
-        elif not rename_if_absent(draft, folder / draft.name):  # created just now by a program that ignores our lock
+        elif not rename_if_absent(draft, folder / draft.name):  # created by a program without our lock
             if journal is not None:
                 journal.unlink()
             return folder / draft.name
     for path in remove:
         path.unlink(missing_ok=True)
-    if journal is not None:  # completing it later would remove what another process writes meanwhile
+    if journal is not None:  # completing this journal later would delete newer files of other processes
         journal.unlink()
     return None
 
 
 def complete_interrupted_writes(folder: Path) -> None:
-    """Complete the interrupted replacements in a folder, and remove temporary folders that were left behind.
-
-    Temporary folders of running processes are left unchanged.
-    """
+    """Complete the interrupted replacements in a folder, and delete the temporary folders of dead processes."""
     for temporary in folder.glob(f"{_TEMPORARY_PREFIX}*"):
         if _TEMPORARY_NAME.fullmatch(temporary.name) is None or temporary.is_symlink():
             continue
@@ -451,8 +450,8 @@ def complete_interrupted_writes(folder: Path) -> None:
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM wait until the end of this context, which must be short."""
-    if threading.current_thread() is not threading.main_thread():  # where no signal raises
+    """Delay Ctrl-C and SIGTERM until the end of the `with` block, which must be short."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
         yield
         return
     arrived, before = list[int](), dict[int, Any]()
@@ -469,7 +468,7 @@ def deferred_signals() -> Iterator[None]:
 
 @contextmanager
 def _draft_folder(*paths: Path) -> Iterator[Path]:
-    """Yield a temporary folder next to the paths; error messages name these paths, not the temporary ones."""
+    """Yield a temporary folder next to the paths. Error messages give these paths, not the temporary ones."""
     folder, temporary = paths[0].parent, None
     new_folders = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
@@ -484,21 +483,21 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             try:
                 _discard(temporary)
             finally:
-                _discard(temporary)  # again, because a signal may come just before they wait
+                _discard(temporary)  # again, because a signal may have interrupted the first call
                 release_lock(descriptor)
-    except (OSError, RuntimeError, SafetensorError) as error:  # the latter two from torch and safetensors, disk full
+    except (OSError, RuntimeError, SafetensorError) as error:  # full disk: torch and safetensors raise the latter two
         reason = str(error)
         if temporary is not None:
             reason = reason.replace(f"{temporary}{os.sep}", f"{folder}{os.sep}")
         if not isinstance(error, NotWrittenError):
             names = ", ".join(map(str, paths))
             blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
-            remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
+            remedy = "delete the file or folder at this path" if blocked else "free disk space or choose another folder"
             reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
     finally:
         for place in new_folders:
-            with suppress(OSError):  # it has content
+            with suppress(OSError):  # the folder is not empty
                 place.rmdir()
 
 
@@ -510,11 +509,11 @@ def _discard(temporary: Path | None) -> None:
 
 
 def _temporary_folder(folder: Path) -> tuple[Path, int | None]:
-    """Create and lock a temporary folder. Unlike a folder of mkdtemp, it has the default permissions of new folders."""
+    """Create and lock a temporary folder with default permissions; return its path and the descriptor of its lock."""
     while True:
         temporary = folder / f"{_TEMPORARY_PREFIX}{secrets.token_hex(8)}"
         temporary.mkdir()
-        with suppress(BlockingIOError, FileNotFoundError):  # another process is in `complete_interrupted_writes`
+        with suppress(BlockingIOError, FileNotFoundError):  # another process is deleting this folder
             descriptor = acquire_lock(temporary)
             if temporary.exists():
                 return temporary, descriptor
@@ -522,12 +521,12 @@ def _temporary_folder(folder: Path) -> tuple[Path, int | None]:
 
 
 def _flush(folder: Path) -> None:
-    """Flush a temporary folder with all its files to the disk, and give the files default permissions."""
+    """Flush a temporary folder and all its files to the disk, and give the files default permissions."""
     mode = folder.stat().st_mode & 0o666  # safetensors writes files that only their owner can read
     for parent, _, files in os.walk(folder):
         for name in files:
             path = os.path.join(parent, name)
-            with suppress(OSError):  # a file system without permissions
+            with suppress(OSError):  # the file system has no permissions
                 os.chmod(path, mode)
             _fsync(path, os.O_RDWR)
         _flush_names(Path(parent))
@@ -540,7 +539,7 @@ def _flush_names(folder: Path) -> None:
 
 
 def _fsync(path: str | Path, flags: int) -> None:
-    """Flush a file or a folder, opened with these flags, to the disk."""
+    """Flush a file or a folder to the disk. `flags` are those of `os.open`."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
@@ -549,13 +548,13 @@ def _fsync(path: str | Path, flags: int) -> None:
 
 
 def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
-    """Raise, before anything is computed, if a command would overwrite an existing file without being asked to.
+    """Raise before a command starts its work if it would replace a file that it must not replace.
 
     Args:
-        flags: flags with which the user can choose another path, for the error message.
+        flags: Flags for choosing another path, quoted in the error message.
     Raises:
-        FileExistsError: one of the paths exists and `overwrite` is False.
-        ValueError: as in `refuse_inputs`; or `overwrite` would replace a file of another kind.
+        FileExistsError: One of the paths exists, and `overwrite` is False.
+        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind than its suffix.
     """
     refuse_inputs(paths, instead=flags)
     for folder in {path.parent for path in paths}:
@@ -567,7 +566,9 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
 
 
 def safe_file_name(text: str) -> str:
-    """Return a string as part of a file name: at most 40 characters, with `_` for all but letters and digits.
+    """Return the first 40 characters of a string for use in a file name; only letters and digits are kept.
+
+    Each other character becomes `_`.
 
     >>> safe_file_name("../tea pot")
     '___tea_pot'
@@ -576,7 +577,7 @@ def safe_file_name(text: str) -> str:
 
 
 def numbered_paths(path: Path) -> Iterator[Path]:
-    """Yield the path, then path_2, path_3, …
+    """Yield the path, then the path with _2, _3 and so on before its suffix.
 
     >>> names = numbered_paths(Path("red.ply"))
     >>> next(names).name, next(names).name

@@ -1,4 +1,4 @@
-"""Reading the files of a semantic field, with checks of digests, shapes, index ranges and finite values.
+"""Readers for the files of a semantic field, which check digests, shapes, index ranges and finite values.
 
 This module does not need torch.
 """
@@ -21,7 +21,7 @@ FIELD_FILE, EVIDENCE_FILE = "field.safetensors", "evidence.safetensors"
 EVIDENCE_FORMAT = "normlift_ns.evidence/1"
 EVIDENCE_COUNTS = ("num_views", "weight_power", "num_excluded")
 SCALAR_NAMES = ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight", "view_count")
-"""Names of the per-Gaussian numbers, as in `core.lift.Scalars`."""
+"""Names of the scalars per Gaussian, as in `core.lift.Scalars`."""
 _MAX_VIEWS = 2**24
 
 
@@ -36,28 +36,30 @@ class RowArrays(NamedTuple):
         """Raise if the arrays are not a valid weight matrix with `num_columns` columns.
 
         Args:
-            name: name of the matrix, for the error message.
+            name: Name of the matrix, for the error message.
+            num_columns: Number of columns of the matrix.
         Raises:
-            ValueError: wrong type or shape, entries outside the matrix, or weights that are negative or not finite.
+            ValueError: An array has another type or shape, a column is out of range, or a weight is negative or not
+                finite.
         """
         weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
         arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))
         for part, array, dtype in (*arrays, ("weights", self.weight, weight_dtype)):
             if array.ndim != 1 or array.dtype != dtype:
-                raise InputError(f"{name}: {part} are {array.dtype} {array.shape}, expected one-dimensional {dtype}")
+                raise InputError(f"{name}: {part} are {array.dtype} {array.shape}, expected {dtype} in one dimension")
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.size > 0 else []
         size = self.column.size
         if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
             raise InputError(
-                f"{name}: offsets must rise from 0 to the number of entries, got {ends} for {size} columns and "
-                f"{self.weight.size} weights"
+                f"{name}: offsets must rise from 0 to the number of entries, but their ends are {ends} for {size} "
+                f"columns and {self.weight.size} weights"
             )
         low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
         if low < 0 or high >= num_columns:
             raise InputError(f"{name}: columns are in {low}..{high}, expected 0..{num_columns - 1}")
         least, most = (float(self.weight.min()), float(self.weight.max())) if size > 0 else (0.0, 0.0)
         if not 0 <= least <= most < math.inf:
-            raise InputError(f"{name}: weights are in {least}..{most}, expected finite weights of at least 0")
+            raise InputError(f"{name}: weights are in {least}..{most}, expected finite values of at least 0")
 
 
 class EvidenceArrays(NamedTuple):
@@ -67,9 +69,9 @@ class EvidenceArrays(NamedTuple):
     region_view: Int32[np.ndarray, " s"]
     unlabeled: RowArrays
     counts: tuple[int, int, int]
-    """Number of views, power of the weights, number of excluded Gaussians."""
+    """Number of views, power of the weights, and number of excluded Gaussians."""
     digest: str | None
-    """None for files of version 0.1."""
+    """Digest of the content; None for files of version 0.1."""
 
 
 class FieldArrays(NamedTuple):
@@ -77,30 +79,32 @@ class FieldArrays(NamedTuple):
 
     manifest: dict[str, Any]
     arrays: dict[str, np.ndarray]
-    """`source`, the scalars, `means` (not in version 0.1), and either `features`, or `coordinates` and optionally
-    `basis`.
+    """Arrays by name: `source`, the scalars, and `means` (since version 0.2).
+
+    Fields that store evidence also have `features`. Other fields have `coordinates`, and `basis` if it is low-rank.
     """
     evidence: EvidenceArrays | None
+    """Evidence; None for the other storage forms."""
     digested_files: frozenset[str]
-    """Files that have a digest in the manifest, as paths relative to its folder."""
+    """Files that have a digest in the manifest, as paths relative to the folder of the manifest."""
 
 
 def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again") -> EvidenceArrays:
     """Read and check a file that `Evidence.save` wrote.
 
     Args:
-        key: the key that the file was saved with. With a key, a file without a digest (version 0.1) is an error.
-        remedy: what the error message suggests if the file is missing or damaged.
+        key: Key that the file was saved with. If a key is given, files without a digest (version 0.1) are invalid.
+        remedy: Advice in the error message if the file is missing or damaged.
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or not an evidence file.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is damaged or not an evidence file.
     """
     legacy_keys = None if key else ("format", *EVIDENCE_COUNTS)
     arrays, metadata, digest = load_arrays(path, key=key, legacy_keys=legacy_keys, remedy=remedy)
     if metadata.get("format") != EVIDENCE_FORMAT:
         raise InputError(
-            f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
-            f"{EVIDENCE_FORMAT!r}"
+            f"{path} has format {metadata.get('format')!r}, expected an evidence file of format {EVIDENCE_FORMAT!r}; "
+            "create it again with this version"
         )
     try:
         rows = RowArrays(*(arrays[name] for name in ("offsets", "region", "weight")))
@@ -110,17 +114,17 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         rows.check("region weights", region_view.size)
         if not (0 <= views <= _MAX_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
             counts = ", ".join(map(str, (views, power, excluded)))
-            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, out of range")
+            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, which is out of range")
         unlabeled.check("weights of unlabeled pixels", views)
         if len(unlabeled.offsets) != len(rows.offsets):
             raise InputError(
-                f"{len(rows.offsets) - 1} Gaussians have region weights, but {len(unlabeled.offsets) - 1} have weights "
-                "of unlabeled pixels"
+                f"region weights are for {len(rows.offsets) - 1} Gaussians, but weights of unlabeled pixels are for "
+                f"{len(unlabeled.offsets) - 1}"
             )
         last = views - 1 if region_view.size > 0 else 0
         check_array("region_view", region_view, "int32", (region_view.size,), 0, last)
         if bool((region_view[1:] < region_view[:-1]).any()):
-            raise InputError(f"region_view falls, expected rising values in 0..{views - 1}")
+            raise InputError(f"values of region_view decrease, expected ascending values in 0..{views - 1}")
         return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); {remedy}") from error
@@ -130,8 +134,8 @@ def read_field(folder: Path) -> FieldArrays:
     """Read the files that `SemanticField.save` wrote, and check all digests.
 
     Raises:
-        FileNotFoundError: the folder has no complete field.
-        ValueError: unknown schema version, or a damaged file, which the message names.
+        FileNotFoundError: The folder has no complete field.
+        ValueError: The schema version is unknown, or a file is damaged. The message gives its path.
     """
     manifest, digests = read_manifest(folder)
     try:
@@ -162,7 +166,7 @@ def _check_field(
         if evidence is not None:
             check_array("features", arrays["features"], "float32", (len(evidence.region_view), dimension), -FLOAT32_MAX)
             if ((arrays["norm"] > 0) & (arrays["weight"] == 0)).any():
-                raise InputError("norm is above 0 for Gaussians whose weight is 0")
+                raise InputError("norm is above 0 for Gaussians with weight 0, expected norm 0")
             if len(evidence.rows.offsets) - 1 != n:
                 raise InputError(f"{EVIDENCE_FILE} has {len(evidence.rows.offsets) - 1} Gaussians, expected {n}")
             return

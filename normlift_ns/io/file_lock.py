@@ -1,10 +1,11 @@
 """Work claims for processes that share a folder, without locks.
 
-A claim is the file KEY.NUMBER, created with O_EXCL, so that only one process gets it, also on network drives. NUMBER
-counts the attempts at a task; only the latest attempt counts. Its owner writes a heartbeat into the file, and creates
-KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process takes the task over by claiming the
-next number, which again only one process gets. Claim files are never deleted, so no process can delete the claim of
-another. Each process times heartbeats with its own clock; clocks of different machines need not agree.
+A claim is a file KEY.NUMBER for attempt NUMBER at task KEY. Only the latest attempt is valid. Processes create claims
+with O_EXCL, so only one process owns an attempt, on network drives too. The owner writes a heartbeat into the file, and
+creates KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process claims the next attempt.
+
+Claim files are never deleted, so no process can delete the claim of another process. Each process measures heartbeats
+with its own clock, so the clocks of different machines may differ.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ from normlift_ns.io.guard import read_file
 ABANDONED = "left"
 """Outcome of an abandoned attempt; any process may claim the task again immediately."""
 BEATS_PER_TIMEOUT = 6
-"""Number of heartbeats per timeout: after one timeout without a heartbeat, an owner counts as dead."""
+"""Number of heartbeats that an owner writes per timeout; see `iter_claims`."""
 _CLAIM_NAME = re.compile(r"([0-9a-z_-]+)\.([1-9][0-9]*)(?:\.([a-z]+))?")
 _PULSE_DIGITS = 12
 _MAX_POLL_INTERVAL = 5.0
-"""Seconds between two looks at the claims of other processes."""
+"""Maximum time between two checks of the claims of other processes, in seconds."""
 
 
 class ClaimState(NamedTuple):
     """State of a task."""
 
     number: int
-    """Number of the latest attempt; 0 if the task was never claimed."""
+    """Number of the latest attempt; 0 if no process has claimed the task yet."""
     outcome: str | None
     """Outcome of that attempt; None while it runs, or if its owner died."""
 
@@ -47,7 +48,7 @@ UNCLAIMED = ClaimState(0, None)
 
 @dataclass(frozen=True)
 class Claim:
-    """An attempt at a task, owned by one process."""
+    """Claim of one process for one attempt at a task."""
 
     folder: Path
     key: str
@@ -60,10 +61,10 @@ class Claim:
 
 
 def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
-    """Return the state of every task that was ever claimed, by key.
+    """Return the states of all tasks that have claim files, by key.
 
     Args:
-        names: names of the files in the folder.
+        names: Names of all files in the folder; names of other files are ignored.
 
     >>> claim_states(["a.1", "a.1.left", "a.2", "b.1", "b.1.done", "notes.txt"])
     {'a': ClaimState(number=2, outcome=None), 'b': ClaimState(number=1, outcome='done')}
@@ -80,9 +81,11 @@ def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
 
 
 def is_claimable(state: ClaimState, at_start: ClaimState) -> bool:
-    """Return whether a task may be claimed immediately.
+    """Return True if a task is unclaimed or abandoned, or if its latest attempt ended before this process started.
 
-    It may if it was never claimed, if it was abandoned, or if its latest attempt ended before this process started.
+    Args:
+        state: Current state of the task.
+        at_start: State of the task when this process started.
 
     >>> failed = ClaimState(1, "failed")
     >>> is_claimable(failed, at_start=failed), is_claimable(failed, at_start=UNCLAIMED)
@@ -103,10 +106,10 @@ def try_claim(folder: Path, key: str, after: int) -> Claim | None:
     """Claim the next attempt at a task; return None if another process claimed it first.
 
     Args:
-        key: name of the task, of lower-case letters, digits, - and _.
-        after: number of the latest attempt.
+        key: Name of the task, made of lower-case letters, digits, - and _.
+        after: Number of the latest attempt, as in `ClaimState`.
     Raises:
-        OSError: the folder cannot be written.
+        OSError: The folder cannot be written.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -118,7 +121,7 @@ def try_claim(folder: Path, key: str, after: int) -> Claim | None:
     assert _CLAIM_NAME.fullmatch(attempt.path.name), key
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with attempt.path.open("xb") as file:  # host name and process id are for human readers
+        with attempt.path.open("xb") as file:  # host name and process ID are only for people
             file.write(f"{0:0{_PULSE_DIGITS}d} {socket.gethostname()} {os.getpid()}\n".encode())
     except FileExistsError:
         return None
@@ -126,12 +129,12 @@ def try_claim(folder: Path, key: str, after: int) -> Claim | None:
 
 
 def write_pulse(claim: Claim, count: int) -> bool:
-    """Write the heartbeat of a claim; return False if another process has taken the task over.
+    """Write the heartbeat of a claim; return False if another process has taken over the task.
 
-    Failing to write the heartbeat is not an error; other processes then see it stop.
+    If the file cannot be written, the function raises no error, and the heartbeat stops for other processes.
 
     Args:
-        count: a non-negative number that differs from the previous one.
+        count: Non-negative number that differs from the previous one.
     """
     with suppress(OSError), claim.path.open("r+b", buffering=0) as file:
         file.write(f"{count:0{_PULSE_DIGITS}d}".encode())
@@ -139,7 +142,7 @@ def write_pulse(claim: Claim, count: int) -> bool:
 
 
 def read_pulse(claim: Claim) -> bytes:
-    """Read the heartbeat of a claim; return an empty string if it cannot be read."""
+    """Return the heartbeat of a claim; an empty byte string if the file cannot be read."""
     with suppress(OSError):
         return read_file(claim.path)[:_PULSE_DIGITS]
     return b""
@@ -149,9 +152,9 @@ def finish_claim(claim: Claim, outcome: str) -> None:
     """Record the outcome of an attempt, so that other processes stop waiting for it.
 
     Args:
-        outcome: a word of lower-case letters; `ABANDONED` lets other processes claim the task immediately.
+        outcome: Word of lower-case letters. After `ABANDONED`, other processes may claim the task immediately.
     Raises:
-        OSError: the folder cannot be written.
+        OSError: The folder cannot be written.
     """
     path = claim.path.with_name(f"{claim.path.name}.{outcome}")
     assert _CLAIM_NAME.fullmatch(path.name), outcome
@@ -167,20 +170,21 @@ def iter_claims(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Claim]:
-    """Yield claims of this process until every task has ended, in this process or another.
+    """Yield claims of this process until all tasks have ended, whichever process works on them.
 
-    The generator waits for tasks of other processes, and claims them if their heartbeat stops. The caller must work on
-    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `timeout`), and call `finish_claim` before it takes
-    the next claim.
+    The generator waits for tasks of other processes, and claims a task if its heartbeat stops. While the caller works
+    on a claim, it must call `write_pulse` `BEATS_PER_TIMEOUT` times per `timeout`. It must call `finish_claim` before
+    it requests the next claim.
 
     Args:
-        keys: names of the tasks.
-        initial_states: result of `read_claim_states` before the caller listed its tasks. Attempts that had ended by
-            then are repeated; attempts that end later are not.
-        timeout: seconds without a heartbeat after which an owner counts as dead.
-        clock, sleep: replacements for tests.
+        keys: Names of the tasks.
+        initial_states: Result of `read_claim_states` before the caller listed its tasks. Attempts that had already
+            ended are repeated; attempts that end later are not.
+        timeout: Seconds without a heartbeat after which another process may take over a task.
+        clock: Function that returns the time in seconds; tests replace it.
+        sleep: Function that waits for a number of seconds; tests replace it.
     Raises:
-        OSError: the folder cannot be written.
+        OSError: The folder cannot be written.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -189,7 +193,7 @@ def iter_claims(
     >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, timeout=60.0))
     (ClaimState(number=1, outcome='done'), [])
     """
-    heartbeats: dict[Claim, tuple[bytes, float]] = {}  # the latest one of each claim, and when it was first read
+    heartbeats: dict[Claim, tuple[bytes, float]] = {}  # latest heartbeat of each claim, and its first reading time
     while True:
         now, current, waiting, mine = clock(), read_claim_states(folder), False, None
         for key in keys:
@@ -203,7 +207,7 @@ def iter_claims(
                 available, waiting = now - heartbeats[other][1] >= timeout, True
             if available and (mine := try_claim(folder, key, state.number)) is not None:
                 break
-            waiting |= available  # another process claimed it first, and may die
+            waiting |= available  # another process claimed the task first, and may die
         if mine is not None:
             yield mine
         elif not waiting:
@@ -212,7 +216,7 @@ def iter_claims(
             sleep(min(timeout / BEATS_PER_TIMEOUT, _MAX_POLL_INTERVAL))
 
 
-# JSON Lines files: each process appends to a file of its own, and readers read all files of a folder.
+# JSON Lines files: each process appends to its own file, and readers read all files in a folder.
 
 
 JSONL_SUFFIX = ".jsonl"
@@ -220,13 +224,13 @@ _Line = TypeVar("_Line")
 
 
 def append_jsonl(path: Path, line: Any) -> None:
-    """Append a line, with a single write, and wait until it is on the disk.
+    """Append a line to a JSON Lines file with a single write, and flush it to the disk.
 
     Args:
-        path: a file that no other process writes.
-        line: a dataclass instance or other value that msgspec encodes as JSON.
+        path: File that no other process writes.
+        line: Dataclass instance or other value that msgspec can encode as JSON.
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
     with path.open("ab", buffering=0) as file:
         file.write(msgspec.json.encode(line) + b"\n")
@@ -234,9 +238,9 @@ def append_jsonl(path: Path, line: Any) -> None:
 
 
 def read_jsonl(folder: Path, kind: type[_Line]) -> list[_Line]:
-    """Return the lines of all .jsonl files in a folder, file by file in the order of their names.
+    """Return the decoded lines of all .jsonl files in a folder, sorted by file name.
 
-    Lines that do not decode as `kind` are skipped: a process that is killed may leave an incomplete one.
+    Lines that cannot be decoded as `kind` are skipped, because a killed process may leave an incomplete line.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())

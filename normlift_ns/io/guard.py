@@ -1,4 +1,4 @@
-"""Guards of all files: what may be read, and which existing files an output may replace."""
+"""Checks of files before they are read, and of existing files before an output replaces them."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from typing import Any
 from normlift_ns.errors import InputError
 
 MAX_TEXT_BYTES = 2**26
-"""Size limit of a text file; normlift_ns writes a few thousand bytes."""
+"""Maximum size of a text file, in bytes. Text files of normlift_ns have a few thousand bytes."""
 
 
 def open_regular(path: str | Path, *, max_bytes: int | None = None) -> BufferedReader:
-    """Open a regular file for reading, without waiting for a pipe.
+    """Open a regular file for reading, without blocking on a pipe.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it is a folder, a pipe or a device, or has more than `max_bytes` bytes.
+        FileNotFoundError: The file does not exist.
+        ValueError: The path is a folder, a pipe or a device, or the file has more than `max_bytes` bytes.
     """
     try:
         file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115 (the caller closes it)
     except IsADirectoryError:
-        raise InputError(f"{path} is not a regular file; replace it with the file that belongs there") from None
+        raise InputError(f"{path} is a folder, expected a regular file; replace it, or give another path") from None
     try:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{path} is not a regular file; replace it with the file that belongs there")
+            raise InputError(f"{path} is not a regular file but a pipe or device; replace it, or give another path")
         if max_bytes is not None and status.st_size > max_bytes:
-            raise InputError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
+            raise InputError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}; give another file")
     except BaseException:
         file.close()
         raise
@@ -48,22 +48,22 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
-    """Raise the errors of `open_regular` before another library opens the file."""
+    """Raise the errors of `open_regular`, before another library opens the file."""
     open_regular(path, max_bytes=max_bytes).close()
 
 
 def read_file(path: str | Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
-    """Return the content of a regular file; raises the errors of `open_regular`."""
+    """Return the content of a regular file, or raise the errors of `open_regular`."""
     with open_regular(path, max_bytes=max_bytes) as file:
         return file.read()
 
 
 def read_text(path: Path, encoding: str = "utf8") -> str:
-    """Return the text of a regular file, with \\n as line ends; raises the errors of `open_regular`."""
-    return read_file(path).decode(encoding).replace("\r\n", "\n")  # copying via Windows may change line endings
+    """Return the text of a regular file with \\n as line endings, or raise the errors of `open_regular`."""
+    return read_file(path).decode(encoding).replace("\r\n", "\n")  # a copy made on Windows may end lines with \r\n
 
 
-# Outputs. A run or a data set is recognized by its files; further inputs are those that a command was given.
+# Outputs. Runs and data sets are recognized by their files; a command adds its own inputs with `protect_inputs`.
 
 
 _RUN = r"config\.yml|(dataparser_transforms|splat|transforms|added_photographs)\.json|nerfstudio_models|normlift"
@@ -77,38 +77,38 @@ _OWNERS = (
     *(("data set", (name,), _DATA_SET) for name in ("transforms.json", "sparse/0", "sparse/cameras.bin")),
     *(("data set", (name,), _DATA_SET) for name in ("sparse/cameras.txt", "colmap/sparse", "database.db")),
 )
-"""Kind of folder, entries that identify it, and a pattern of the entries that belong to it."""
+"""Kind of folder, the entries that identify it, and a pattern for all entries that belong to it."""
 _KINDS = {
     ".ply": rb"ply\r?\n", ".png": rb"\x89PNG\r\n\x1a\n", ".npy": rb"\x93NUMPY", ".jpg": rb"\xff\xd8\xff",
     ".glb": rb"glTF", ".spz": rb"\x1f\x8b|NGSP",
     ".pdf": rb"%PDF-", ".safetensors": rb'(?s).{8}\{"', ".svg": rb"<\?xml[^>]*>\s*(<!DOCTYPE svg|<svg)|<svg",
 }  # fmt: skip
-"""First bytes of files by the suffix that names their kind."""
+"""Patterns for the first bytes of a file, by the suffix of its kind."""
 _HEAD_BYTES = 1024
 _inputs: set[str] = set()
 
 
 def protect_inputs(*paths: Path | None) -> None:
-    """Let no output replace these files, or the files in these folders."""
+    """Protect files, and all files in folders, against replacement by outputs of this command; ignore None."""
     _inputs.update(os.path.abspath(path) for path in paths if path is not None)
 
 
 def forget_inputs() -> None:
-    """Forget the files of `protect_inputs`, at the beginning of a command."""
+    """Remove the protection of `protect_inputs`, at the beginning of a command."""
     _inputs.clear()
 
 
 def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
-    """Raise, before anything is computed, if an output would replace a file of a run, a data set, a cache, or an input.
+    """Raise if an output would replace an input, or a file of a run, a data set or a cache.
 
-    A run is a folder that has config.yml and nerfstudio_models/, or files of another trainer. Nothing may be written
-    over its files or into its folders; figures, tables and exports next to these are allowed. A data set may get new
-    files.
+    A run is a folder with config.yml and nerfstudio_models/, or with the files of another trainer. Outputs must not
+    replace its files or go into its folders. Outputs next to its files and new files in a data set are allowed.
+    Commands call this function before they start their work.
 
     Args:
-        instead: flags with which the user can choose another path, for the error message.
+        instead: Flags for choosing another path, quoted in the error message.
     Raises:
-        ValueError: as above, with links resolved.
+        ValueError: An output, with links resolved, would replace such a file.
 
     >>> refuse_inputs([Path("answers.json")], instead="--output-json")
     """
@@ -117,13 +117,16 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
         owner = _owner_of(os.path.realpath(path), owners, inputs)
         if owner is not None:
             raise InputError(
-                f"{path} is part of {owner}, and replacing it would destroy that; give another {instead} "
-                "(--overwrite True does not allow this)"
+                f"{path} is part of {owner} and must not be replaced, not even with --overwrite True; "
+                f"give another {instead}"
             )
 
 
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
-    """Return what a path without links is part of; None if an output may be written there."""
+    """Return a description of the input, run, data set or cache that contains a path; None if it may be written.
+
+    The path must have its links resolved.
+    """
     exists, folder = os.path.exists(path), os.path.dirname(path)
     for kind, parent, names in owners(folder):
         if (exists or kind == "run") and names.fullmatch(Path(path).relative_to(parent).parts[0]):
@@ -137,7 +140,7 @@ def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callabl
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
-    """Yield the runs and data sets that contain a folder, with the pattern of their entries."""
+    """Yield the kind, folder and pattern of entries of each run and data set that contains a folder."""
     for parent in (folder, *map(str, Path(folder).parents)):
         for kind, markers, names in _OWNERS:
             if all(os.path.exists(os.path.join(parent, marker)) for marker in markers):
@@ -145,7 +148,7 @@ def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
 
 
 def _input_files() -> dict[tuple[int, int], str]:
-    """Return the names of the inputs that exist by device and inode, so that links are recognized."""
+    """Return the paths of existing inputs by device and inode, which identify a file regardless of links."""
     found = {}
     for name in filter(os.path.exists, _inputs):
         status = os.stat(name)
@@ -154,12 +157,12 @@ def _input_files() -> dict[tuple[int, int], str]:
 
 
 def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=True") -> None:
-    """Raise if an output would replace anything but an empty file or a regular file of its own kind.
+    """Raise if an output would replace anything except an empty file or a regular file of its own kind.
 
     Args:
-        path: the output; if it does not exist, nothing is checked.
-        kind: kind of the output as of `file_kind`; None: not known yet.
-        flags: flags that name the output, for the error message.
+        path: Path of the output. If it does not exist, the function returns without a check.
+        kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
+        flags: Flags for choosing the output, quoted in the error message.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, or its content is of another kind.
     """
@@ -169,22 +172,22 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
         found = file_kind(path)
     except (OSError, InputError):
         raise InputError(
-            f"{path}, given with {flags}, exists and is not a regular file that can be read; give another name"
+            f"{path}, given with {flags}, is not a regular file, or cannot be read; give another name"
         ) from None
     if found != "" and kind is not None and kind != found:
         raise InputError(
-            f"{path} holds {found}, and would be replaced by {kind}; give another name, "
-            "or delete it (--overwrite True replaces only a file of the same kind)"
+            f"{path} contains {found}, but the output is {kind}, and --overwrite True replaces only files of the same "
+            "kind; give another name, or delete the file"
         )
 
 
 def file_kind(path: Path) -> str:
-    """Return the kind of a file by its content, as a suffix such as ".ply"; "" for an empty file.
+    """Return the kind of a file by its content: a suffix such as ".ply", or "" for an empty file.
 
-    Other kinds are told apart by their first word or bytes.
+    For kinds without a suffix here, return a description with the first column or the first bytes.
 
     Raises:
-        OSError, ValueError: it cannot be read, or is not a regular file.
+        OSError, ValueError: The file cannot be read, or is not a regular file.
     """
     with open_regular(path) as file:
         head = file.read(_HEAD_BYTES)
@@ -195,7 +198,7 @@ def file_kind(path: Path) -> str:
         if head.lstrip()[:1] in (b"{", b"["):
             file.seek(0)
             return ".json" if _is_json(file) else "text that is not JSON"
-    decoder = codecs.getincrementaldecoder("utf8")("replace")  # the head may end within a character
+    decoder = codecs.getincrementaldecoder("utf8")("replace")  # the head may end in the middle of a character
     text = decoder.decode(head, final=len(head) < _HEAD_BYTES)
     if any(not (c.isprintable() or c.isspace()) or c == "\ufffd" for c in text):
         return f"data beginning with {head[:4].hex()}"
@@ -204,7 +207,7 @@ def file_kind(path: Path) -> str:
 
 
 def suffix_kind(path: Path) -> str | None:
-    """Return the kind of file that a suffix promises; None if it promises none."""
+    """Return the kind of a file by the suffix of its path, in lower case; None for other suffixes."""
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 
@@ -227,19 +230,19 @@ def _is_json(file: BufferedReader) -> bool:
 
 
 def check_files_distinct(files: Iterable[tuple[str, Path]], description: str, remedy: str) -> None:
-    """Check that no two images use the same file, with symbolic links resolved.
+    """Raise if two images use the same file, with symbolic links resolved.
 
     Args:
         files: Pairs of an image name and one of its files.
-        description: Kind of file, for the message.
-        remedy: How to give each image its own file, for the message.
+        description: Kind of file, for the error message.
+        remedy: Advice on how to give each image its own file, for the error message.
     Raises:
-        ValueError: If two images share a file.
+        ValueError: Two images share a file.
     """
     owner: dict[str, str] = {}
     for name, file in files:
         other = owner.setdefault(os.path.realpath(file), name)
         if other != name:
             raise InputError(
-                f"images {other} and {name} would share the {description} {file}; give each its own file, {remedy}"
+                f"images {other} and {name} share the {description} {file}; give each image its own file, {remedy}"
             )

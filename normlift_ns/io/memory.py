@@ -1,4 +1,4 @@
-"""Memory that this process may still allocate: of the machine, of its cgroups, and of `ulimit -v`."""
+"""Limits of the memory that this process may still allocate: the machine, its cgroups and `ulimit -v`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from importlib.util import find_spec
 from pathlib import Path
 
 _LIFT_BYTES, _GAUSSIAN_BYTES, _PIXEL_BYTES = 2**29, 600, 32
-"""Least memory of a lift of any size, per Gaussian (parameters, their copy in the new run, scalars) and per pixel of a
-view."""
+"""Lower bounds for the memory of a lift, in bytes: fixed, per Gaussian, and per pixel of a view.
+
+The bytes of a Gaussian are its parameters, their copy in the new run, and its scalars.
+"""
 
 
 def free_memory(root: Path = Path("/")) -> dict[str, int]:
-    """Return the free bytes under each limit, by its name; empty if the system does not report them.
+    """Return the free bytes under each memory limit, by the name of the limit.
+
+    Limits that the system does not report are left out.
 
     Args:
         root: Folder that contains proc and sys.
@@ -37,7 +41,10 @@ def free_memory(root: Path = Path("/")) -> dict[str, int]:
 
 
 def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield the files of limit and use, of version 2 and version 1, of the own group and of those around it."""
+    """Yield the files with the limit and the usage of the cgroup of this process and of its parent groups.
+
+    Both cgroup versions, 1 and 2, are supported.
+    """
     lines: list[str] = []
     with suppress(OSError, ValueError):
         lines = (root / "proc/self/cgroup").read_text().splitlines()
@@ -51,19 +58,19 @@ def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
             continue
         own = base / group.lstrip("/")
         for folder in (own, *own.parents):
-            if folder.is_relative_to(base):  # in a container, only the outermost one may be visible
+            if folder.is_relative_to(base):  # in a container, only the outermost group may be visible
                 yield folder / names[0], folder / names[1]
 
 
 def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int] | None = None) -> None:
-    """Raise if a limit leaves less memory than needed.
+    """Raise if a memory limit leaves fewer bytes than an operation needs.
 
     Args:
-        needed: Number of bytes.
-        what: What needs them, for the message.
+        needed: Number of bytes that the operation needs.
+        what: Name of the operation, for the error message.
         needed_by_limit: Numbers of bytes that replace `needed` for some limits, by their names in `free_memory`.
     Raises:
-        MemoryError: A limit leaves less; the message has both numbers.
+        MemoryError: A limit leaves fewer bytes. The message gives both numbers.
     """
     for name, free in free_memory().items():
         least = (needed_by_limit or {}).get(name, needed)
@@ -75,14 +82,14 @@ def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int]
 
 
 def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = True) -> None:
-    """Raise if a lift of so many Gaussians and pixels of a view certainly does not fit into memory.
+    """Raise if a lift certainly does not fit into memory.
 
     Args:
         gaussians: Number of Gaussians.
         pixels: Number of pixels of a view.
-        loaded: False if torch is not imported yet, whose libraries count for `ulimit -v`.
+        loaded: False if torch is not imported yet. The estimate for `ulimit -v` then includes its libraries.
     Raises:
-        MemoryError: The lift does not fit; the message has the estimate.
+        MemoryError: The lift does not fit. The message gives the estimate.
     """
     needed = gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
     if loaded:
@@ -92,7 +99,7 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
 
 
 def _library_bytes() -> int:
-    """Return the size of the libraries of torch and CUDA, which are mapped as a whole."""
+    """Return the total size of the libraries of torch and CUDA in bytes; a process maps all of it into memory."""
     spec = find_spec("torch")
     places = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
     files = [file for place in places for file in (*place.glob("lib/*.so*"), *place.parent.glob("nvidia/*/lib/*.so*"))]
