@@ -181,7 +181,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"load_step": 3}, "open_scene"),
         *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
         ({"output_dir": 5}, "output_dir"),
-        *(({"timestamp": x}, "name of a folder") for x in (".", "..", "a/b", "/x", "", ".cache", "x\ny", "\x1b[31m")),
+        *(({"timestamp": x}, "valid folder name") for x in (".", "..", "a/b", "/x", "", ".cache", "x\ny", "\x1b[31m")),
         ({"timestamp": "a" * 300}, "300 .* 200"),
     ]
     for arguments, message in wrong:
@@ -195,7 +195,7 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
     with pytest.raises(TypeError, match=r"config_or_scene must be .* got 3"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
+    with pytest.raises(nl.InputError, match="valid folder name"):  # before a scene is looked for
         nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)

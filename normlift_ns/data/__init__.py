@@ -1,1 +1,1 @@
-"""Readers that turn trained splats and their training images into a `Scene` of the core."""
+"""Readers for trained splats and their training images, which return a `Scene` of the core."""

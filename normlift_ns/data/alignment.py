@@ -1,4 +1,4 @@
-"""Check, from a few renders before a lift, that images, cameras and Gaussians belong together."""
+"""Comparison of a few renders with their images before a lift, to detect cameras that do not match the splat."""
 
 from __future__ import annotations
 
@@ -20,48 +20,52 @@ from normlift_ns.rasterization.settings import RasterSettings
 _MAX_RENDER_SIDE = 400
 """Longer side of the renders in pixels."""
 _MAX_DIVISOR_AS_TRAINED = 4.0
-"""Divisor of an image's size below which it is compared with a render in the trained mode, with the rasterizer's 0.3
-square pixels scaled down. Above it, that render would be too thick. An antialiased one is used instead, which preserves
-the mean of Gaussians smaller than a pixel."""
+"""Divisor of the image size up to which the render uses the rasterize mode of the training, with a scaled eps2d.
+
+For smaller copies, this mode would draw Gaussians too large. They use antialiased mode, which preserves the mean of
+Gaussians smaller than a pixel.
+"""
 _SMALL_EPS2D = 0.1
-"""Square pixels that the antialiased renders add to projected Gaussians."""
+"""Value of eps2d of the antialiased renders, in square pixels."""
 MIN_PSNR = 24.0
-"""Usual minimum in dB; real scenes reach 25 to 40 dB on their training images."""
+"""Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 _FOCAL_STEP, _FOCAL_GAIN = 1.02, 1.0
-"""Factor on the focal length, and gain in dB that counts. A focal length that is 2 % off costs about 15 dB on a sharp
-scene, so 1 dB is well beyond chance."""
+"""Factor on the focal length, and minimum gain in dB to report it.
+
+On a sharp scene, a focal length that is wrong by 2 % costs about 15 dB.
+"""
 _MIN_VISIBLE = 0.001
-"""Fraction of the Gaussians that at least one of the views must see."""
+"""Minimum fraction of the Gaussians in the view that contains most of them."""
 
 
 _SmallView = tuple[View, float]
-"""A view at no more than 400 pixels, and the divisor of its size."""
+"""View of at most 400 pixels on the longer side, and the divisor of its size."""
 
 
 class Alignment(NamedTuple):
     """Agreement between renders and images."""
 
     psnr: float
-    """Mean over the views, in dB."""
+    """Mean PSNR of the renders, in dB."""
     worst: tuple[str, float]
-    """Name of the image with the lowest PSNR, and that PSNR in dB."""
+    """Name and PSNR in dB of the image with the lowest PSNR."""
     visible_fraction: float
-    """Largest fraction of the Gaussians that lies in one view, in 0..1."""
+    """Fraction of the Gaussians in the view that contains most of them, in 0..1."""
     mean_color_psnr: float
-    """PSNR in dB of a constant image in the mean color of each image."""
+    """Mean PSNR in dB if each image is compared with its mean color instead of a render."""
     focal_factor: float
-    """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; otherwise 1."""
+    """Factor 1 / 1.02 or 1.02 on the focal lengths, if it increases the mean PSNR by more than 1 dB; otherwise 1."""
 
 
 def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, device: str = "cpu") -> Alignment:
-    """Render three training views at no more than 400 pixels and compare them with their images.
+    """Render three training views with at most 400 pixels on the longer side, and compare them with their images.
 
     Args:
-        scene: Gaussians, cameras and images.
-        settings: constants of the rasterizer at full size; None: those of gsplat 1.4.
-        device: torch device to render on.
+        scene: Scene with Gaussians, cameras and images.
+        settings: Constants of the rasterizer at full size; None for the constants of gsplat 1.4.
+        device: Device of torch that renders the views.
     Raises:
-        FileNotFoundError, ValueError: if an image is missing or cannot be read.
+        FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
     views, settings = _sample_views(scene), settings or RasterSettings()
     render = partial(_render, scene, scene.gaussians.to(device), settings)
@@ -76,7 +80,7 @@ def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, d
 
 
 def mean_psnr(scene: Scene, factor: float = 1.0) -> float:
-    """Return `Alignment.psnr` alone, in dB, with a factor on the focal lengths."""
+    """Return the mean PSNR of `Alignment` in dB, after multiplying the focal lengths by a factor."""
     render = partial(_render, scene, scene.gaussians, RasterSettings())
     return _mean_psnr(render, _sample_views(scene), factor)
 
@@ -85,47 +89,46 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     """Return a warning in whole sentences, or None if renders and images agree.
 
     Args:
-        match: result of `measure_alignment`.
-        trained_cameras: whether, as far as the files show, the splat was trained with these cameras.
+        match: Result of `measure_alignment`.
+        trained_cameras: True if, according to the files, the splat was trained with these cameras.
     Raises:
-        ValueError: if Gaussians and cameras are unrelated.
+        ValueError: The Gaussians and the cameras do not belong together.
     """
     causes = "Likely causes: " + (
         "the images, their exposure or transforms.json have changed since the training, or the training was stopped "
         "early"
         if trained_cameras
-        else "cameras of another capture; cameras in a different world from the splat's (give --world-transform; for "
-        "gsplat's trainer see --gsplat-normalize); other images, or distorted images with cameras for undistorted "
-        "ones; a different exposure from the training images; much smaller copies of the training images; another "
-        "--rasterize-mode or --background"
+        else "cameras of another capture, or cameras in another world than the splat. Give --world-transform, or for "
+        "gsplat's trainer --gsplat-normalize. Other causes are other, distorted or much smaller images, another "
+        "exposure, another --rasterize-mode or another --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            f"The cameras do not look at this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
-            f"of three training views. {causes}. --check-alignment False lifts anyway."
+            f"The cameras do not show this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
+            f"of three training views. {causes}. To lift anyway, give --check-alignment False."
         )
     if match.psnr < match.mean_color_psnr and not trained_cameras:
         raise InputError(
-            f"The splat does not show what its images show: renders from three of the cameras are further from the "
-            f"images ({match.psnr:.1f} dB) than their mean color is ({match.mean_color_psnr:.1f} dB). {causes}. "
-            "--check-alignment False lifts anyway."
+            f"The splat does not match its images. Renders of three training views have a PSNR of {match.psnr:.1f} dB, "
+            f"less than the mean color of each image ({match.mean_color_psnr:.1f} dB). {causes}. "
+            "To lift anyway, give --check-alignment False."
         )
     if match.focal_factor != 1.0:
         return (
             f"Focal lengths that are {abs(match.focal_factor - 1):.0%} "
-            f"{'longer' if match.focal_factor > 1 else 'shorter'} fit the images better by more than 1 dB. The cameras "
-            "may not be those of the training: has their file changed since, or were the images resized?"
+            f"{'longer' if match.focal_factor > 1 else 'shorter'} increase the PSNR by more than 1 dB. The cameras "
+            "may not be those of the training. Check whether the camera file has changed or the images were resized."
         )
     name, lowest = match.worst
     if match.psnr >= MIN_PSNR > lowest:
         return (
-            f"The splat reaches only {lowest:.1f} dB on {name}, one of the three training images that were checked; "
-            f"{MIN_PSNR:.0f} dB or more is usual. Has this image or its camera changed since the training? If so, "
-            "other images may have changed too: only three are checked."
+            f"The render of {name}, one of three training images that were checked, has a PSNR of only {lowest:.1f} "
+            f"dB; {MIN_PSNR:.0f} dB or more is usual. Check whether this image or its camera has changed since the "
+            "training. If so, other images may have changed too."
         )
     if match.psnr < MIN_PSNR:
         return (
-            f"The splat reaches {match.psnr:.1f} dB on three training images; {MIN_PSNR:.0f} dB or more is usual. "
+            f"Renders of three training images have a PSNR of {match.psnr:.1f} dB; {MIN_PSNR:.0f} dB or more is usual. "
             f"The semantics will be equally inexact. {causes}."
         )
     return None
@@ -137,14 +140,14 @@ def _sample_views(scene: Scene) -> list[_SmallView]:
     usable = [(view, divisor) for view, divisor in views if view.mask is None or bool(view.mask.any())]
     if len(usable) == 0:
         raise InputError(
-            f"The masks of {', '.join(view.name for view, _ in views)} leave no pixels. Expected masks that are "
-            "zero at pixels to ignore; are they inverted?"
+            f"The masks of {', '.join(view.name for view, _ in views)} exclude all pixels. Expected masks that are "
+            "zero only at pixels to ignore. If they are inverted, invert them again."
         )
     return usable
 
 
 def _shrink(view: View) -> _SmallView:
-    """Shrink a view by averaging pixels, which needs no further filter."""
+    """Downscale a view to at most 400 pixels on the longer side; also return the divisor of its size."""
     camera = view.camera
     divisor = max(1.0, max(camera.width, camera.height) / _MAX_RENDER_SIDE)
     width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
@@ -158,7 +161,7 @@ def _mean_psnr(render: Callable[[_SmallView, float], Tensor], views: Sequence[_S
 def _render(
     scene: Scene, gaussians: GaussianScene, settings: RasterSettings, small: _SmallView, factor: float
 ) -> UInt8[Tensor, "h w 3"]:
-    """Render the scene so that it looks like a downscaled render at full size."""
+    """Render a small view of the scene that looks like a downscaled render at full size."""
     view, divisor = small
     camera = replace(view.camera, K=view.camera.K * torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]]))
     as_trained = divisor < _MAX_DIVISOR_AS_TRAINED
@@ -181,6 +184,6 @@ def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
 
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
-    """Return the mask of the Gaussians whose centers lie inside the image and in front of the camera."""
+    """Return a mask of the Gaussians whose centers are inside the image and in front of the camera."""
     _, _, depth, inside = camera.project(means)
     return inside & (depth > 0.01)

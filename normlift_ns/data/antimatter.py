@@ -1,4 +1,4 @@
-"""`.splat` files, as antimatter15's viewer reads them: 32 bytes per Gaussian, without a header."""
+"""Reader for the `.splat` files of antimatter15's viewer, with 32 bytes per Gaussian and no header."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MIN_SCALE = 1e-30
 
 
 def read_antimatter(path: Path) -> SplatFile:
-    """Read a .splat file, whose Gaussians have one color from all sides.
+    """Read a .splat file. Its colors do not depend on the view direction.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if its size is not a multiple of 32 bytes, or its Gaussians cannot be drawn.
+        FileNotFoundError: The file does not exist.
+        ValueError: Its size is not a multiple of 32 bytes, or its Gaussians cannot be drawn.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no .splat file at {path}. Give the file of the splat with --load-ply.")
@@ -36,7 +36,7 @@ def read_antimatter(path: Path) -> SplatFile:
     rows = np.frombuffer(data, _ROW)
     scales, colors = torch.from_numpy(rows["scales"].copy()), torch.from_numpy(rows["colors"].astype(np.float32))
     if bool((scales < 0).any()):
-        raise InputError(f"{path} is not a .splat file: it has negative scales. Give the file of a splat.")
+        raise InputError(f"{path} is not a .splat file: it has negative scales. Give a valid .splat file.")
     splat = SplatParameters(
         means=torch.from_numpy(rows["means"].copy()),
         quats=torch.from_numpy(rows["quats"].astype(np.float32)) / 128 - 1,
@@ -46,5 +46,8 @@ def read_antimatter(path: Path) -> SplatFile:
         features_rest=torch.zeros(len(rows), 0, 3),
     )
     validate_splat(splat, path)
-    rounding = f"{path.name} holds rounded numbers: rotations within 0.02 radians, opacities and colors within 0.002."
+    rounding = (
+        f"{path.name} contains rounded numbers. Maximum errors: 0.02 radians for rotations, and 0.002 for opacities "
+        "and colors."
+    )
     return SplatFile(splat, remarks=(rounding,))

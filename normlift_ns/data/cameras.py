@@ -1,4 +1,4 @@
-"""Cameras of a splat without a nerfstudio run: their file, the splat's world, and learned pose adjustments."""
+"""Cameras of a splat without a nerfstudio run: camera files, world transforms and learned pose adjustments."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ _MIN_POINTS, _PARALLEL = 4, 1e-6
 
 
 def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
-    """Read the camera file that the options name, and check that its images exist.
+    """Read the camera file in the options, and check that its images exist.
 
     Args:
-        options: locations of cameras, images and masks.
-        advice: what to do about missing images, for error messages; None: what the options leave to try.
+        options: Paths of cameras, images and masks.
+        advice: Advice on missing images, for error messages; None for advice that suits the options.
     Raises:
-        FileNotFoundError: if a file, folder, image or mask is missing.
-        ValueError: if the options name no camera file or two, or the file cannot be read.
+        FileNotFoundError: A file, folder, image or mask is missing.
+        ValueError: The options do not contain exactly one camera file, or it cannot be read.
     """
     count = (options.colmap is not None) + (options.transforms is not None)
     if count != 1:
         raise InputError(
-            f"A splat needs one camera file, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            f"A splat needs one camera file, got {'two' if count else 'none'}. Give the folder of a COLMAP project "
             "with --colmap, or a transforms.json with --transforms."
         )
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
@@ -52,15 +52,15 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
     return cameras._replace(frames=[rescale_intrinsics(frame, cameras.source, advice) for frame in cameras.frames])
 
 
-_TURNED = "The axes of gsplat's normalization point the other way; rotated by half a turn, the splat fits its images."
-_NORMALIZED = "The splat does not fit its images in the world of its cameras, but it does in gsplat's normalized world."
+_TURNED = "The splat matches its images after a rotation of gsplat's normalized world by half a turn, which is used."
+_NORMALIZED = "The splat matches its images in gsplat's normalized world, which is used instead of the cameras' world."
 
 
 def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[tuple[str, WorldTransform]]:
-    """Return possible maps from the cameras' world to the splat's, each with a message for its use.
+    """Return possible transforms from the world of the cameras to the world of the splat.
 
-    There are several if only the images can decide. A PLY file may come from gsplat's trainer too, so its normalized
-    world is the alternative if that of the cameras does not fit.
+    If there are several, the caller compares renders with the images, and shows the message of the transform that it
+    chooses. PLY files may come from gsplat's trainer, so its normalized world is an alternative for PLY files too.
     """
     if options.world_transform is not None:
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
@@ -79,22 +79,22 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
 
 
 def _normalizations(options: SplatOptions, cameras: CameraFile) -> list[WorldTransform]:
-    """Recompute the normalizations that gsplat's trainer may have applied, from its COLMAP project."""
+    """Compute the normalizations that gsplat's trainer may have applied to its COLMAP project."""
     if options.colmap is None:
         raise InputError(
-            "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
-            "transforms.json is not enough. Give the project with --colmap, or a known transform with "
-            "--world-transform, or --gsplat-normalize False if the training used --no-normalize-world-space."
+            "gsplat's trainer normalized the world of the splat with the points of its COLMAP project, which a "
+            "transforms.json does not contain. Give the project with --colmap, or a known transform with "
+            "--world-transform. If the training used --no-normalize-world-space, give --gsplat-normalize False."
         )
     try:
         points = read_colmap_points(cameras.source)
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{error} gsplat's trainer normalized the world by points3D.") from error
+        raise FileNotFoundError(f"{error} gsplat's trainer used points3D to normalize the world.") from error
     if len(points) < _MIN_POINTS:
         raise InputError(
-            f"{cameras.source} has {len(points)} points, too few to recompute the normalization of gsplat's trainer. "
-            "Give the project that the splat was trained with, or --gsplat-normalize False if the training used "
-            "--no-normalize-world-space."
+            f"{cameras.source} has {len(points)} points, too few to compute the normalization of gsplat's trainer. "
+            "Give the project that the splat was trained with. If the training used --no-normalize-world-space, give "
+            "--gsplat-normalize False."
         )
     return gsplat_normalization(cameras.frames, points)
 
@@ -102,22 +102,31 @@ def _normalizations(options: SplatOptions, cameras: CameraFile) -> list[WorldTra
 def adjust_poses(
     frames: Sequence[Frame], held_out: frozenset[str], deltas: Float[Tensor, "v 9"], path: Path
 ) -> list[Frame]:
-    """Return the frames with the pose adjustments that gsplat's --pose_opt learned for the training views."""
+    """Apply the pose adjustments that gsplat's --pose_opt learned for the training views.
+
+    Args:
+        frames: Frames of all images.
+        held_out: Names of the images that the training did not use; their poses stay unchanged.
+        deltas: Adjustments of the training views, as in `SplatFile.pose_adjust`.
+        path: File of the splat, for error messages.
+    Raises:
+        ValueError: The numbers of adjustments and training views differ, or an adjustment is not a rotation.
+    """
     trained = [frame for frame in frames if frame.name not in held_out]
     if len(trained) != len(deltas):
         without_eighth = len(frames) - len(range(0, len(frames), 8))
         hint = " The trainer holds out every 8th image: give --test-every 8." if len(deltas) == without_eighth else ""
         raise InputError(
             f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
-            f"{len(frames)} images are training views. Name the others with --test-every or --eval-images.{hint}"
+            f"{len(frames)} images are training views. Give the other images with --test-every or --eval-images.{hint}"
         )
     by_name = {}
     for frame, delta in zip(trained, deltas.numpy()):
         first, second = delta[3:6] + np.eye(3)[0], delta[6:9] + np.eye(3)[1]
         if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
             raise InputError(
-                f"{path}: its `pose_adjust` for {frame.name} is not a valid rotation. Expected two axes that are not "
-                "parallel."
+                f"{path}: the `pose_adjust` of {frame.name} is not a valid rotation. Expected two axes that are not "
+                "parallel. Copy the file again."
             )
         x = first / np.linalg.norm(first)
         y = second - (x @ second) * x

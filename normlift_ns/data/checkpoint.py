@@ -1,4 +1,4 @@
-"""Checkpoints of nerfstudio and of gsplat, read without running code from them."""
+"""Readers for nerfstudio and gsplat checkpoints that do not execute code from the files."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from normlift_ns.data.splat import (
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import check_regular
 
-_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
+_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # names in NumPy 1 and NumPy 2
 
 
 @contextmanager
 def allow_numpy_scalars() -> Iterator[None]:
-    """Allow `torch.load(weights_only=True)` to read NumPy scalars in addition to tensors and plain containers.
+    """Allow `torch.load(weights_only=True)` to read NumPy scalars within a `with` block.
 
-    torch before 2.4 cannot build NumPy scalars, so it reads each of them as None.
+    torch before 2.4 cannot construct NumPy scalars, so they become None.
     """
     if hasattr(torch.serialization, "safe_globals"):
         with torch.serialization.safe_globals(numpy_scalar_globals()):
@@ -57,7 +57,7 @@ def allow_numpy_scalars() -> Iterator[None]:
 
 
 def numpy_scalar_globals() -> list[Any]:
-    """Return the types and functions that unpickle NumPy scalars, for torch's allow-list."""
+    """Return the types and functions that torch's allow-list needs to unpickle NumPy scalars."""
     rebuild: Any = np.float64(0).__reduce__()[0]
     dtypes = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
     return [
@@ -69,25 +69,31 @@ def numpy_scalar_globals() -> list[Any]:
 
 
 def _latin1(text: str, encoding: str) -> bytes:
-    """Encode text as pickle encodes bytes. Other encodings could expand a small file to gigabytes."""
+    """Encode text as Latin-1, which pickle uses for bytes; raise UnpicklingError for other encodings.
+
+    Other encodings could expand a small file to gigabytes.
+    """
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"bytes in the encoding {encoding}")
+        raise pickle.UnpicklingError(f"bytes in the encoding {encoding}, expected latin1")
     return codecs.latin_1_encode(text)[0]
 
 
 def _unread(*_: object) -> None:
-    """Stand-in for a NumPy scalar."""
+    """Return None in place of a NumPy scalar."""
 
 
 def _unread_dtype(*_: object) -> torch.nn.Parameter:
-    """Stand-in for a NumPy dtype: the only kind of object with a custom state that old torch versions build."""
+    """Return a parameter in place of a NumPy dtype.
+
+    Old versions of torch construct objects with a custom state only if they are parameters.
+    """
     stand_in: Any = torch.nn.Parameter(torch.empty(0))
     stand_in.__setstate__ = _unread
     return stand_in
 
 
 def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
-    """Return the function under another name, because torch's allow-list compares names."""
+    """Return a function with another module and name, because torch's allow-list compares names."""
 
     def alias(*args: Any) -> Any:
         return function(*args)
@@ -96,7 +102,7 @@ def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[.
     return alias
 
 
-# Safe reading of nerfstudio checkpoints, which runs no code from the file.
+# Safe reading of nerfstudio checkpoints, without executing code from the file.
 
 
 _PREFIX = "gauss_params."
@@ -109,49 +115,50 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     model: dict[str, Tensor]
-    """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, …, without optimizers and LPIPS."""
+    """State of the model on the CPU, without LPIPS. Tensors named gauss_params.* are in float32."""
     splat: SplatParameters
-    """The gauss_params."""
+    """Parameters of the Gaussians, from gauss_params.* in the state."""
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
-    """Return the checkpoint of a step; None: of the last step.
+    """Return the path of the checkpoint of a step, or of the last step if `step` is None.
 
     Raises:
-        FileNotFoundError: if there is no checkpoint, or none of that step; the message lists the steps that exist.
+        FileNotFoundError: There is no such checkpoint. The message lists the existing steps.
     """
     found = sorted(folder.glob("step-*.ckpt"))
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
-            f"No checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes every "
-            "--steps-per-save steps and at the end; copy it there, or finish the training."
+            f"There is no checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes "
+            "every --steps-per-save steps and at the end. Copy it to this folder, or finish the training."
         )
     if step is None:
         return checkpoints[max(checkpoints)]
     if step not in checkpoints:
         raise FileNotFoundError(
-            f"No checkpoint of step {step} in {folder}; it has the steps {', '.join(map(str, sorted(checkpoints)))}. "
-            "Give one of them with --load-step, or omit it for the last step."
+            f"There is no checkpoint of step {step} in {folder}, which has the steps "
+            f"{', '.join(map(str, sorted(checkpoints)))}. Give one of them with --load-step, or omit --load-step for "
+            "the last step."
         )
     return checkpoints[step]
 
 
 def _step_of(path: Path) -> int | None:
-    """Return the step in a file name of nerfstudio's form; None for other names, and for anything but a file."""
+    """Return the step in the name of a checkpoint file; None for other names and for folders."""
     number = path.name.removeprefix("step-").removesuffix(".ckpt")
     return int(number) if path.name == f"step-{number}.ckpt" and number.isdecimal() and path.is_file() else None
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read step and model of a splatfacto checkpoint, full or slim; optimizer states stay on disk.
+    """Read the step and the model of a splatfacto checkpoint, without its optimizer states.
 
-    Gaussians in float16, bfloat16 or float64 become float32, as in nerfstudio. Gaussians that are not finite stay, and
-    are never drawn.
+    Parameters in float16, bfloat16 or float64 become float32, as in nerfstudio. Gaussians that are not finite are kept,
+    and are never drawn.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is truncated, damaged, not a splatfacto checkpoint or without Gaussians, or its step is
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is truncated, damaged, not a splatfacto checkpoint or without Gaussians, or its step is
             invalid or differs from its name.
     """
     advice = "give another checkpoint with --load-step"
@@ -159,13 +166,16 @@ def read_checkpoint(path: Path) -> Checkpoint:
     state = loaded.get("pipeline") if isinstance(loaded, dict) else None
     if not isinstance(state, dict) or "step" not in loaded:
         keys = sorted(map(str, loaded)) if isinstance(loaded, dict) else type(loaded).__name__
-        raise InputError(f"{path} is not a nerfstudio checkpoint: expected `step` and `pipeline` in it, found {keys}.")
+        raise InputError(
+            f"{path} is not a nerfstudio checkpoint: found {keys}, expected `step` and `pipeline`. Give another "
+            "checkpoint with --load-step."
+        )
     step = validate_step(loaded["step"], path)
     model = _model_state(state, path)
     missing = [_PREFIX + name for name in GAUSSIAN_PARAMETERS if _PREFIX + name not in model]
     if missing:
         raise InputError(
-            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. Give another checkpoint with "
+            f"{path} does not contain splatfacto Gaussians: {', '.join(missing)} missing. Give another checkpoint with "
             "--load-step, or lift a PLY file of the scene with --load-ply."
         )
     known = {*GAUSSIAN_PARAMETERS, "normals"}
@@ -176,10 +186,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def validate_step(step: Any, path: Path) -> int:
-    """Validate and return a training step.
+    """Validate and return the training step of a checkpoint.
 
     Raises:
-        ValueError: if the step is not a whole number in range, or not the step in the file name.
+        ValueError: The step is not a whole number in range, or differs from the step in the file name.
     """
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
         raise InputError(
@@ -189,8 +199,8 @@ def validate_step(step: Any, path: Path) -> int:
     expected = _step_of(path)
     if expected is not None and expected != step:
         raise InputError(
-            f"{path} was saved at step {step}, which is not the step in its name. Rename it to step-{step:09d}.ckpt, "
-            "or give another checkpoint with --load-step."
+            f"{path} was saved at step {step}, but its name has another step. Rename it to step-{step:09d}.ckpt, or "
+            "give another checkpoint with --load-step."
         )
     return step
 
@@ -198,16 +208,16 @@ def validate_step(step: Any, path: Path) -> int:
 def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
     """Load a file written by torch.save, memory-mapped on the CPU.
 
-    Only tensors, plain containers and NumPy scalars are unpickled (`weights_only=True` plus the allow-list of
-    `unpickling`), so a file from a stranger runs no code.
+    The function unpickles only tensors, plain containers and NumPy scalars, so an untrusted file cannot execute code.
+    It uses `weights_only=True` with `allow_numpy_scalars`.
 
     Args:
-        path: the file.
-        writer: clause for error messages that names the writer of such files.
-        advice: for error messages, an alternative to copying the file again.
+        path: File to load.
+        writer: Clause that names the program that writes such files, for error messages.
+        advice: Alternative to copying the file again, for error messages.
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is truncated or damaged, or holds other Python objects.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is truncated or damaged, or contains other Python objects.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected a file written by torch.save; {advice}.")
@@ -220,7 +230,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
     except pickle.UnpicklingError as error:
         match = re.search(r"(?:GLOBAL|Unsupported class) (\S+)", str(error))
         raise InputError(
-            f"{path} is rejected because it holds Python objects{f' ({match[1]})' if match else ''}: expected only "
+            f"{path} is rejected because it contains Python objects{f' ({match[1]})' if match else ''}. Expected only "
             f"tensors and numbers, {writer}. {advice[0].upper()}{advice[1:]}."
         ) from error
     except Exception as error:  # torch does not document its exceptions for files that torch.save did not write
@@ -230,20 +240,23 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
 
 
 def _check_archive(path: Path, advice: str) -> None:
-    """Check the sizes and the CRC-32 of every tensor, which torch.load ignores; torch.save never compresses."""
+    """Raise InputError unless the sizes and CRC-32 checksums of a file of torch.save are valid.
+
+    torch.load does not check them. Compressed entries are invalid, because torch.save never compresses.
+    """
     size = path.stat().st_size
     try:
         if not zipfile.is_zipfile(path):
             raise InputError(
-                f"{path} is truncated or not a checkpoint: its {size:,} bytes are not a ZIP archive as torch.save "
-                f"writes it. Copy it again, or {advice}."
+                f"{path} is truncated or not a checkpoint: its {size:,} bytes are not a ZIP archive of torch.save. "
+                f"Copy it again, or {advice}."
             )
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             is_compressed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if is_compressed or sum(entry.file_size for entry in entries) > size:
                 raise InputError(
-                    f"{path} declares more content than its {size:,} bytes, or holds compressed entries, which "
+                    f"{path} declares more content than its {size:,} bytes, or contains compressed entries, which "
                     f"torch.save never writes. Copy it again, or {advice}."
                 )
             damage = archive.testzip()
@@ -258,7 +271,7 @@ def _check_archive(path: Path, advice: str) -> None:
 
 
 def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
-    """Return the model's tensors by their names on one GPU; training on several GPUs prefixes names with `module.`."""
+    """Return the tensors of the model by name, without the prefix `module.` of trainings on several GPUs."""
     state: dict[str, Tensor] = {}
     for name, value in pipeline.items():
         if not isinstance(name, str):
@@ -271,18 +284,18 @@ def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
         if not model or not isinstance(value, Tensor) or rest.startswith("lpips."):
             continue
         if rest in state:
-            raise InputError(f"{path} holds {rest} twice. Expected every tensor once; copy it again.")
+            raise InputError(f"{path} contains {rest} twice, expected every tensor once. Copy it again.")
         check_dense_tensor(value, rest, path)
         state[rest] = value.detach().clone()
     return state
 
 
 def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
-    """Raise if a tensor would take more memory than it has storage, or is not a plain array of real numbers.
+    """Raise unless a tensor is a dense array of real numbers on the CPU.
 
     Raises:
-        ValueError: if the tensor is sparse, quantized, complex, nested, not on the CPU or larger than its storage, for
-            example because it repeats its content.
+        ValueError: The tensor is sparse, quantized, complex, nested, not on the CPU or larger than its storage. An
+            expanded tensor, for example, is larger than its storage.
     """
     if (
         value.layout != torch.strided
@@ -293,8 +306,8 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
         or value.numel() * value.element_size() > value.untyped_storage().nbytes()
     ):
         raise InputError(
-            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device} that "
-            "is not stored as a dense array. Expected plain tensors, as trainers save them; save the file again."
+            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device}, "
+            "expected a dense array of real numbers. Save the file again with plain tensors."
         )
 
 
@@ -304,12 +317,12 @@ _GSPLAT_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def read_gsplat_checkpoint(path: Path) -> SplatFile:
-    """Read ckpt_<step>_rank<r>.pt; after training on several GPUs, read the files of all ranks, in order.
+    """Read ckpt_<step>_rank<r>.pt, with the files of all other ranks if the training used several GPUs.
 
     Raises:
-        FileNotFoundError: if there is no such file, or a rank is missing.
-        ValueError: if a file is damaged, comes from another trainer or training run, or needs an appearance network, or
-            if the Gaussians cannot be drawn.
+        FileNotFoundError: The file, or the file of another rank, does not exist.
+        ValueError: A file is damaged, comes from another trainer or training run, or needs an appearance network, or
+            the Gaussians cannot be drawn.
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]
@@ -318,8 +331,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
         steps_named = f"steps: {', '.join(map(str, sorted(steps)))}"
         raise InputError(
-            f"{files[0].parent} has ranks of different {steps_named if len(steps) > 1 else 'spherical harmonics'}. "
-            "Expected the files of one training run; put them into a separate folder."
+            f"{files[0].parent} has ranks with different {steps_named if len(steps) > 1 else 'spherical harmonics'}. "
+            "Expected the files of one training run. Copy these files to a separate folder."
         )
     names = splats[0].parameters
     merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
@@ -330,8 +343,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
 def _rank_files(path: Path) -> tuple[Path, ...]:
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no checkpoint at {path}. With --load-gsplat, give a file that gsplat's simple_trainer wrote, "
-            "for example results/garden/ckpts/ckpt_29999_rank0.pt."
+            f"There is no checkpoint at {path}. With --load-gsplat, give a file of gsplat's simple_trainer, for "
+            "example results/garden/ckpts/ckpt_29999_rank0.pt."
         )
     match = _RANK.fullmatch(path.name)
     if match is None:
@@ -345,13 +358,13 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
         missing = next(rank for rank in range(len(ranks)) if rank not in ranks)
         raise FileNotFoundError(
             f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {missing}. Every "
-            "rank holds a part of the Gaussians; copy all files of the training run."
+            "rank contains a part of the Gaussians. Copy all files of the training run."
         )
     return tuple(ranks[rank] for rank in sorted(ranks))
 
 
 def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
-    """Read the step, the parameters by splatfacto's names, and the pose adjustments."""
+    """Read the step, the parameters by splatfacto's names, and the pose adjustments of one rank."""
     loaded = load_torch_archive(path, "as gsplat's simple_trainer writes them", _ADVICE)
     splats = _splats(path, loaded)
     for name in _GSPLAT_NAMES:
@@ -359,7 +372,7 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
         raise InputError(
             f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
-            "expected (N, 1, 3) and (N,)."
+            "expected (N, 1, 3) and (N,). Give another file with --load-gsplat."
         )
     parameters = {name: splats[name] for name in ("means", "quats", "scales")}
     parameters["opacities"] = splats["opacities"][:, None]
@@ -368,24 +381,24 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
 
 
 def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
-    """Return the tensors in `splats` of a checkpoint, which has those of 3D Gaussians with spherical harmonics."""
+    """Return the tensors in `splats` of a checkpoint, or raise InputError if they are not 3D Gaussians."""
     splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
         hint = "; for a nerfstudio run, give its config.yml with --load-config" if "pipeline" in keys else ""
-        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats` in it, found {keys}{hint}.")
+        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats`, found {keys}{hint}.")
     if "app_module" in loaded:
         raise InputError(
-            f"{path} holds `app_module`: an appearance network (--app_opt), without which its Gaussians have no "
-            "colors. Train it again without that option, or export a PLY file with the trainer's --save_ply and give "
-            "that with --load-ply."
+            f"{path} contains an appearance network, `app_module` (--app_opt), which computes the colors of its "
+            "Gaussians. Train it again without --app_opt. Or export a PLY file with the trainer's --save_ply, and give "
+            "it with --load-ply."
         )
     missing = [name for name in _GSPLAT_NAMES if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
         raise InputError(
-            f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
-            f"{', '.join(sorted(map(str, splats)))}. Expected the parameters of 3D Gaussians with spherical harmonics, "
-            "as gsplat's simple_trainer writes them."
+            f"{path} has no {', '.join(missing) or 'tensors'} in `splats`, which contains "
+            f"{', '.join(sorted(map(str, splats)))}. Expected 3D Gaussians with spherical harmonics. Give a file of "
+            "gsplat's simple_trainer with --load-gsplat."
         )
     check_extra_names((str(name) for name in splats if name not in _GSPLAT_NAMES), path)
     return splats
@@ -400,7 +413,7 @@ def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] 
         check_dense_tensor(deltas, "pose_adjust", path)
     if not isinstance(deltas, Tensor) or deltas.ndim != 2 or deltas.shape[1] != 9 or not bool(deltas.isfinite().all()):
         raise InputError(
-            f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected embeds.weight with finite "
-            f"numbers of shape (views, 9); {_ADVICE}."
+            f"{path}: `pose_adjust` is not valid. Expected embeds.weight with finite numbers of shape (views, 9), as "
+            f"written by gsplat's --pose_opt; {_ADVICE}."
         )
     return deltas.double()

@@ -29,28 +29,28 @@ CAMERA_MODELS = {
     "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
     "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
 }
-"""Names of the parameters of COLMAP's camera models, which are in the order of their IDs in binary files."""
+"""Names of the parameters of COLMAP's camera models. The models are in the order of their IDs in binary files."""
 _SIMPLE_IF_ZERO = {"FULL_OPENCV": ("k4", "k5", "k6"), "FOV": ("omega",)}
-"""Camera models that are one of `PERSPECTIVE_MODELS` if these parameters are zero."""
+"""Camera models that equal one of `PERSPECTIVE_MODELS` if the given parameters are zero."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
 
 
 def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: None) -> Path:
-    """Return the folder of the reconstruction: the given folder, its sparse/0 or a similar subfolder.
+    """Return the folder of a COLMAP reconstruction: the given folder, or a subfolder such as sparse/0.
 
-    If COLMAP's mapper wrote several, it is the one with most images.
+    If there are several reconstructions, return the one with the most images.
 
     Args:
-        folder: folder of the project or of the reconstruction.
-        say: function that is called with a sentence if there are several.
+        folder: Folder of the project or of the reconstruction.
+        say: Function that is called with a message if there are several reconstructions.
     Raises:
-        FileNotFoundError: if none of them holds a reconstruction; the message lists them.
+        FileNotFoundError: None of these folders contains a reconstruction. The message lists them.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {folder}. Give the folder of the COLMAP project, which holds images and sparse/0, "
+            f"There is no folder {folder}. Give the folder of the COLMAP project, which contains images/ and sparse/0, "
             "with --colmap."
         )
     if _is_model(folder):
@@ -60,8 +60,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     models = list(filter(_is_model, dict.fromkeys([*places, *(other for other in numbered if other.name.isdigit())])))
     if len(models) == 0:
         raise FileNotFoundError(
-            f"{folder} holds no COLMAP reconstruction: neither it nor its {', '.join(_MODEL_FOLDERS)} contains "
-            "cameras.bin or cameras.txt. Give the folder that holds sparse/0 with --colmap."
+            f"{folder} contains no COLMAP reconstruction: there is no cameras.bin or cameras.txt in it or in its "
+            f"{', '.join(_MODEL_FOLDERS)}. Give the folder that contains sparse/0 with --colmap."
         )
     if len(models) == 1:
         return models[0]
@@ -69,8 +69,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     largest = max(models, key=counts.__getitem__)
     listed = ", ".join(f"{relative_name(model, folder)} with {count:,} images" for model, count in counts.items())
     say(
-        f"{folder} holds several reconstructions: {listed}. The largest, {relative_name(largest, folder)}, is used; "
-        "give the folder of another one with --colmap."
+        f"{folder} contains several reconstructions: {listed}. The largest one, {relative_name(largest, folder)}, is "
+        "used. To use another one, give its folder with --colmap."
     )
     return largest
 
@@ -88,7 +88,7 @@ def _count_images(model: Path) -> int:
 
 
 class ColmapCamera(NamedTuple):
-    """A camera as stored in the file."""
+    """Camera as stored in a COLMAP file."""
 
     camera_id: int
     model: str
@@ -97,13 +97,16 @@ class ColmapCamera(NamedTuple):
     params: tuple[float, ...]
 
     def named_parameters(self) -> dict[str, float]:
-        """Return the parameters by name, with fx and fy for a shared focal length; the model must be a known one."""
+        """Return the parameters by name; a shared focal length becomes fx and fy.
+
+        The model must be one of `CAMERA_MODELS`.
+        """
         values = dict(zip(CAMERA_MODELS[self.model].split(), self.params))
         return {"fx": values["f"], "fy": values.pop("f"), **values} if "f" in values else values
 
 
 class ColmapImage(NamedTuple):
-    """A registered image as stored in the file, with a world-to-camera pose in OpenCV convention."""
+    """Registered image as stored in a COLMAP file, with a world-to-camera pose in OpenCV convention."""
 
     image_id: int
     name: str
@@ -114,15 +117,15 @@ class ColmapImage(NamedTuple):
 
 
 def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
-    """Read the cameras, by ID, and the registered images, in file order.
+    """Read a reconstruction, and return its cameras by ID and its registered images in file order.
 
     Args:
-        model: folder of the reconstruction.
-        text_first: if both formats exist, read the text files, as nerfstudio does; otherwise read the binary files, as
+        model: Folder of the reconstruction.
+        text_first: If both formats exist, read the text files, as nerfstudio does, instead of the binary files, as
             COLMAP does.
     Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: if a file is damaged or holds duplicate IDs, impossible image sizes, poses that are not finite, no
+        FileNotFoundError: A file is missing.
+        ValueError: A file is damaged, or contains duplicate IDs, invalid image sizes, poses that are not finite, no
             images, or an image without its camera.
     """
     as_text = text_first and (model / "cameras.txt").exists()
@@ -133,13 +136,13 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
 
 
 def _check_cameras(listed: list[ColmapCamera], model: Path) -> dict[int, ColmapCamera]:
-    """Return the cameras by ID; raise InputError for duplicate IDs and impossible numbers."""
+    """Return the cameras by ID; raise InputError for duplicate IDs and invalid sizes or parameters."""
     cameras: dict[int, ColmapCamera] = {}
     for camera in listed:
         if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
             raise InputError(
-                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
-                f"twice, or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
+                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels occurs twice, "
+                f"or its sides are not in 1..{_MAX_SIDE:,} pixels. {_ADVICE}"
             )
         if not (np.abs(camera.params) < _MAX_VALUE).all():
             raise InputError(
@@ -151,30 +154,32 @@ def _check_cameras(listed: list[ColmapCamera], model: Path) -> dict[int, ColmapC
 
 
 def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera], model: Path) -> None:
-    """Raise InputError unless there are images, with poses, cameras and distinct IDs."""
+    """Raise InputError unless there are images, and each has a valid pose, a camera and a unique ID."""
     for image in images:
         pose = np.array([*image.rotation, *image.translation])
         if not (np.abs(pose) < _MAX_VALUE).all() or not np.any(pose[:4]):
             raise InputError(
-                f"{model}: the pose of {image.name} is not finite, or its quaternion is zero: {image.rotation} "
-                f"{image.translation}. {_ADVICE}"
+                f"{model}: {image.name} has the quaternion {image.rotation} and the translation {image.translation}. "
+                f"Expected finite numbers, and a quaternion that is not zero. {_ADVICE}"
             )
     orphans = [image for image in images if image.camera_id not in cameras]
     if orphans or len(images) == 0:
-        problem = f"{orphans[0].name} needs camera {orphans[0].camera_id}, which is missing" if orphans else "no image"
+        problem = f"{orphans[0].name} lacks its camera {orphans[0].camera_id}" if orphans else "there is no image"
         raise InputError(
-            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected a camera "
-            "for every image; copy the whole reconstruction again."
+            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected images that "
+            "each have a camera. Copy the whole reconstruction again."
         )
     if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
 
 
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
-    """Return the intrinsics of a camera. FULL_OPENCV and FOV may have the parameters of a simpler model.
+    """Return the intrinsics of a camera.
+
+    The models FULL_OPENCV and FOV are supported only if they equal a simpler model.
 
     Raises:
-        ValueError: if `normlift_ns` cannot undistort images of this camera model.
+        ValueError: `normlift_ns` cannot undistort images of this camera model.
     """
     parameters: dict[str, Any] = {}
     if camera.model in (*PERSPECTIVE_MODELS, *_SIMPLE_IF_ZERO):
@@ -183,15 +188,15 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
     if len(parameters) == 0 or any(extra.values()):
         numbers = "".join(f", {name} = {value:g}" for name, value in extra.items())
         raise InputError(
-            f"{model}: camera {camera.camera_id} has the model {camera.model}{numbers}; supported models are "
-            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, with the splat as it is, and give the new folder "
-            f"with --colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
+            f"{model}: camera {camera.camera_id} has the model {camera.model}{numbers}, expected one of "
+            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, keep the splat, and give the new folder with "
+            f"--colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
         )
     return Intrinsics(width=camera.width, height=camera.height, **parameters)
 
 
 def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
-    """Return the camera-to-world pose in OpenGL convention."""
+    """Return the camera-to-world pose of an image in OpenGL convention."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (nerfstudio runs do not need SciPy)
 
     matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
@@ -199,25 +204,26 @@ def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
 
 
 def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice: str) -> CameraFile:
-    """Read the cameras of a COLMAP project, and locate its images.
+    """Read the cameras of a COLMAP project, and find its images.
 
     Args:
-        folder: absolute path of the project.
-        images, masks: folders of the images and masks; None: images/ in the project, and no masks.
-        advice: what to do about missing images, for error messages.
+        folder: Absolute path of the project.
+        images: Folder of the images; None for images/ in the project.
+        masks: Folder of the masks; None for no masks.
+        advice: Advice on missing images, for error messages.
     Raises:
-        FileNotFoundError: if the reconstruction, an image or a mask is missing.
-        ValueError: as in `read_colmap_model` and `colmap_intrinsics`.
+        FileNotFoundError: The reconstruction, an image or a mask is missing.
+        ValueError: The errors of `read_colmap_model` and `colmap_intrinsics`.
     """
     remarks: list[str] = []
     model = find_colmap_model(folder, remarks.append)
     cameras, registered = read_colmap_model(model)
     _check_formats(cameras, registered, model)
-    registered.sort(key=lambda image: image.name)  # as training tools sort them
+    registered.sort(key=lambda image: image.name)  # trainers use this order
     intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (images or folder / "images").absolute()
     if not images_dir.is_dir():
-        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
+        raise FileNotFoundError(f"There is no image folder {images_dir}. Copy the images into it, or {advice}.")
     names = [image.name for image in registered]
     files = find_images(names, images_dir, model, advice, allow_copies=True)
     mask_files = [None] * len(files) if masks is None else find_masks(names, masks)
@@ -230,7 +236,7 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
 
 
 def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage], model: Path) -> None:
-    """Raise if a reconstruction in both formats has different cameras: programs differ in which of them they read."""
+    """Raise InputError if a reconstruction has different cameras in its text files and its binary files."""
     if not all((model / f"{name}.{suffix}").is_file() for name in ("cameras", "images") for suffix in ("bin", "txt")):
         return
     others, other_images = read_colmap_model(model, text_first=True)
@@ -238,7 +244,7 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     def numbers(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> dict[str, list[float]]:
         found = {}
         for image in images:
-            camera, turned = cameras[image.camera_id], np.outer(image.rotation, image.rotation)  # q is -q
+            camera, turned = cameras[image.camera_id], np.outer(image.rotation, image.rotation)  # equal for q and -q
             found[image.name] = [camera.width, camera.height, *camera.params, *turned.ravel(), *image.translation]
         return found
 
@@ -251,18 +257,18 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     ]
     if len(differ) > 0:
         raise InputError(
-            f"{model} can be read in two ways: the camera of {differ[0]} in its .bin files, which COLMAP and gsplat "
-            f"read, is not that in its .txt files, which nerfstudio reads ({len(differ)} of {len(first)} images). Keep "
-            f"those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
+            f"{model} can be read in two ways: the cameras of {differ[0]} in the .bin and .txt files differ "
+            f"({len(differ)} of {len(first)} images). COLMAP and gsplat read the .bin files; nerfstudio reads the .txt "
+            f"files. Keep only those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
         )
 
 
 def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:
-    """Read the points of the reconstruction, sorted by their IDs.
+    """Return the points of a reconstruction, sorted by their IDs.
 
     Raises:
-        FileNotFoundError: if there is no points3D file.
-        ValueError: if the file is damaged or holds points that are not finite.
+        FileNotFoundError: There is no points3D file.
+        ValueError: The file is damaged, or contains points that are not finite.
     """
     positions = dict(_read(model, "points3D", _points_text, _points_binary))
     points = np.array([positions[point_id] for point_id in sorted(positions)], dtype=np.float64).reshape(-1, 3)
@@ -291,7 +297,7 @@ def _read(
             data = _ByteReader(read_file(path, max_bytes=2**34))
             entries = list(parse_binary(data))
             if data.offset != len(data.data):
-                raise InputError(f"{len(data.data) - data.offset:,} bytes too many")
+                raise InputError(f"it has {len(data.data) - data.offset:,} bytes after its last entry")
             return entries
         lines = [line.strip() for line in read_file(path, max_bytes=2**34).decode("utf-8-sig").splitlines()]
         return list(parse_text([line for line in lines if not line.startswith("#")]))
@@ -322,10 +328,10 @@ class _ByteReader:
         self.offset += count
 
     def count(self) -> int:
-        """Read the number of entries that follow. Each takes at least eight bytes, which exposes a damaged number."""
+        """Read the number of entries that follow; raise InputError if they cannot fit, at 8 bytes or more per entry."""
         number = self.unpack("Q")[0]
         if number > len(self.data) // 8:
-            raise InputError(f"it declares {number:,} entries, but has {len(self.data):,} bytes")
+            raise InputError(f"it declares {number:,} entries, but has only {len(self.data):,} bytes")
         return number
 
 
@@ -343,7 +349,7 @@ def _cameras_text(lines: list[str]) -> Iterator[ColmapCamera]:
     for line in filter(None, lines):
         camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise InputError(f"camera {camera_id} has {len(parameters)} parameters; {name} needs {counts[name]}")
+            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, but {name} needs {counts[name]}")
         yield ColmapCamera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
 
 
@@ -362,7 +368,7 @@ def _images_text(lines: list[str]) -> Iterator[ColmapImage]:
             continue
         points = next(iterator, "").split()  # the next line lists the image's points and may be empty
         if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
-            raise InputError(f"the line after that of {line.split()[-1]} does not list points as x, y and point ID")
+            raise InputError(f"the line after {line.split()[-1]} does not list points as x, y and point ID")
         image_id, *values, camera_id, name = line.split(maxsplit=9)
         pose = list(map(float, values))
         yield ColmapImage(int(image_id), name, pose[:4], pose[4:], int(camera_id))

@@ -1,6 +1,7 @@
-"""Compressed PLY files of PlayCanvas: chunks of 256 Gaussians with their bounds, and 16 bytes per Gaussian.
+"""Compressed PLY files of PlayCanvas, with chunks of 256 Gaussians and 16 bytes per Gaussian.
 
-The format is that of https://github.com/playcanvas/splat-transform. Spherical harmonics have a byte per coefficient.
+Each chunk stores the bounds of its values. Spherical harmonics take one more byte per coefficient. The format is that
+of https://github.com/playcanvas/splat-transform.
 """
 
 from __future__ import annotations
@@ -35,26 +36,26 @@ _BOUNDS = {
 _POSITION_BITS = (11, 10, 11)
 _MAX_LOG_SCALE = 20.0
 _MAX_HARMONICS = 15
-"""Number of coefficients of degrees 1 to 3."""
+"""Number of spherical harmonics of degrees 1 to 3, per color channel."""
 _SH_RANGE = 8.0
-"""Spherical harmonics are clamped to half of it on both sides of 0."""
+"""Width of the range of stored spherical harmonics, -4..4."""
 
 
 class CompressedPly(NamedTuple):
-    """Bytes of a compressed PLY file."""
+    """Content of a compressed PLY file, with the order of its Gaussians."""
 
     data: bytes
     rows: Int64[np.ndarray, " n"]
-    """Rows of the Gaussians in the order of the file."""
+    """For each Gaussian in the file, its row in the original splat."""
     rounding: str
-    """Rounding errors of the file, for a message."""
+    """Message about the rounding errors of the file."""
 
 
 def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor], str]:
-    """Return the parameters in a compressed PLY file by splatfacto's names, and its rounding errors for a message.
+    """Return the parameters in a compressed PLY file, by splatfacto's names, and a message about rounding errors.
 
     Raises:
-        ValueError: if elements or properties are missing, or their numbers or types do not match.
+        ValueError: Elements or properties are missing, or their numbers or types do not match.
     """
     elements = {element.name: element.data for element in data.elements}
     chunk, vertex, harmonics = elements.get("chunk"), elements["vertex"], elements.get("sh")
@@ -64,7 +65,7 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
     assert chunk is not None
     if n > len(chunk) * _CHUNK_ROWS or (harmonics is not None and len(harmonics) != n):
         extra = "" if harmonics is None else f" and {len(harmonics):,} rows of spherical harmonics"
-        raise _unmatched(path, f"{n:,} Gaussians in {len(chunk):,} chunks{extra}")
+        raise _unmatched(path, f"{n:,} Gaussians in {len(chunk):,} chunks of 256{extra}, expected matching numbers")
     words = {name: torch.from_numpy(vertex[name].astype(np.int64)) for name in _VERTEX}
     rotation, color = words["packed_rotation"], _units(words["packed_color"], (8, 8, 8, 8))
     means, scales = (_bounds(chunk, group, n) for group in ("means", "scales"))
@@ -80,16 +81,15 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
 
 
 def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
-    """Return Gaussians as a compressed PLY file, in an order that makes chunks small.
+    """Encode Gaussians as a compressed PLY file, sorted so that each chunk covers a small box.
 
-    Opacities and colors have 8 bits, spherical harmonics 1/32 between -4 and 4, rotations 10 bits per component, and
-    positions and logarithms of scales 10 or 11 bits of their range in a chunk.
+    Opacities and colors have 8 bits; rotations have 10 bits per component. Positions and logarithms of scales have 10
+    or 11 bits for their range in a chunk. Spherical harmonics have steps of 1/32 between -4 and 4.
 
     Args:
-        parameters: finite parameters by splatfacto's names; colors are spherical harmonics, of which those of degree 4
-            are left out.
-        name: name of the file, for the message.
-        comments: comments for its header.
+        parameters: Finite parameters by splatfacto's names. Spherical harmonics of degree 4 are left out.
+        name: Name of the file, for the message.
+        comments: Comments for the header of the file.
     """
     rows = _chunk_order(parameters["means"].detach().cpu().numpy())
     values = {key: value.detach().cpu().double()[rows] for key, value in parameters.items()}
@@ -117,7 +117,7 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
     ]
     rest = (
         values["features_rest"][:, :_MAX_HARMONICS].transpose(1, 2).reshape(len(rows), -1)
-    )  # all of red, then green, then blue
+    )  # all coefficients of red, then green, then blue
     if rest.shape[1] > 0:
         packed = to_bytes(((rest / _SH_RANGE + 0.5) * 256).floor())
         elements.append(_element("sh", {f"f_rest_{i}": packed[:, i] for i in range(rest.shape[1])}, "u1"))
@@ -127,44 +127,43 @@ def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments:
 
 
 def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> str:
-    """Describe rounding errors by the ranges of positions and logarithms of scales."""
+    """Return a message about rounding errors, given the ranges of positions and log scales in each chunk."""
     steps = 2 * (2 ** min(_POSITION_BITS) - 1)
     errors = means.amax(dim=1).sort().values / steps
     most = float(errors[(len(errors) * 99 - 1) // 100])
     return (
-        f"{name} holds rounded numbers: 99 % of the positions within {most:.2g} and all "
-        f"within {float(errors[-1]):.2g}, logarithms of scales within {float(scales.max()) / steps:.2g}, "
-        "rotations within 0.005 radians, opacities within 0.002."
+        f"{name} contains rounded numbers. Maximum errors: {most:.2g} for 99 % of the positions and "
+        f"{float(errors[-1]):.2g} for all, {float(scales.max()) / steps:.2g} for logarithms of scales, "
+        "0.005 radians for rotations, 0.002 for opacities."
     )
 
 
 def _check_element(path: Path, element: str, table: np.ndarray | None, names: tuple[str, ...], kind: str) -> None:
-    """Raise unless a table has these properties, as numbers of one kind."""
+    """Raise InputError unless a table has the named properties, with numbers of a NumPy kind such as "f"."""
     types = {} if table is None else {name: table.dtype[name] for name in table.dtype.names or ()}
     wrong = [name for name in names if name not in types or types[name].kind != kind]
     if len(wrong) > 0:
         raise InputError(
-            f"{path} is a compressed PLY file whose element {element!r} has no valid {', '.join(wrong)}. Write it "
-            "again, or give the PLY file that it was made of."
+            f"{path} is a compressed PLY file, but its element {element!r} has no valid {', '.join(wrong)}. Write it "
+            "again, or give the uncompressed PLY file."
         )
 
 
 def _unmatched(path: Path, problem: str) -> InputError:
     return InputError(
-        f"{path} is a compressed PLY file with {problem}: these numbers do not match. Write it again, or give the PLY "
-        "file that it was made of."
+        f"{path} is a damaged compressed PLY file with {problem}. Write it again, or give the uncompressed PLY file."
     )
 
 
 def _bounds(chunk: np.ndarray, group: str, n: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the lower and upper bounds of every Gaussian."""
+    """Return the lower and the upper bounds of the chunk of each Gaussian."""
     table = torch.from_numpy(np.stack([chunk[name].astype(np.float32) for name in _BOUNDS[group]], axis=1))
     rows = table.repeat_interleave(_CHUNK_ROWS, 0)[:n]
     return rows[:, :3], rows[:, 3:]
 
 
 def _colors(chunk: np.ndarray, units: Float[Tensor, "n 3"], path: Path) -> Float[Tensor, "n 3"]:
-    if _BOUNDS["colors"][0] not in (chunk.dtype.names or ()):  # the first version of the format had no bounds
+    if _BOUNDS["colors"][0] not in (chunk.dtype.names or ()):  # the first version of the format had no color bounds
         return units
     _check_element(path, "chunk", chunk, _BOUNDS["colors"], "f")
     return torch.lerp(*_bounds(chunk, "colors", len(units)), units)
@@ -183,7 +182,7 @@ def _unpack_harmonics(path: Path, table: np.ndarray | None, n: int) -> Float[Ten
 
 
 def _units(words: Int64[Tensor, " n"], bits: tuple[int, ...]) -> Float[Tensor, "n k"]:
-    """Return the unsigned numbers in the last bits of words, each divided by its largest value."""
+    """Unpack unsigned numbers from the low bits of words, and scale each of them to 0..1."""
     shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
     return torch.stack([(words >> s & (2**b - 1)).float() / (2**b - 1) for s, b in zip(shifts, bits)], dim=1)
 
@@ -196,7 +195,7 @@ def _words(units: Float[Tensor, "n k"], bits: tuple[int, ...]) -> Int64[Tensor, 
 
 
 def _chunk_bounds(values: Float[Tensor, "n c"]) -> tuple[Float[Tensor, "k c"], Float[Tensor, "k c"]]:
-    """Return the smallest and the largest values of every chunk as float32."""
+    """Return the minimum and the maximum of each chunk as float32."""
     chunks = values.split(_CHUNK_ROWS)
     return torch.stack([x.amin(dim=0) for x in chunks]).float(), torch.stack([x.amax(dim=0) for x in chunks]).float()
 
@@ -207,7 +206,7 @@ def _element(name: str, columns: Mapping[str, np.ndarray], kind: str) -> PlyElem
 
 
 def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return an order of the rows in which chunks are small boxes: those of a k-d tree."""
+    """Return an order of the rows, made with a k-d tree, in which each chunk covers a small box."""
     weights = 1 / (2.0 ** np.array(_POSITION_BITS) - 1)
     chunks, boxes = [], [np.arange(len(means))]
     while len(boxes) > 0:
@@ -216,7 +215,7 @@ def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
             chunks.append(rows)
             continue
         axis = int((np.ptp(means[rows], axis=0) * weights).argmax())
-        middle = -(-len(rows) // _CHUNK_ROWS) // 2 * _CHUNK_ROWS  # all chunks but the last one are full
+        middle = -(-len(rows) // _CHUNK_ROWS) // 2 * _CHUNK_ROWS  # only the last chunk may have fewer rows
         rows = rows[np.argpartition(means[rows, axis], middle)]
         boxes += [rows[middle:], rows[:middle]]
     return np.concatenate(chunks)

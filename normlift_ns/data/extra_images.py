@@ -1,4 +1,4 @@
-"""Extra images that were taken after training and registered together with the training images."""
+"""Extra images, taken after the training and registered together with the training images."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
 _MAX_SHIFT, _MAX_ROTATION = 1e-3, 0.1
-"""Largest change of a known camera: a fraction of the extent of all cameras, and degrees."""
+"""Tolerances for known cameras: shift as a fraction of the extent of all cameras, and rotation in degrees."""
 
 
 def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None) -> AnyScene:
-    """Return the scene with extra images among its training views.
+    """Return the scene with extra images added to its training views.
 
-    The camera file must contain images of the scene too. Their names show which images are new, and their cameras align
-    the file's world with the scene's. Images that were held out of the training are not new.
+    The camera file must contain new images and images of the scene. Images are matched by name, and the cameras of the
+    known images align the world of the file with the world of the scene. Held-out images of the scene are not new.
 
     Args:
-        scene: the scene to extend.
-        cameras: folder of a COLMAP project, or a transforms.json, with old and new images.
-        images: folder of the images; None: as in `SplatOptions.images`.
+        scene: Scene to extend.
+        cameras: Folder of a COLMAP project, or a transforms.json, with old and new images.
+        images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
-        FileNotFoundError, ValueError: as in `open_splat`; or if there is no new image, there are fewer than two known
-            images, or known cameras have moved relative to each other. The message names the image.
+        FileNotFoundError, ValueError: The errors of `open_splat`; no image is new; fewer than two images are known; or
+            known cameras have moved relative to each other.
     """
     path = cameras.absolute()
     is_transforms = path.suffix == ".json" or (path / "transforms.json").is_file()
@@ -52,14 +52,14 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
     world = _align(extended, known)
     base = scene.names_root if isinstance(scene, SplatScene) else scene.location.folder
     placed = [replace(frame, name=relative_name(frame.file, base)) for frame in transform_frames(new, world)]
-    placed.sort(key=lambda frame: frame.file)  # the order in which a lifted run reads them
+    placed.sort(key=lambda frame: frame.file)  # a lifted run reads them in this order
     identity = {**scene.identity, "added_photographs": [frame.name for frame in placed]}
     extended_scene = with_frames(scene, placed)
     return replace(extended_scene, identity=identity, remarks=(*extended_scene.remarks, *extended.remarks))
 
 
 def _key(name: str) -> str:
-    """Return the part of an image name that all camera files share: without the top folder images/ or images_4/.
+    """Return an image name without its top folder images/ or images_4/, which some camera files omit.
 
     >>> _key("images_4/left/0001.jpg"), _key("0001.jpg")
     ('left/0001.jpg', '0001.jpg')
@@ -69,10 +69,10 @@ def _key(name: str) -> str:
 
 
 def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
-    """Return the similarity from the file's world to the scene's, from the cameras that both have.
+    """Fit the similarity from the world of the file to the world of the scene to their common cameras.
 
     Raises:
-        ValueError: if there are fewer than two such cameras, or some have moved relative to each other.
+        ValueError: There are fewer than two common cameras, or some have moved relative to each other.
     """
     old = [frame for frame in extended.frames if _key(frame.name) in known]
     source = np.stack([frame.pose for frame in old]) if len(old) > 0 else np.zeros((0, 3, 4))
@@ -84,9 +84,9 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
     extent = float(np.linalg.norm(centered_target, axis=1).max(initial=0.0))
     if len(old) < 2 or extent == 0 or not np.linalg.norm(centered_source) > 0:
         raise InputError(
-            f"{extended.source} has {len(old)} of the {len(known)} images of the scene, such as {next(iter(known))}. "
-            "Expected at least two, at different positions, to locate the new cameras. Give a camera file that "
-            "contains both new and old images."
+            f"{extended.source} contains {len(old)} of the {len(known)} images of the scene, the first of which is "
+            f"{next(iter(known))}. Expected at least two at different positions, to align the new cameras. Give a "
+            "camera file that contains both new and old images."
         )
     u, _, vt = np.linalg.svd(np.einsum("vij,vkj->ik", target[:, :, :3], source[:, :, :3]))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -98,9 +98,9 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
     worst = int(np.argmax(np.maximum(shifts / _MAX_SHIFT, angles / _MAX_ROTATION)))
     if not (shifts[worst] <= _MAX_SHIFT and angles[worst] <= _MAX_ROTATION and 0 < scale < math.inf):
         raise InputError(
-            f"The worlds differ: in {extended.source}, the camera of {old[worst].name} has moved since the training, "
-            f"by {shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees ({len(old)} old "
-            "images were compared). Register new images without moving old ones (COLMAP: image_registrator on the old "
-            "model, no bundle adjustment). Cameras that the training itself optimized have moved too."
+            f"In {extended.source}, the camera of {old[worst].name} has moved since the training, by "
+            f"{shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees. {len(old)} old images "
+            "were compared. Register the new images without moving the old ones: in COLMAP, use image_registrator on "
+            "the old model, without bundle adjustment. A training that optimizes its cameras moves them too."
         )
     return WorldTransform(np.concatenate([rotation, translation[:, None] / scale], axis=1), scale)

@@ -1,4 +1,4 @@
-"""Frames (images with their cameras) of camera files, and image headers."""
+"""Frames of camera files (images with their cameras), and image headers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.guard import check_files_distinct, open_regular
 
 _FORMATS = {"JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "DIB", "PPM", "GIF", "TGA", "JPEG2000", "AVIF"}
-"""Formats that Pillow reads without other programs and that hold images rather than documents."""
+"""Image formats that Pillow reads without other programs; document formats are left out."""
 _MAX_SIDE = 2**16
 _EXIF_ORIENTATION = 0x0112
 _SINGLE_CHANNEL = {"1", "L", "P", "I", "F"}
@@ -27,24 +27,24 @@ class ImageHeader(NamedTuple):
     """Header of an image file."""
 
     size: tuple[int, int]
-    """Width and height of the pixels as stored."""
+    """Width and height in pixels, without EXIF rotation."""
     mode: str
     """Pillow's name of the pixel format."""
     rotated: bool
-    """True if EXIF data ask viewers to rotate the image, which training ignores."""
+    """True if the EXIF data contain a rotation, which training ignores."""
     multi_frame: bool
-    """True if the file holds several images; only the first is read."""
+    """True if the file contains several images, of which only the first is read."""
 
 
 def read_image_header(file: Path) -> ImageHeader:
     """Read the header of an image file.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the path is not a regular file, not an image, or an image of unsupported format or size.
+        FileNotFoundError: The file does not exist.
+        ValueError: The path is not a regular file, or the file is not an image of a supported format and size.
     """
     if not file.exists():
-        raise FileNotFoundError(f"{file} is missing, but the camera file lists it. Put it back.")
+        raise FileNotFoundError(f"{file} is missing, but the camera file lists it. Copy it to this path.")
     if not file.is_file():
         raise InputError(f"{file} is not a regular file. Expected an image; copy it again from the capture.")
     try:
@@ -65,51 +65,52 @@ def read_image_header(file: Path) -> ImageHeader:
 
 def _is_rotated(image: Image.Image) -> bool:
     if image.format == "PNG" and "exif" not in image.info:
-        return False  # otherwise Pillow would read all pixels to look for EXIF data at the end of the file
+        return False  # otherwise Pillow reads all pixels to find EXIF data at the end of the file
     try:
         return image.getexif().get(_EXIF_ORIENTATION, 1) not in (0, 1)
-    except Exception:  # damaged EXIF data cannot ask for a rotation
+    except Exception:  # damaged EXIF data contain no rotation
         return False
 
 
 def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
-    """Raise if a mask does not have one channel and the size of its image.
+    """Raise unless a mask has one channel and the size of its image.
 
     Args:
-        mask: file of the mask.
-        file: file of its image, for messages.
-        size: width and height of the image.
+        mask: Path of the mask.
+        file: Path of its image, for error messages.
+        size: Width and height of the image in pixels.
     Raises:
-        FileNotFoundError, ValueError: as in `read_image_header`, or if the mask does not fit. The message names both.
+        FileNotFoundError, ValueError: The errors of `read_image_header`, or the mask has other channels or another
+            size. The message gives both paths.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):
         raise InputError(
             f"The mask {mask} of {file} has the pixel format {header.mode}. Expected one channel that is zero at "
-            "pixels to ignore; save it in grayscale."
+            "pixels to ignore. Save it in grayscale."
         )
     if header.size != size:
         raise InputError(
             f"The mask {mask} is {header.size[0]} x {header.size[1]} pixels, but its image {file} is {size[0]} x "
-            f"{size[1]}. Expected a mask of the same size as its image."
+            f"{size[1]}. Give a mask of the same size as its image."
         )
 
 
 def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tuple[str, ...]:
-    """Return warnings, in whole sentences, about images that training reads differently from image viewers."""
+    """Return warnings in whole sentences about images that image viewers display in another way than training."""
     kinds = (
         (
             [header.rotated for header in headers],
             "have an EXIF rotation, which training ignores",
-            "They are lifted as stored in the file, not as viewers show them, so objects that lie on their side "
-            "are found less reliably. To fix this, rotate the pixels and train again",
+            "They are lifted without this rotation, so queries may miss objects that then lie on their side. To fix "
+            "this, rotate the pixels and train again",
         ),
         (
             [header.mode == "CMYK" for header in headers],
-            "are in CMYK, which training reads as different colors",
+            "are in CMYK, which training reads with wrong colors",
             "Convert them to RGB",
         ),
-        ([header.multi_frame for header in headers], "hold several images", "Only the first image of each is used"),
+        ([header.multi_frame for header in headers], "contain several images", "Only the first of each is used"),
     )
     warnings = []
     for affected, problem, advice in kinds:
@@ -121,17 +122,17 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of a rotation from orthonormal, because files round."""
+"""Maximum deviation of a rotation from an orthonormal matrix; numbers in files are rounded."""
 GIVE_IMAGES = "give the folder of the images with --images"
-"""Advice about missing images, unless the folder was given."""
+"""Advice on missing images if the options do not contain their folder."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-"""Camera models that `Intrinsics` covers, by the names that COLMAP and nerfstudio give them."""
+"""Perspective camera models that `Intrinsics` can represent, by their names in COLMAP and nerfstudio."""
 
 
 class Intrinsics(NamedTuple):
-    """Intrinsics, in pixels, of a camera with OpenCV's distortion.
+    """Camera intrinsics in pixels, with OpenCV's distortion parameters.
 
-    It is k1 k2 p1 p2 k3 of a pinhole camera, or k1 k2 k3 k4 of a fisheye camera.
+    Perspective cameras use k1, k2, p1, p2 and k3. Fisheye cameras use k1, k2, k3 and k4.
     """
 
     fx: float
@@ -150,7 +151,7 @@ class Intrinsics(NamedTuple):
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float]:
-        """k1, k2, k3, p1, p2."""
+        """Distortion parameters k1, k2, k3, p1, p2."""
         return self[6:11]
 
     @property
@@ -159,7 +160,7 @@ class Intrinsics(NamedTuple):
         return any(self[6:12])
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """Return the intrinsics of the same image at another size."""
+        """Return the intrinsics of the same image at another size in pixels."""
         x, y = width / self.width, height / self.height
         return self._replace(
             fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
@@ -167,39 +168,39 @@ class Intrinsics(NamedTuple):
 
 
 class WorldTransform(NamedTuple):
-    """Similarity p -> scale * (transform @ p) from the world of the cameras to that of a splat."""
+    """Similarity p -> scale * (transform @ p) from the world of the cameras to the world of a splat."""
 
     transform: Float[np.ndarray, "3 4"]
     """Rotation and translation."""
     scale: float
     float32: bool = False
-    """Compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its training."""
+    """True to compute in float32 like nerfstudio, so that the cameras equal those of the training bit for bit."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """An image and its camera."""
+    """Image with its camera."""
 
     file: Path
     """Absolute path of the image."""
     name: str
-    """The file relative to the dataset, with forward slashes."""
+    """Path of the image relative to the dataset, with forward slashes."""
     pose: Float[np.ndarray, "3 4"]
     """Camera-to-world pose in OpenGL convention: x right, y up, z backward."""
     intrinsics: Intrinsics
     mask: Path | None = None
-    """Absolute path of the mask, an image of the same size that is zero at pixels to ignore."""
+    """Absolute path of the mask, which is zero at pixels to ignore and has the size of the image."""
 
 
 def check_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise if a camera is invalid.
+    """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: if there are no cameras, names repeat, poses are not rigid, numbers are not finite, or focal lengths
-            or sizes are not positive.
+        ValueError: There are no cameras, a name occurs twice, or a pose is not rigid. A number is not finite, or a
+            focal length or size is not positive.
     """
     if len(frames) == 0:
-        raise InputError(f"{source} has no cameras with images. Expected one for every training image.")
+        raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")
     for frame in frames:
         if not np.isfinite([*frame.pose.ravel(), *frame.intrinsics]).all():
             raise InputError(
@@ -221,28 +222,28 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     names = [frame.name for frame in frames]
     duplicates = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if duplicates:
-        raise InputError(f"{source} lists {duplicates[0]} more than once. Expected every image once.")
+        raise InputError(f"{source} lists {duplicates[0]} more than once. Remove all but one of its entries.")
 
 
 def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *, allow_copies: bool) -> list[Path]:
     """Find images by name in a folder, and return their absolute paths.
 
     Args:
-        names: image names from the camera file.
-        folder: folder to search.
-        source: the camera file, for error messages.
-        advice: what to do about missing images, for error messages.
-        allow_copies: whether the folder may hold copies of the images, which need not lie in the same subfolders.
+        names: Image names in the camera file.
+        folder: Folder to search.
+        source: Path of the camera file, for error messages.
+        advice: Advice on missing images, for error messages.
+        allow_copies: True if the folder may contain copies of the images, also in other subfolders.
     Raises:
-        FileNotFoundError: if images are missing; the message counts them and names the first.
-        ValueError: if two names lead to one file.
+        FileNotFoundError: Images are missing. The message gives their number and the first of them.
+        ValueError: Two names lead to the same file.
     """
     found = [_find_file(folder, name, copies=allow_copies) for name in names]
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}; the first is "
-            f"{missing[0]}. Put them back, or {advice}."
+            f"{len(missing)} of the {len(names)} images in {source} are missing from {folder}; the first is "
+            f"{missing[0]}. Copy them to this folder, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]
     check_files_distinct(zip(names, files), "file", f"in the folders that {source} lists, or {advice}")
@@ -250,7 +251,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
 
 
 def plain_name(name: str) -> str:
-    r"""Return a path with forward slashes, also if a program on Windows wrote it.
+    r"""Return a path with forward slashes instead of the backslashes of Windows.
 
     >>> plain_name("images\\left\\1.png"), plain_name("C:\\a\\1.png"), plain_name("images/1.png")
     ('images/left/1.png', 'C:/a/1.png', 'images/1.png')
@@ -259,15 +260,15 @@ def plain_name(name: str) -> str:
 
 
 def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Path]:
-    """Return the paths at which a file that a camera file lists may be.
+    """Return the possible paths of a file in a camera file, in the order of preference.
 
-    The first is its own. An absolute path may be that of another machine, so the file may also be at the end of its
-    path in the folder: images/1.png for C:\\scene\\images\\1.png.
+    An absolute path may be from another machine, so its trailing parts are also tried in the folder. An example is
+    images/1.png for C:\\scene\\images\\1.png.
 
     Args:
-        folder: folder to search.
-        name: path relative to the folder, or absolute.
-        copies: also try a relative path without its leading folders, for copies in folders such as images_2.
+        folder: Folder to search.
+        name: Absolute path, or path relative to the folder.
+        copies: True to omit leading folders of relative paths too, for copies in folders such as images_2.
     """
     plain = plain_name(name)
     path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)
@@ -279,11 +280,7 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """Find a file by name in a folder, also with another suffix, as downscaled copies have.
-
-    Args:
-        folder, name, copies: as in `possible_paths`.
-    """
+    """Return the first existing file of `possible_paths`, or None; copies may have another suffix."""
     for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
@@ -295,11 +292,13 @@ def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
 
 
 def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
-    """Find the masks of images: name.jpg.png, as in COLMAP, or any image with the same stem.
+    """Find the masks of images, and return their absolute paths.
+
+    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image name with any supported suffix.
 
     Raises:
-        FileNotFoundError: if a mask is missing.
-        ValueError: if two images share a mask.
+        FileNotFoundError: A mask is missing.
+        ValueError: Two images share a mask.
     """
     masks = []
     for name in names:
@@ -315,15 +314,15 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
 
 
 def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) -> Frame:
-    """Return the frame with intrinsics for the size of its file, which may be a smaller copy of the image.
+    """Return a frame with its intrinsics scaled to the size of its file, which may be a smaller copy of the image.
 
     Args:
-        frame: the frame as the camera file describes it.
-        source: the camera file, for error messages.
-        advice: what to do about an unsuitable image, for error messages.
+        frame: Frame as read from the camera file.
+        source: Path of the camera file, for error messages.
+        advice: Advice on an unsuitable image, for error messages.
     Raises:
-        FileNotFoundError: if the file is missing.
-        ValueError: if the file is not an image, its aspect ratio differs from its camera's, or its mask does not fit.
+        FileNotFoundError: The file is missing.
+        ValueError: The file is not an image, it has another aspect ratio than its camera, or its mask is not valid.
     """
     width, height = read_image_header(frame.file).size
     camera = frame.intrinsics
@@ -331,9 +330,9 @@ def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) ->
         scale = (width / camera.width + height / camera.height) / 2
         if abs(camera.width * scale - width) > 1 or abs(camera.height * scale - height) > 1:
             raise InputError(
-                f"{frame.file} is {width} x {height} pixels, but its camera in {source} has {camera.width} x "
-                f"{camera.height}: the aspect ratios differ. Put the images there that the cameras were computed from, "
-                f"or proportionally smaller copies, or {advice}."
+                f"{frame.file} has {width} x {height} pixels, but its camera in {source} has {camera.width} x "
+                f"{camera.height}, which is another aspect ratio. Replace the images with those that the cameras were "
+                f"computed from, or with proportionally smaller copies, or {advice}."
             )
         camera = camera.resized(width, height)
     if frame.mask is not None:
@@ -342,9 +341,9 @@ def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) ->
 
 
 def transform_frames(frames: Sequence[Frame], world: WorldTransform) -> list[Frame]:
-    """Return the frames with poses in another world."""
+    """Return the frames with their poses transformed to the world of a splat."""
     dtype = torch.float32 if world.float32 else torch.float64
     poses = torch.from_numpy(np.array([[*frame.pose, [0, 0, 0, 1]] for frame in frames])).to(dtype)
-    poses = torch.from_numpy(world.transform).to(dtype) @ poses  # one product, as in nerfstudio, for equal rounding
+    poses = torch.from_numpy(world.transform).to(dtype) @ poses  # one product, for the same rounding as nerfstudio
     poses[:, :, 3] *= world.scale
     return [replace(frame, pose=pose.double().numpy()) for frame, pose in zip(frames, poses)]

@@ -91,7 +91,7 @@ class _Document(msgspec.Struct, rename="camel"):
 
 
 class _Gltf(NamedTuple):
-    """A glTF file with the content of its buffers."""
+    """Document of a glTF file and the contents of its buffers."""
 
     path: Path
     document: _Document
@@ -99,14 +99,14 @@ class _Gltf(NamedTuple):
 
 
 def read_gltf(path: Path) -> SplatFile:
-    """Read the splat of a glTF file, in its own coordinates: transforms of nodes are not applied.
+    """Read the splat of a glTF file in its own coordinates, without the transforms of nodes.
 
-    Compression as SPZ (KHR_gaussian_splatting_compression_spz_2) is read too.
+    The splat may be compressed as SPZ (KHR_gaussian_splatting_compression_spz_2).
 
     Raises:
-        FileNotFoundError: if there is no such file, or no file of a buffer.
-        ValueError: if the file is not a glTF file with exactly one splat, is truncated or damaged, or needs an
-            extension or setting that is not supported, or if its Gaussians cannot be drawn.
+        FileNotFoundError: The file, or the file of a buffer, does not exist.
+        ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
+            setting, or has Gaussians that cannot be drawn.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")
@@ -117,8 +117,8 @@ def read_gltf(path: Path) -> SplatFile:
         found = extension.get(name, expected)
         if found != expected:
             raise InputError(
-                f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export it with that "
-                "setting, or as a PLY file."
+                f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export it with the "
+                "expected setting, or as a PLY file."
             )
     moved = any(value is not None for node in gltf.document.nodes for value in msgspec.structs.astuple(node))
     remarks = (f"The nodes of {path.name} have transforms, which are not applied to the splat.",) if moved else ()
@@ -129,7 +129,7 @@ def read_gltf(path: Path) -> SplatFile:
         return file._replace(remarks=(*file.remarks, *remarks))
     splat = _read_attributes(gltf, primitive)
     validate_splat(splat, path)
-    mode = mesh.extras.get("rasterize_mode") if isinstance(mesh.extras, dict) else None  # as `encode_glb` is given it
+    mode = mesh.extras.get("rasterize_mode") if isinstance(mesh.extras, dict) else None  # as written by `encode_glb`
     return SplatFile(splat, mode if mode in get_args(RasterizeMode) else None, remarks=remarks)
 
 
@@ -139,21 +139,21 @@ def _nested(extension: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _open_gltf(path: Path) -> _Gltf:
-    """Read the JSON of a file, and the binary chunk if it has one."""
+    """Read the JSON document and the buffers of a glTF or GLB file."""
     with open_regular(path) as file:
         is_glb = file.read(4) == GLB_MAGIC
     text, binary = _glb_chunks(path) if is_glb else (read_file(path), b"")
     try:
         document = msgspec.json.decode(text, type=_Document)
     except (msgspec.DecodeError, msgspec.ValidationError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"its JSON is not that of glTF ({error})") from error
+        raise _damaged(path, f"its JSON does not match the glTF schema ({error})") from error
     if not str(document.asset.get("version", "")).startswith("2."):
-        raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export it again.")
+        raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export glTF 2.0.")
     unknown = sorted(set(document.extensions_required) - _KNOWN)
     if len(unknown) > 0:
         raise InputError(
-            f"{path} requires {', '.join(unknown)[:200]}, which is not supported. Export it without that extension, or "
-            "as a PLY file."
+            f"{path} requires unsupported extensions: {', '.join(unknown)[:200]}. Export it without them, or as a PLY "
+            "file."
         )
     return _Gltf(path, document, [_buffer_bytes(path, buffer, binary) for buffer in document.buffers])
 
@@ -163,7 +163,7 @@ def _damaged(path: Path, problem: str) -> InputError:
 
 
 def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
-    """Return the JSON and the binary chunk."""
+    """Return the JSON chunk and the binary chunk of a GLB file; empty if a chunk is missing."""
     with open_regular(path) as file:
         size = path.stat().st_size
         header = file.read(_HEADER.size)
@@ -174,7 +174,7 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
             length, kind = _CHUNK.unpack(head)
             limit = MAX_TEXT_BYTES if kind == b"JSON" else size
             if length > min(limit, size - file.tell()):
-                raise _damaged(path, f"a chunk declares {length:,} bytes")
+                raise _damaged(path, f"a chunk declares {length:,} bytes, which is too many")
             if kind in (b"JSON", b"BIN\0") and kind not in chunks:
                 chunks[kind] = file.read(length)
             else:
@@ -188,7 +188,7 @@ def _find_splat(gltf: _Gltf) -> tuple[_Mesh, _Primitive]:
     if len(splats) != 1:
         raise InputError(
             f"{gltf.path} has {len(splats)} splats ({_EXTENSION}) among its {len(primitives)} primitives, expected "
-            f"one. {'Export the splat, not a mesh.' if len(splats) == 0 else 'Export each splat to a file of its own.'}"
+            f"one. {'Export the splat, not a mesh.' if len(splats) == 0 else 'Export each splat to a separate file.'}"
         )
     return splats[0]
 
@@ -197,7 +197,7 @@ def _read_attributes(gltf: _Gltf, primitive: _Primitive) -> SplatParameters:
     def read(name: str, size: int) -> Tensor:
         index = primitive.attributes.get(name)
         if index is None:
-            raise InputError(f"{gltf.path} has a splat without {name}. Export the scene again.")
+            raise InputError(f"{gltf.path}: the splat has no attribute {name}. Export the scene again.")
         return torch.from_numpy(_read_accessor(gltf, index, name, size))
 
     opacity, scales = read(f"{_EXTENSION}:OPACITY", 1), read(f"{_EXTENSION}:SCALE", 3)
@@ -225,7 +225,7 @@ def _harmonic(degree: int, index: int) -> str:
 
 
 def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.ndarray, "n c"]:
-    """Return the numbers of an accessor as float32, normalized ones in 0..1 or -1..1."""
+    """Return the numbers of an accessor as float32; normalized integers are scaled to 0..1 or -1..1."""
     accessors = gltf.document.accessors
     accessor = accessors[index] if 0 <= index < len(accessors) else None
     kind = None if accessor is None else _TYPES.get(accessor.component_type)
@@ -236,7 +236,7 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
     stride = dtype.itemsize * size if view.byte_stride is None else view.byte_stride
     end = accessor.byte_offset + (accessor.count - 1) * stride + dtype.itemsize * size
     if accessor.count < 1 or accessor.byte_offset < 0 or stride < dtype.itemsize * size or end > len(data):
-        raise _damaged(gltf.path, f"{name} declares {accessor.count:,} rows in a view of {len(data):,} bytes")
+        raise _damaged(gltf.path, f"{name} has {accessor.count:,} rows, which do not fit into {len(data):,} bytes")
     shape, strides = (accessor.count, size), (stride, dtype.itemsize)
     values = np.ndarray(shape, dtype, data, accessor.byte_offset, strides).astype(np.float32)
     return np.maximum(values / np.iinfo(dtype).max, -1) if accessor.normalized and dtype.kind != "f" else values
@@ -250,12 +250,12 @@ def _view_bytes(gltf: _Gltf, index: object) -> tuple[_BufferView, memoryview]:
         raise _damaged(gltf.path, f"it has no buffer view {str(index)[:20]}")
     data = memoryview(buffers[view.buffer])
     if view.byte_offset < 0 or view.byte_length < 0 or view.byte_offset + view.byte_length > len(data):
-        raise _damaged(gltf.path, f"a buffer view ends after byte {len(data):,} of its buffer")
+        raise _damaged(gltf.path, f"a buffer view is larger than its buffer of {len(data):,} bytes")
     return view, data[view.byte_offset : view.byte_offset + view.byte_length]
 
 
 def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
-    """Return the binary chunk, the bytes of a data URI, or those of a file in the same folder."""
+    """Return the bytes of a buffer, which come from the binary chunk, a data URI, or a file in the same folder."""
     if buffer.uri is None:
         return binary
     head, comma, text = buffer.uri.partition(",")
@@ -267,27 +267,27 @@ def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
     file = path.parent / buffer.uri
     if "/" in buffer.uri or "\\" in buffer.uri or "\0" in buffer.uri or file.name != buffer.uri:
         raise InputError(
-            f"{path} names the buffer {buffer.uri[:80]!r}, expected the name of a file in the same folder. Export "
-            "it as a GLB file."
+            f"{path} has the buffer {buffer.uri[:80]!r}, expected the name of a file in the same folder. Export it as "
+            "a GLB file."
         )
     if not file.is_file():
-        raise FileNotFoundError(f"There is no file {file}, a buffer of {path.name}. Copy it into that folder.")
+        raise FileNotFoundError(f"There is no file {file}, which {path.name} needs. Copy it into that folder.")
     return read_file(file, max_bytes=max(buffer.byte_length, 0) + 3)
 
 
 def encode_glb(
     splat: SplatParameters, columns: Mapping[str, Float[np.ndarray, " n"]], extras: Mapping[str, Any]
 ) -> bytes:
-    """Return Gaussians as a GLB file, with float32 numbers in their own coordinates.
+    """Encode Gaussians as a GLB file, with float32 numbers in their own coordinates.
 
     Args:
-        splat: finite Gaussians whose colors are spherical harmonics; those of degree 4 are left out.
-        columns: further attributes, whose names begin with an underscore.
-        extras: `extras` of the mesh, with JSON types only; "rasterize_mode" is read again.
+        splat: Finite Gaussians. Spherical harmonics of degree 4 are left out.
+        columns: Further attributes, with names that begin with an underscore.
+        extras: `extras` of the mesh, with JSON types only. `read_gltf` reads the key "rasterize_mode".
     """
     values = {name: value.detach().cpu().double() for name, value in splat.parameters.items()}
     colors = (values["features_dc"] * SH_C0 + 0.5).clamp(0, 1)
-    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # as COLOR_0 has them
+    linear = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # COLOR_0 is linear
     opacities = values["opacities"].sigmoid()
     attributes = {
         "POSITION": values["means"].float().numpy(),
@@ -304,7 +304,7 @@ def encode_glb(
     document = _document(attributes, extras)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    binary = b"".join(array.tobytes() for array in arrays)  # rows of 4 bytes or a multiple of it
+    binary = b"".join(array.tobytes() for array in arrays)  # the size of every row is a multiple of 4 bytes
     total = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
     parts = (_HEADER.pack(GLB_MAGIC, 2, total), _CHUNK.pack(len(text), b"JSON"), text)
     return b"".join([*parts, _CHUNK.pack(len(binary), b"BIN\0"), binary])

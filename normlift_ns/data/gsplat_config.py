@@ -1,4 +1,4 @@
-"""cfg.yml, in which gsplat's trainer stores its settings next to ckpts/ and ply/."""
+"""Reader for cfg.yml, the settings that gsplat's trainer stores next to ckpts/ and ply/."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from normlift_ns.options import RasterizeMode
 
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
-_ADVICE = "Copy it from the training run again, or move the splat to a folder of its own."
+_ADVICE = "Copy it from the training run again, or move the splat to a separate folder."
 
 
 class GsplatConfig(NamedTuple):
-    """Settings of a training that change what is drawn, or which images it used; None if not stored."""
+    """Settings in a cfg.yml that affect rendering or the choice of training images; None for missing settings."""
 
     path: Path
     rasterize_mode: RasterizeMode | None
@@ -27,10 +27,12 @@ class GsplatConfig(NamedTuple):
 
 
 def find_gsplat_config(splat: Path) -> GsplatConfig | None:
-    """Read the cfg.yml of the training run that a checkpoint or PLY file lies in; None if there is none.
+    """Read the cfg.yml of the training run that contains a checkpoint or PLY file.
 
+    Returns:
+        The settings, or None if there is no cfg.yml of gsplat's trainer.
     Raises:
-        ValueError: if the file is damaged, or the splat was not trained as 3D Gaussians with pinhole cameras.
+        ValueError: The file is damaged, or the splat was not trained as 3D Gaussians with pinhole cameras.
     """
     path = splat.parent.parent / "cfg.yml" if splat.parent.name in _FOLDERS else splat.parent / "cfg.yml"
     if not path.is_file():
@@ -42,7 +44,7 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
         raise InputError(f"{path} is not valid YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
     if config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
-        return None  # of another program
+        return None  # another program wrote the file
     texts = {name: config_string(root, name) for name in ("camera_model", "model_type", "test_every")}
     flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", "with_ut")}
     _check_primitive(path, texts["camera_model"], texts["model_type"], is_3dgut=flags["with_ut"] is True)
@@ -63,14 +65,14 @@ def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
 
 def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, *, is_3dgut: bool) -> None:
     if is_3dgut:
-        problem = "with_ut true (3DGUT), whose Gaussians are drawn in another way"
+        problem = "with_ut true (3DGUT), which renders Gaussians in another way"
     elif model_type not in (None, "3dgs"):
-        problem = f"model_type {model_type[:40]}, whose Gaussians are drawn in another way"
+        problem = f"model_type {model_type[:40]}, which renders Gaussians in another way"
     elif camera_model not in (None, "pinhole"):
         problem = f"camera_model {camera_model[:40]}"
     else:
         return
     raise InputError(
-        f"{path} says that the splat was trained with {problem}. Expected 3D Gaussians and pinhole cameras. Train it "
-        "again with simple_trainer.py and undistorted images."
+        f"According to {path}, the splat was trained with {problem}. Expected 3D Gaussians and pinhole cameras. Train "
+        "it again with simple_trainer.py and undistorted images."
     )

@@ -1,4 +1,4 @@
-"""Training images, undistorted with their pinhole cameras, and the selection of those held out."""
+"""Training images, their undistortion to pinhole cameras, and the selection of held-out images."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
     """Return the names of the images that the training did not use.
 
     Args:
-        names: sorted names of all images.
-        test_every: hold out every n-th image, starting with the first, as gsplat's trainer does, and Inria's with
+        names: Sorted names of all images.
+        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, or Inria's with
             --eval.
-        eval_images: image names, with or without folder and suffix; or a text file with one name per line; or a
-            fraction below 1. As in ns-train's dataparser, the training images are then evenly spaced, and the rest is
-            held out.
+        eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
+            below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
-        ValueError: if no image has one of the names, or both options are given.
+        ValueError: A name does not match an image, or both options are given.
     """
     if test_every is not None and len(eval_images) > 0:
-        raise InputError("--test-every and --eval-images both select held-out images; give only one of them")
+        raise InputError("--test-every and --eval-images are both given, expected at most one of them; omit one")
     if test_every is not None:
         if test_every < 2:
             raise InputError(f"--test-every must be at least 2, got {test_every}; omit it if nothing was held out")
@@ -62,7 +61,7 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
         return None  # an image name
     if not 0 < fraction < 1:
         raise InputError(
-            f"--eval-images {eval_images[0]} is not a fraction: expected a number between 0 and 1, or image names"
+            f"--eval-images {eval_images[0]} is not a valid fraction; give a number between 0 and 1, or image names"
         )
     return fraction
 
@@ -70,7 +69,7 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
 def _read_names(file: Path) -> list[str]:
     """Read image names from a text file, one per line."""
     if not file.is_file():
-        raise InputError(f"--eval-images names the file {file}, which does not exist. Expected one name per line.")
+        raise InputError(f"There is no file {file}, given with --eval-images. Give a file with one name per line.")
     try:
         names = [line.strip() for line in read_text(file, "utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:
@@ -86,15 +85,15 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
         matches = [name for name in names if str(short(Path(name))) == str(path)]
         if len(matches) > 1:
             raise InputError(
-                f"--eval-images {requested} matches {len(matches)} images: {', '.join(matches)}. Give full names."
+                f"--eval-images {requested} matches {len(matches)} images: {', '.join(matches)}. Give the full name."
             )
         if matches:
             return matches
     matches = [name for name in names if path.as_posix().endswith(f"/{name}")]
     if len(matches) != 1:
         raise InputError(
-            f"--eval-images names {requested}, but no image has this name; there are {len(names)}, "
-            f"{names[0]} to {names[-1]}"
+            f"--eval-images {requested} does not match one of the {len(names)} images. Give the name of an image, from "
+            f"{names[0]} to {names[-1]}."
         )
     return matches
 
@@ -102,7 +101,7 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
 def to_camera(
     camera_to_world: Float[Tensor, "3 4"], intrinsics: Float[Tensor, "3 3"], width: int, height: int
 ) -> Camera:
-    """Convert an OpenGL pose (x right, y up, z backward) to an OpenCV camera, by splatfacto's own steps."""
+    """Convert an OpenGL pose (x right, y up, z backward) to an OpenCV camera, with the same steps as splatfacto."""
     rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
     pose = torch.eye(4, dtype=camera_to_world.dtype, device=camera_to_world.device)
     pose[:3, :3] = rotation
@@ -111,7 +110,7 @@ def to_camera(
 
 
 def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 3"]) -> UInt8[Tensor, "h w 3"]:
-    """Return the image with the background, RGB in 0..1, behind its alpha channel if it has one."""
+    """Blend a background color, RGB in 0..1, behind an image with an alpha channel; return other images unchanged."""
     if image.shape[2] != 4:
         return image
     alpha = image[:, :, 3:].float() / 255
@@ -119,7 +118,7 @@ def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 
 
 
 _NERFSTUDIO_MODES = {"RGB", "RGBA", "L", "CMYK"}
-"""Pillow modes that nerfstudio can train on, CMYK with wrong colors."""
+"""Pillow modes that nerfstudio accepts; it reads CMYK with wrong colors."""
 
 
 def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
@@ -128,31 +127,31 @@ def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 @contextmanager
 def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
-    """Open an image, resized by nerfstudio's camera_res_scale_factor."""
+    """Yield an image file opened by Pillow, resized by a factor (nerfstudio's camera_res_scale_factor)."""
     with open_regular(file) as stream, Image.open(stream) as opened:
         yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
 
 
 def camera_type_error(file: Path, kind: str) -> str:
-    """Return the message about an image whose camera is of a type that splatfacto does not support."""
-    return f"{file} was taken with a {kind} camera; splatfacto supports only perspective and fisheye cameras."
+    """Return an error message for an image with a camera type that splatfacto does not support."""
+    return f"{file} has a camera of type {kind}; splatfacto supports only perspective and fisheye cameras."
 
 
 class SplitViews:
-    """Lazy `Views` of V images on disk: indexing reads and undistorts one image.
+    """Lazy `Views` of V images on disk; each access reads and undistorts one image.
 
     Args:
-        files: the images.
-        names: the image files relative to the dataset.
-        masks: one mask per image, or None for all or some of them.
-        sizes: width and height of the cameras, before undistortion.
-        poses: camera-to-world poses [V, 3, 4] in OpenGL convention: the split's, or those optimized by the training.
+        files: Paths of the images.
+        names: Paths of the images relative to the dataset.
+        masks: One path per image, or None for images without a mask.
+        sizes: Width and height of the cameras in pixels, before undistortion.
+        poses: Camera-to-world poses [V, 3, 4] in OpenGL convention, from the dataset or optimized by the training.
         background: RGB in 0..1, blended behind images with an alpha channel.
-        scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
+        scale: Factor that resizes the files, nerfstudio's camera_res_scale_factor.
     """
 
     _LISTED_IN, _TRAINED = "the dataset", "run"
-    """Phrases for messages: the list of images, and the output of the training."""
+    """Words for the source of the image list and for the trained model, used in error messages."""
 
     def __init__(
         self,
@@ -167,21 +166,21 @@ class SplitViews:
         self.files = list(files)
         """Absolute paths of the images."""
         self.names = list(names)
-        """Image files relative to the dataset, with forward slashes."""
+        """Paths of the images relative to the dataset, with forward slashes."""
         self._masks, self._sizes, self._poses = masks or [None] * len(self.files), sizes, poses
         self._background, self._scale = background, scale
         protect_inputs(*self.files, *self._masks)
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
-        """Read an image at the size of the camera; not called in subclasses with their own `_load`."""
+        """Read an image at the size of the camera. Subclasses must override this method or `_load`."""
         raise NotImplementedError
 
     def _lens(self, index: int) -> Intrinsics:
-        """Return the intrinsics of an image; not called in subclasses with their own `_undistort` and `_pinhole`."""
+        """Return the intrinsics of an image. Subclasses must override this method, or `_undistort` and `_pinhole`."""
         raise NotImplementedError
 
     def _load(self, index: int) -> tuple[Any, Any]:
-        """Read an image [H, W, C] and its mask or None, at the size of the camera."""
+        """Read an image [H, W, C] and its mask, or None without a mask, at the size of the camera."""
         image, file = self._pixels(self.files[index]), self._masks[index]
         if file is None:
             return image, None
@@ -189,31 +188,31 @@ class SplitViews:
             mask = np.array(opened).astype(bool)
         if mask.shape != image.shape[:2]:
             raise InputError(
-                f"the mask has shape {mask.shape}, expected {image.shape[:2]}: one channel of the same size as its "
-                "image; save it in grayscale"
+                f"the mask has shape {mask.shape}, expected {image.shape[:2]}, one channel with the size of the image; "
+                "save it in grayscale"
             )
         return image, mask
 
     def _check_header(self, index: int, header: ImageHeader) -> None:
-        """Raise if nerfstudio would misread an image, or it or its mask does not have the expected size."""
+        """Raise InputError if nerfstudio would misread an image, or if its size or its mask is not valid."""
         file, mask = self.files[index], self._masks[index]
         if header.mode not in _NERFSTUDIO_MODES:
             raise InputError(
-                f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
-                "RGBA or grayscale; convert the images."
+                f"{file} has the pixel format {header.mode}, which nerfstudio misreads. Expected 8-bit RGB, RGBA or "
+                "grayscale. Convert the images."
             )
         self._check_size(index, header.size if self._scale == 1 else _scaled_size(header.size, self._scale))
         if mask is not None:
             check_mask(mask, file, header.size)
 
     def _undistort(self, index: int, image: Any, mask: Any) -> tuple[Tensor, Bool[Tensor, "h w"] | None, bool]:
-        """Return image and mask without distortion, and whether they had any."""
+        """Return the undistorted image and mask, and True if they were distorted."""
         lens = self._lens(index)
         values = None if mask is None else torch.from_numpy(_undistort_mask(mask, lens)).bool()
         return torch.from_numpy(undistort_image(image, lens)[0]), values, lens.is_distorted
 
     def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
-        """Return intrinsics, width and height of an undistorted image."""
+        """Return the camera matrix, width and height of an undistorted image."""
         return _undistorted_intrinsics(self._lens(index))
 
     def __len__(self) -> int:
@@ -223,9 +222,9 @@ class SplitViews:
         """Read and undistort one image.
 
         Raises:
-            IndexError: if there is no such view.
-            FileNotFoundError, ValueError: if a file is missing, cannot be read or differs in size from its camera; the
-                message names it.
+            IndexError: The index is out of range.
+            FileNotFoundError, ValueError: A file is missing, cannot be read, or differs in size from its camera. The
+                message gives its path.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
@@ -238,7 +237,7 @@ class SplitViews:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Cameras of the undistorted images; no image is read."""
+        """Cameras of the undistorted images, computed without reading images."""
         return self._cameras
 
     @cached_property
@@ -255,8 +254,8 @@ class SplitViews:
         """Check the headers of all images, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: if an image is missing, not an image, or misread; the message names it. For a
-                run of nerfstudio, also if an image or mask does not have the size of its camera or image.
+            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. For
+                nerfstudio runs, also if an image or a mask has the wrong size. The message gives the path.
         """
         headers = [read_image_header(file) for file in self.files]
         for index, header in enumerate(headers):
@@ -272,12 +271,12 @@ class SplitViews:
             )
 
     def _read(self, index: int) -> tuple[Any, Any]:
-        """Load an image and its mask, and check their files and size."""
+        """Load an image and its mask, and check the size of the image."""
         try:
             image, mask = self._load(index)
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"{error.filename} is missing, but {self._LISTED_IN} lists it. Put it back."
+                f"{error.filename} is missing, but {self._LISTED_IN} lists it. Copy it to this path."
             ) from error
         except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
             mask = self._masks[index]
@@ -290,22 +289,21 @@ class SplitViews:
 
 
 class ImageViews(SplitViews):
-    """Lazy `Views` of images on disk: indexing reads and undistorts one image.
+    """Lazy `Views` of the images in a camera file; each access reads and undistorts one image.
 
-    Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images: OpenCV's
-    optimal new camera matrix without black borders, cropped to its region of interest.
+    Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images. The camera
+    matrix becomes OpenCV's optimal one without black borders, and images are cropped to its region of interest.
 
     Args:
-        frames: image files and their cameras.
+        frames: Image files and their cameras.
         background: RGB in 0..1, blended behind images with an alpha channel.
-        scale: nerfstudio's camera_res_scale_factor, by which the files are resized.
     """
 
     _LISTED_IN, _TRAINED = "the camera file", "splat"
 
     def __init__(self, frames: Sequence[Frame], background: Float[Tensor, " 3"]) -> None:
         self.frames = list(frames)
-        """The frames, as the camera file describes them."""
+        """Frames as read from the camera file."""
         super().__init__(
             [frame.file for frame in frames],
             [frame.name for frame in frames],
@@ -334,14 +332,14 @@ def _mode_problem(mode: str) -> str | None:
     if mode[0] not in "IF":
         return None
     return (
-        f"its pixel format is {mode}, expected 8 bits per channel; convert the images to those that the splat was "
-        "trained with"
+        f"its pixel format is {mode}, expected 8 bits per channel; give the images that the splat was trained with, or "
+        "convert them in the same way"
     )
 
 
-@lru_cache  # images of one camera differ only in their poses
+@lru_cache  # the images of a camera share their intrinsics
 def _undistorted_intrinsics(lens: Intrinsics) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Return the camera matrix, width and height of the undistorted image."""
+    """Return the camera matrix, width and height of undistorted images."""
     if not lens.is_distorted:
         return torch.from_numpy(_matrix(lens)), lens.width, lens.height
     image, matrix = undistort_image(np.zeros((lens.height, lens.width, 1), np.uint8), lens)
@@ -349,7 +347,7 @@ def _undistorted_intrinsics(lens: Intrinsics) -> tuple[Float[Tensor, "3 3"], int
 
 
 def _matrix(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
-    """Return the camera matrix in nerfstudio's precision, float32."""
+    """Return the camera matrix in float32, the precision of nerfstudio."""
     fx, fy, cx, cy = lens[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
 
@@ -357,10 +355,10 @@ def _matrix(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
 def undistort_image(
     image: UInt8[np.ndarray, "h w c"], lens: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "h2 w2 c"], Float[np.ndarray, "3 3"]]:
-    """Undistort an image, and return it with its camera matrix.
+    """Undistort an image, and return it with its new camera matrix.
 
     Raises:
-        ValueError: if OpenCV cannot undistort it.
+        ValueError: OpenCV cannot undistort the image.
     """
     if not lens.is_distorted:
         return image, _matrix(lens)
@@ -368,21 +366,21 @@ def undistort_image(
         pixels, pinhole, (x, y) = _undistorted_fisheye(image, lens) if lens.fisheye else _undistorted(image, lens)
     except (InputError, cv2.error, ValueError) as error:
         parameters = [*lens[6:9], lens.k4, lens.p1, lens.p2]
-        raise InputError(f"its distortion {parameters} cannot be removed ({error})") from error
+        raise InputError(f"the distortion {parameters} cannot be removed ({error})") from error
     fx, fy = pinhole[0, 0], pinhole[1, 1]
     return pixels, np.array([[fx, 0, pinhole[0, 2] - x + 0.5], [0, fy, pinhole[1, 2] - y + 0.5], [0, 0, 1]])
 
 
 def _undistorted(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int]]:
-    """Return an undistorted image, its camera matrix before it was cropped, and the corner of the crop."""
+    """Return an undistorted image, its camera matrix before cropping, and the corner (x, y) of the crop."""
     if lens.k4 != 0:
-        raise InputError("only k1, k2, k3, p1 and p2 can be undistorted")
+        raise InputError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
     k1, k2, k3, p1, p2 = (float(np.float32(value)) for value in lens.distortion)
     coefficients, matrix = np.array([k1, k2, p1, p2, k3, 0, 0, 0]), _matrix(lens)
     matrix[:2, 2] -= 0.5  # OpenCV puts pixel centers at integers
     pinhole, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(matrix, coefficients, image.shape[1::-1], 0)
     if w < 1 or h < 1:
-        raise InputError("undistortion leaves no pixel of the image")
+        raise InputError("the undistorted image has no pixels")
     pixels = cv2.undistort(image, matrix, coefficients, None, pinhole)[y : y + h, x : x + w]
     return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)), pinhole, (x, y)
 
@@ -396,7 +394,7 @@ def _undistorted_fisheye(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[
 
 
 def _fisheye(lens: Intrinsics) -> tuple[Any, Any, Any]:
-    """Return camera matrix, coefficients and pinhole camera matrix, with pixel centers at integers."""
+    """Return the camera matrix, distortion coefficients and new camera matrix, with pixel centers at integers."""
     matrix, coefficients = _matrix(lens), np.array([*lens[6:9], lens.k4], np.float32)
     matrix[:2, 2] -= 0.5
     pinhole = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(

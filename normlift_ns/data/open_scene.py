@@ -1,4 +1,4 @@
-"""Opening of a trained scene: a splatfacto run, or a lifted run with the splat or the extra images that it stores."""
+"""Functions that open splatfacto runs and lifted runs, with the splat or the extra images stored in a lifted run."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white":
 
 @dataclass(frozen=True)
 class SplatScene:
-    """A `Scene` made from a splat and its images, without a nerfstudio run."""
+    """Scene made from a splat and its images, without a nerfstudio run."""
 
     splat: SplatParameters
     train: ImageViews
     held_out: ImageViews
     name: str
     checkpoint_path: Path
-    """The PLY file, the first gsplat checkpoint, or the checkpoint of a lifted run."""
+    """Path of the splat file, of the first gsplat checkpoint, or of the checkpoint of a lifted run."""
     step: int
     """Training step; 0 if unknown."""
     runs_dir: Path
     names_root: Path
-    """Folder that image names are relative to."""
+    """Base folder of the relative image names."""
     identity: Mapping[str, Any]
     rasterize_mode: RasterizeMode
     background_name: Background
@@ -56,17 +56,17 @@ class SplatScene:
     """Warnings about the images, in whole sentences."""
 
     renderer = None
-    """None, because `normlift_ns` renders the scene."""
+    """Renderer of another package; None, because `normlift_ns` renders this scene."""
     has_harmonics = True
 
     @property
     def gaussians(self) -> GaussianScene:
-        """The N Gaussians, activated."""
+        """Gaussians with activated scales and opacities."""
         return self.splat.activated
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """Raw parameters as trained, by splatfacto's names."""
+        """Raw parameters of the training, by splatfacto's names."""
         return self.splat.parameters
 
     @property
@@ -75,7 +75,7 @@ class SplatScene:
         return BACKGROUND_COLORS[self.background_name]
 
     def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
-        """Return each Gaussian's RGB color, >= 0, as seen from the camera."""
+        """Return the RGB color of each Gaussian as seen from a camera, with values >= 0."""
         coefficients = torch.cat([self.splat.features_dc[:, None], self.splat.features_rest], dim=1)
         return view_colors(self.splat.means, coefficients, camera, self.splat.degree)
 
@@ -83,7 +83,13 @@ class SplatScene:
 def split_views(
     frames: Sequence[Frame], held_out: frozenset[str], background: Background
 ) -> tuple[ImageViews, ImageViews]:
-    """Return the training images and those that were held out."""
+    """Return the views of the training images and of the held-out images.
+
+    Args:
+        frames: Frames of all images.
+        held_out: Names of the held-out images.
+        background: Color behind images with an alpha channel.
+    """
     train, rest = (
         ImageViews([frame for frame in frames if (frame.name in held_out) == is_rest], BACKGROUND_COLORS[background])
         for is_rest in (False, True)
@@ -91,7 +97,7 @@ def split_views(
     return train, rest
 
 
-# Splat and cameras stored in a lifted run, which open it again without the original files.
+# Splat and cameras stored in a lifted run, so that it can be opened without the original files.
 
 
 SPLAT_FILE, TRANSFORMS_FILE, CHECKPOINT_DIR = "splat.json", "transforms.json", "nerfstudio_models"
@@ -107,16 +113,17 @@ class _Saved(msgspec.Struct):
 
 
 def save_splat(folder: Path, scene: SplatScene) -> None:
-    """Write splat.json and the cameras, transforms.json, into the folder of a run."""
+    """Write splat.json and transforms.json, which contains the cameras, into the folder of a run."""
     write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
     saved = _Saved(scene.name, scene.rasterize_mode, scene.background_name, str(scene.names_root), dict(scene.identity))
     write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
 
 
 def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
-    """Return the checkpoint that splatfacto loads: step and parameters.
+    """Return the content of a checkpoint that splatfacto can load: step and parameters.
 
-    Without spherical harmonics, splatfacto would read the colors as logits, so the first degree is added as zeros.
+    If there is only the constant spherical harmonic, splatfacto would read colors as logits. The function then adds
+    zeros as harmonics of degree 1.
     """
     parameters = scene.parameters
     if scene.splat.degree == 0:
@@ -128,14 +135,14 @@ def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
 
 
 def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
-    """Open the splat of a lifted run.
+    """Open the splat and the images of a lifted run.
 
     Args:
-        run_dir: folder of the lifted run.
-        data: current folder of the images, if they were moved.
-        load_step: step of the checkpoint; None: the last.
+        run_dir: Folder of the lifted run.
+        data: Current folder of the images, if they were moved.
+        load_step: Step of the checkpoint; None for the last step.
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
+        FileNotFoundError, ValueError: A file is missing or damaged. The message gives its path.
     """
     path = run_dir / SPLAT_FILE
     try:
@@ -147,7 +154,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
     if data is not None and not data.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
+            f"There is no folder {data}, given with --data. Give the new path of {saved.photographs}."
         )
     cameras = read_transforms(
         run_dir / TRANSFORMS_FILE,
@@ -177,12 +184,12 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
 
 
 EXTRA_IMAGES_FILE = "added_photographs.json"
-"""File in a lifted nerfstudio run: cameras of the added images, in the world of its Gaussians."""
+"""Name of the file in a lifted nerfstudio run with the cameras of extra images, in the world of the Gaussians."""
 AnyScene = TypeVar("AnyScene", NerfstudioScene, SplatScene)
 
 
 class _ConcatenatedViews:
-    """`Views` of two datasets, one after the other."""
+    """Concatenated `Views` of two datasets."""
 
     def __init__(self, first: Views, second: Views) -> None:
         self._first, self._second = first, second
@@ -201,10 +208,10 @@ class _ConcatenatedViews:
 
 
 def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
-    """Return the scene with more training views, whose cameras are in its world.
+    """Return the scene with additional training views. Their cameras must be in the world of the scene.
 
     Raises:
-        FileNotFoundError, ValueError: if an image is missing or cannot be read.
+        FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
     views = ImageViews(frames, scene.background)
     remarks = (*scene.remarks, *views.check_files())
@@ -215,10 +222,10 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
 
 
 def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
-    """Return the scene of a lifted run with the extra images that the run stores, if any.
+    """Return the scene of a lifted run, with the extra images that are stored in the run.
 
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
+        FileNotFoundError, ValueError: A file is missing or damaged. The message gives its path.
     """
     path = run_dir / EXTRA_IMAGES_FILE
     if not path.is_file():
@@ -238,13 +245,13 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     For a splat without a nerfstudio run, see `open_splat`.
 
     Args:
-        load_config: config.yml of the run.
-        data: current path of the dataset, if it was moved.
-        load_step: step of the checkpoint, the last one if None.
+        load_config: Path of the config.yml of the run.
+        data: Current path of the dataset, if it was moved.
+        load_step: Step of the checkpoint; None for the last step.
     Raises:
-        FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
-        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
-            of the run.
+        FileNotFoundError: The config, the checkpoint, the dataset or an image is missing.
+        ValueError: The config is from another method or program, the checkpoint is damaged, or the dataset is not the
+            dataset of the run.
 
     >>> scene = open_scene(config)
     >>> len(scene.train), scene.train[1].image.shape
@@ -255,7 +262,7 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     load_step = None if load_step is None else check_number("load_step", load_step, int)
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
-        complete_interrupted_writes(run_dir.parent)  # a lift was killed while it replaced the run
+        complete_interrupted_writes(run_dir.parent)  # an interrupted lift may have been replacing the run
     if config.is_file() and (run_dir / SPLAT_FILE).is_file():  # lifted from a splat without a nerfstudio run
         scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
@@ -271,22 +278,24 @@ def load_field(
     """Load the semantic field of a lifted run.
 
     Args:
-        means, checkpoint: as in `SemanticField.load`.
+        run_dir: Run directory.
+        means: Positions of the Gaussians, to check that the field belongs to them; None for no check.
+        checkpoint: Name of the source of `means`, for error messages.
     Raises:
-        FileNotFoundError: the run has no semantic field.
-        ValueError: the field is damaged, or belongs to other Gaussians than `means`.
+        FileNotFoundError: The run has no semantic field.
+        ValueError: The field is damaged, or belongs to other Gaussians than `means`.
     """
     folder = field_folder(run_dir)
     return resolve_field_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
 
 
 def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
-    """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
+    """Return the field with absolute paths in its manifest; see `resolve_manifest_paths`."""
     return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
 
 
 class StoredRun(NamedTuple):
-    """A lifted run on disk."""
+    """Lifted run on disk, with its open scene and field."""
 
     folder: Path
     """Run directory, which contains config.yml."""
@@ -295,13 +304,13 @@ class StoredRun(NamedTuple):
 
 
 def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> StoredRun:
-    """Open the scene of a lifted run and its field, and warn of what has changed since.
+    """Open the scene and the field of a lifted run, and warn if files have changed since the lift.
 
     Args:
-        load_config, data: as in `open_scene`.
+        load_config: Path of the config.yml of the run.
+        data: Current path of the dataset, if it was moved.
     Raises:
-        FileNotFoundError, ValueError: for the same reasons as `open_scene`; also if the run has no semantics, or
-            those of other Gaussians.
+        FileNotFoundError, ValueError: The errors of `open_scene`, or the run has no semantic field of its Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)
@@ -313,7 +322,7 @@ def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> 
 
 
 def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
-    """Return a warning if the cameras differ from those that the field records of the lift."""
+    """Return a list with a warning if the cameras differ from the cameras of the lift, or an empty list."""
     changed = [
         split
         for split, key, views in (
@@ -325,7 +334,7 @@ def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
     if len(changed) == 0:
         return []
     return [
-        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
-        "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
-        "Restore the dataset, give its path with --data, or lift again"
+        f"the {' and '.join(changed)} cameras of {scene.name} have changed since the lift. Query results still use the "
+        "old cameras, but renders and evaluations use the new ones. Restore the dataset, give its path with --data, or "
+        "lift again."
     ]

@@ -1,4 +1,4 @@
-"""Opening of splats without a nerfstudio run."""
+"""Functions that open splats without a nerfstudio run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from normlift_ns.options import SplatOptions
 from normlift_ns.registry import Registry
 
 _MAX_STEP = 0.1
-"""Largest distance of neighboring float32 numbers, as a fraction of the width of the median Gaussian."""
+"""Maximum step between neighboring float32 coordinates, as a fraction of the width of the median Gaussian."""
 
 
 @check_arguments
@@ -37,14 +37,14 @@ def open_splat(
     """Open a trained splat and its images.
 
     Args:
-        path: a PLY file, also compressed, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
-            simple_trainer; its first bytes tell its format. Installed packages may add other formats by suffix.
-        options: locations of its cameras and images.
-        say: function that is called with one sentence per assumption, for example `print`.
+        path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
+            simple_trainer. The format is detected by the first bytes. Installed packages may add formats by suffix.
+        options: Paths of the cameras and images, and settings of the splat.
+        say: Function that is called with one sentence per assumption, for example `print`.
     Raises:
-        FileNotFoundError: if a file or image is missing.
-        ValueError: if a file cannot be read, does not match the others or is not a splat.
-        TypeError: if an argument has the wrong type.
+        FileNotFoundError: A file or image is missing.
+        ValueError: A file cannot be read, does not match the others, or is not a splat.
+        TypeError: An argument has the wrong type.
 
     >>> from normlift_ns import SplatOptions, open_run, open_splat
     >>> run = open_run(config)
@@ -111,13 +111,13 @@ def open_splat(
 def _check_coordinates(
     splat: SplatParameters, positions: Float[np.ndarray, "n 3"], what: str, options: SplatOptions
 ) -> None:
-    """Raise if positions are so far from the origin that float32 cannot tell neighboring Gaussians apart.
+    """Raise InputError if positions are so far from the origin that float32 is too coarse for the Gaussians.
 
     Args:
-        splat: the Gaussians.
-        positions: their positions, or those of the cameras in the same world.
-        what: what has these positions, for the message.
-        options: options of the splat.
+        splat: Gaussians of the scene.
+        positions: Positions of the Gaussians, or of the cameras in the same world.
+        what: File or objects with these positions, for the error message.
+        options: Options of the splat.
     """
     center, width = np.median(positions, axis=0), float(splat.scales.median().exp())
     step = float(np.spacing(np.abs(center).max().astype(np.float32)))
@@ -127,15 +127,15 @@ def _check_coordinates(
     matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
     place = f" Cameras: printf '{matrix}' > offset.txt, and --world-transform offset.txt"
     raise InputError(
-        f"{what}: the middle of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
-        f"zone. Numbers in float32 are {step:.2g} apart there, too far for Gaussians {width:.2g} wide. Subtract one "
+        f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
+        f"zone. The step of float32 is {step:.2g} there, too coarse for Gaussians {width:.2g} wide. Subtract the same "
         f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Splat: export it with this offset "
         f"from the program that wrote it.{place if options.world_transform is None else ''}"
     )
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
-    """Return the names of the images that the training did not use, by the options, else by its cfg.yml."""
+    """Return the names of the held-out images according to the options, or else to cfg.yml or the camera file."""
     held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.eval_images) > 0:
         test_every = options.test_every
@@ -143,16 +143,16 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
         names = [frame.name for frame in frames]
         held_out = held_out_names(names, test_every=test_every, eval_images=options.eval_images)
     if len(held_out) == len(frames) and options.views == "train":
-        raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
+        raise InputError(f"All {len(frames)} images are held out, expected at least one to lift; give --views all.")
     return held_out
 
 
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
 _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
-"""Formats whose files are recognized whatever their suffix, except for splat, which has no first bytes of its own."""
+"""Formats that are detected regardless of the suffix. The exception is splat, which has no characteristic bytes."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
-"""Suffixes of formats that are not read."""
+"""Suffixes of unsupported formats."""
 _BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
@@ -169,15 +169,17 @@ SPLAT_READERS = Registry(
     flag="--load-ply",
     default="splat.ply",
 )
-"""Readers of splat files by file name suffix, functions from a path to a `SplatFile`. Other packages add theirs with
-entry points of this group."""
+"""Readers of splat files by suffix: functions that take a path and return a `SplatFile`.
+
+Other packages add readers with entry points of the group `normlift_ns.scenes`.
+"""
 
 
 def _read(path: Path) -> SplatFile:
-    """Read a splat by the reader of its format.
+    """Read a splat with the reader for its format.
 
     Raises:
-        FileNotFoundError, ValueError: If the file is missing or not a splat, or the reader of another package fails.
+        FileNotFoundError, ValueError: The file is missing or not a splat, or the reader of another package fails.
     """
     protect_inputs(path)
     name = _format(path)
@@ -190,7 +192,7 @@ def _read(path: Path) -> SplatFile:
         file = read(path)
     except (InputError, OSError):
         raise
-    except Exception as error:  # readers of other packages may raise anything
+    except Exception as error:  # readers of other packages may raise any exception
         reason = summarize_error(error)
         raise InputError(f"{path} cannot be read by the installed reader of the format {name!r} ({reason})") from error
     if not isinstance(file, SplatFile):
@@ -201,7 +203,7 @@ def _read(path: Path) -> SplatFile:
 
 
 def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
-    """Return a checkpoint or PLY file with the settings in the cfg.yml of its training run."""
+    """Add the settings in the cfg.yml of the training run to the contents of a checkpoint or PLY file."""
     config = find_gsplat_config(path)
     if config is None:
         return file
@@ -210,15 +212,15 @@ def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
         rasterize_mode=mode or file.rasterize_mode,
         by_gsplat=file.by_gsplat if normalized is None else normalized,
         test_every=config.test_every,
-        remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
+        remarks=(*file.remarks, f"The settings of the training are read from {config.path}."),
     )
 
 
 def _format(path: Path) -> str:
-    """Return the name of a file's format: by its first bytes, else by its suffix.
+    """Detect the format of a file by its first bytes, or else by its suffix; return the key of `SPLAT_READERS`.
 
     Raises:
-        ValueError: if it is a splat in a format that is not read; the message has the command that converts it.
+        ValueError: The format is known but not supported. The message gives a command that converts the file.
     """
     suffix = path.suffix.removeprefix(".")
     if suffix in SPLAT_READERS.names() and suffix not in _SNIFFED:
@@ -242,7 +244,7 @@ def _format(path: Path) -> str:
 
 
 def _refuse_archive(path: Path) -> None:
-    """Raise if a ZIP archive holds a splat in a format that is not read."""
+    """Raise InputError unless a ZIP archive is a file of torch.save, or too damaged to list its content."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
@@ -253,42 +255,42 @@ def _refuse_archive(path: Path) -> None:
         raise _unread(path, "USDZ")
     if "meta.json" in names and ".webp" in suffixes:
         raise _unread(path, "SOG")
-    if not any(Path(name).name == "data.pkl" for name in names):  # which torch.save writes
+    if not any(Path(name).name == "data.pkl" for name in names):  # torch.save writes data.pkl
         raise InputError(
-            f"{path} is a ZIP archive of {', '.join(names)[:200] or 'nothing'}, expected a splat. Extract the file of "
-            "the splat, and give that."
+            f"{path} is a ZIP archive of {', '.join(names)[:200] or 'nothing'}, expected a splat. Extract the splat, "
+            "and give the extracted file."
         )
 
 
 def _unread(path: Path, name: str) -> InputError:
-    advice = "Export a PLY file from the program that wrote it, and give that."
+    advice = "Export a PLY file from the program that wrote it, and give the PLY file."
     if name in _BY_SPLAT_TRANSFORM:
         advice = f"Convert it with: npx @playcanvas/splat-transform {path.name} {path.stem}.ply (Node 22 or newer)"
-    return InputError(f"{path} is a {name} file, which is not read. {advice}")
+    return InputError(f"{path} is a {name} file, which is not supported. {advice}")
 
 
 def _assumptions(
     path: Path, options: SplatOptions, file: SplatFile, held_out: frozenset[str], cameras: CameraFile
 ) -> list[str]:
-    """Return messages about settings that the files do not specify."""
+    """Return messages about the settings in use and about files that are skipped."""
     texts, mode, frames = list(file.remarks), file.rasterize_mode, cameras.frames
     if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
         texts.append(
-            f"{path.name} was trained with rasterize mode {mode}; --rasterize-mode {options.rasterize_mode} is used "
-            "instead."
+            f"{path.name} was trained with rasterize mode {mode}, but --rasterize-mode {options.rasterize_mode} is "
+            "used instead."
         )
     if options.rasterize_mode is None and mode is None:
-        texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")
+        texts.append(f"{path.name} does not contain its rasterize mode; classic is assumed (see --rasterize-mode).")
     texts.append(
-        "Weights are computed as in gsplat, in the version of --gsplat-version (default: 1.4). Versions before 1.6 cap "
-        "the opacity of a Gaussian in a pixel at 0.999, version 1.6 and Inria's trainer at 0.99. Inria's trainer "
-        "assumes the principal point in the middle of the image. Distorted images are undistorted as in ns-train."
+        "Weights are computed as in gsplat, with the version of --gsplat-version (default: 1.4). Versions before 1.6 "
+        "cap the opacity of a Gaussian in a pixel at 0.999; version 1.6 and Inria's trainer cap it at 0.99. Inria's "
+        "trainer assumes that the principal point is the image center. Images are undistorted as in ns-train."
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"
         texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
     else:
-        texts.append(f"All {len(frames)} images are lifted; see --test-every and --eval-images.")
+        texts.append(f"All {len(frames)} images are lifted; to hold out some, give --test-every or --eval-images.")
     texts += cameras.remarks
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()

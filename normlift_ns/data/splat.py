@@ -1,4 +1,4 @@
-"""Parameters of a trained splat, their validation, and PLY files."""
+"""Parameters of a trained splat, their validation, and the reader for PLY files."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ from normlift_ns.io.guard import file_kind, open_regular
 from normlift_ns.options import RasterizeMode
 
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
-"""Degree of the spherical harmonics by the number of coefficients beyond the constant one."""
+"""Degree of the spherical harmonics, by the number of coefficients without the constant one."""
 _MAX_MEDIAN_WIDTH = 0.02
-"""Largest plausible width of the median Gaussian, as a fraction of the scene. If a file has no negative log scales and
-exceeds it, its scales are linear."""
+"""Largest plausible width of the median Gaussian, as a fraction of the extent of the scene.
+
+If the median is wider and no log scale is negative, the file probably contains linear scales.
+"""
 
 _COLUMNS = {
     "means": ("x", "y", "z"),
@@ -35,11 +37,11 @@ _COLUMNS = {
     "scales": tuple(f"scale_{i}" for i in range(3)),
     "quats": tuple(f"rot_{i}" for i in range(4)),
 }
-"""Parameters of fixed size, with the properties of a PLY file that hold their columns."""
+"""PLY properties of the columns of each parameter. The higher spherical harmonics are left out."""
 _DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _SAMPLE_SIZE, _BLOCK_ROWS = 2**20, 2**18
 _MIN_LOGITS = 100
-"""Number of Gaussians from which logits that all lie in 0..1 cannot be a coincidence."""
+"""Minimum number of Gaussians for the check that their opacities are logits, not numbers in 0..1."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,14 @@ class SplatParameters:
     features_dc: Float[Tensor, "n 3"]
     """Constant spherical harmonic of the colors."""
     features_rest: Float[Tensor, "n k 3"]
-    """Remaining spherical harmonics: K = 0, 3, 8, 15 or 24."""
+    """Other spherical harmonics of the colors, with K = 0, 3, 8, 15 or 24."""
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """The tensors by splatfacto's names."""
+        """Tensors by splatfacto's names."""
         return {name: getattr(self, name) for name in GAUSSIAN_PARAMETERS}
 
     @property
@@ -73,7 +75,7 @@ class SplatParameters:
 
     @cached_property
     def activated(self) -> GaussianScene:
-        """The Gaussians with activated scales and opacities, as a rasterizer takes them."""
+        """Gaussians with activated scales and opacities, as rasterizers use them."""
         return GaussianScene(self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
 
 
@@ -81,15 +83,15 @@ GAUSSIAN_PARAMETERS = tuple(item.name for item in fields(SplatParameters))
 
 
 def validate_splat(splat: SplatParameters, file: Path) -> None:
-    """Raise if the Gaussians cannot be drawn.
+    """Raise if a rasterizer cannot draw the Gaussians.
 
     Raises:
-        ValueError: if there are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms,
-            or opacities are not logits.
+        ValueError: There are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms, or
+            opacities are not logits.
     """
     if len(splat) == 0:
-        raise InputError(f"{file} holds no Gaussians. Export the scene again.")
-    activated = splat.activated  # logits and logarithms themselves may be infinite
+        raise InputError(f"{file} contains no Gaussians. Export the scene again.")
+    activated = splat.activated  # logits and logarithms may be infinite
     geometry = {"means": splat.means, "rotations": splat.quats, "scales": activated.scales}
     colors = (("opacities", activated.opacities), ("colors", splat.features_dc), ("colors", splat.features_rest))
     for name, values in (*geometry.items(), *colors):
@@ -98,48 +100,48 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
         if len(invalid) > 0:
             raise InputError(
                 f"{file} has {len(invalid):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first "
-                f"in row {int(invalid[0])}. Expected finite numbers. Remove those Gaussians; for a PLY file, for "
-                f"example, with: splat-transform {file.name} --filter-nan clean.ply"
+                f"in row {int(invalid[0])}. Expected finite numbers. Remove those Gaussians, for example from a PLY "
+                f"file with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):
-        raise InputError(f"{file} has only zero quaternions, so no Gaussian can be drawn. Export the scene again.")
+        raise InputError(f"{file} has only zero quaternions, expected rotations. Export the scene again.")
     low, high = float(splat.opacities.min()), float(splat.opacities.max())
     if len(splat) >= _MIN_LOGITS and low >= 0 and high <= 1:
         raise InputError(
-            f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, instead of their logits. Expected "
-            "logits, as all splat trainers write them; store log(opacity / (1 - opacity))."
+            f"{file} seems to contain opacities (between {low:.3g} and {high:.3g}), expected their logits. Store "
+            "log(opacity / (1 - opacity)), as all splat trainers do."
         )
     sample = splat.means[:: max(1, len(splat) // _SAMPLE_SIZE)]
     left, right = sample.quantile(0.05, dim=0), sample.quantile(0.95, dim=0)
     extent, width = float((right - left).amax()), float(splat.scales.median().exp())
     if bool((splat.scales >= 0).all()) and extent > 0 and width > _MAX_MEDIAN_WIDTH * extent:
         raise InputError(
-            f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "
-            f"{float(splat.scales.max()):.3g}: read as logarithms, they make the median Gaussian {width:.3g} wide in "
-            f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
+            f"{file} seems to contain linear scales, between {float(splat.scales.min()):.3g} and "
+            f"{float(splat.scales.max()):.3g}. As logarithms, they make the median Gaussian {width:.3g} wide in a "
+            f"scene of {extent:.3g}. Expected natural logarithms. Store log(scale), as all splat trainers do."
         )
 
 
 def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> SplatParameters:
-    """Return a float32 splat from a trainer's tensors, after checking their types and shapes.
+    """Check the types and shapes of a trainer's tensors, and return them as a float32 splat.
 
     Args:
-        parameters: tensors by splatfacto's names.
-        file: their file, for messages.
+        parameters: Tensors by splatfacto's names.
+        file: File of the tensors, for error messages.
     Raises:
-        ValueError: if there are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
+        ValueError: There are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
             float64.
     """
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
     if parameters["means"].ndim == 2 and n == 0:
-        raise InputError(f"{file} holds no Gaussians. Give the file of a training run that kept some.")
+        raise InputError(f"{file} contains no Gaussians. Give the file of another training run.")
     for name, columns in _COLUMNS.items():
         value, shape = parameters[name], (n, len(columns))
         if tuple(value.shape) != shape or value.dtype not in _DTYPES:
             raise InputError(
                 f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
-                f"{shape}, one row per Gaussian. Copy the file again, or give that of another training run."
+                f"{shape}, one row per Gaussian. Copy the file again, or give the file of another training run."
             )
     rest = parameters["features_rest"]
     is_valid = rest.ndim == 3 and rest.shape[::2] == (n, 3) and rest.shape[1] in SH_DEGREES and rest.dtype in _DTYPES
@@ -147,25 +149,25 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
         raise InputError(
             f"{file}: its spherical harmonics have shape {tuple(rest.shape)} and type {rest.dtype}, expected "
             f"floating-point numbers of shape ({n}, K, 3) with K = {', '.join(map(str, SH_DEGREES))} for degrees "
-            f"{', '.join(map(str, SH_DEGREES.values()))}. Copy the file again, or give that of another training run."
+            f"{', '.join(map(str, SH_DEGREES.values()))}. Copy the file again, or give the file of another run."
         )
     return SplatParameters(**{name: parameters[name].detach().float() for name in GAUSSIAN_PARAMETERS})
 
 
 class SplatFile(NamedTuple):
-    """Contents of a file of a trained splat."""
+    """Contents of a splat file."""
 
     splat: SplatParameters
     rasterize_mode: RasterizeMode | None = None
-    """Rasterize mode of the training; None if the file does not name it."""
+    """Rasterize mode of the training; None if the file does not contain it."""
     step: int = 0
     """Training step; 0 if unknown."""
     pose_adjust: Float[Tensor, "v 9"] | None = None
-    """Adjustment of each training view's pose by gsplat's --pose_opt: a translation, and a rotation in six numbers."""
+    """Pose adjustments of the training views by gsplat's --pose_opt: 3 numbers for translation, 6 for rotation."""
     by_gsplat: bool = False
-    """True if gsplat's simple_trainer wrote the file, which normalizes the world of the cameras by default."""
+    """True if gsplat's simple_trainer wrote the file. By default, this trainer normalizes the world of the cameras."""
     test_every: int | None = None
-    """Interval of the images that the training held out; None if the file does not name it."""
+    """Interval n if the training held out every n-th image; None if the file does not contain it."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
 
@@ -174,33 +176,33 @@ _OTHER_PRIMITIVES = re.compile(
     r"(?P<betas>betas?|sb_params.*)|(?P<shapes>shapes?(_\d+)?)|(?P<moving>trbf_.*|motion_.*|omega_.*|velocit.*|"
     r"t|time|scales?_t|rot_r_\d+|t_scale)|(?P<networks>f_offset_.*|f_anchor_.*|app_.*)"
 )
-"""Names of further parameters that change what is drawn, by their kind."""
+"""Names of parameters of unsupported primitives; the groups are the keys of `_KINDS`."""
 _KINDS = {
     "betas": "Beta kernels instead of Gaussians",
     "shapes": "generalized exponentials instead of Gaussians",
     "moving": "Gaussians that move",
-    "networks": "Gaussians that a network makes",
+    "networks": "Gaussians that a network generates",
 }
 _UNUSED = ("nx", "ny", "nz", "red", "green", "blue")
 _FILTER = "filter_3D"
 
 
 def check_extra_names(names: Iterable[str], file: Path) -> tuple[str, ...]:
-    """Return a message that names further parameters of Gaussians, which are not read.
+    """Return a message that lists ignored parameters; an empty tuple if there are none.
 
     Raises:
-        ValueError: if one of them changes what is drawn.
+        ValueError: A parameter belongs to a primitive other than 3D Gaussians.
     """
     names = list(names)
     for match in filter(None, map(_OTHER_PRIMITIVES.fullmatch, names)):
         raise InputError(
             f"{file} has {match[0]}, a parameter of {_KINDS[match.lastgroup or '']}, which are not supported. Export "
-            "3D Gaussians from the program that wrote the file, and give that with --load-ply."
+            "3D Gaussians from the program that wrote the file, and give the new file with --load-ply."
         )
     if len(names) == 0:
         return ()
     listed = ", ".join(names)[:200]
-    return (f"{file.name} has values that are not read, because they should not change what is drawn: {listed}.",)
+    return (f"{file.name} has parameters that are ignored, because they should not affect renders: {listed}.",)
 
 
 _MAX_HEADER_BYTES, _MAX_LINE_BYTES = 2**20, 2**16
@@ -212,24 +214,23 @@ _MODES: dict[str, RasterizeMode] = {
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat, also of a compressed PLY file. Its properties may be in any order; other properties are ignored.
+    """Read a splat from a PLY file, which may be compressed.
 
-    Mip-Splatting's property filter_3D is applied to scales and opacities, as Mip-Splatting does.
-
-    Peak memory is a little more than one copy of the Gaussians.
+    Properties may be in any order, and unknown properties are ignored. The property filter_3D is applied to scales and
+    opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the Gaussians.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not a PLY file, is truncated, does not hold a splat or has Gaussians that cannot be
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not a PLY file, is truncated, does not contain a splat, or has Gaussians that cannot be
             drawn. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no PLY file at {path}. Expected the file of a trained splat.")
+        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of a trained splat with --load-ply.")
     check_ply_header(path)
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count == 0:
-        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+        raise InputError(f"{path} has no vertices, expected Gaussians. Give the PLY file of a trained splat.")
     mode = _mode([*data.comments, *vertex.comments])
     if any(item.name == PACKED for item in vertex.properties):
         parameters, rounding = unpack_compressed_ply(data, path)
@@ -244,28 +245,30 @@ def read_ply(path: Path) -> SplatFile:
         widths = torch.from_numpy(np.ascontiguousarray(vertex.data[_FILTER]).astype(np.float64))
         splat, mode = _apply_filter(splat, widths, path), mode or "antialiased"
         remarks += (
-            f"{path.name} has filter_3D, the filter of Mip-Splatting: it is applied to scales and opacities. Its other "
-            "filter, of 0.1 square pixels, is that of the rasterize mode antialiased, with 0.3.",
+            f"{path.name} has filter_3D, the 3D filter of Mip-Splatting, which is applied to scales and opacities. The "
+            "2D filter of Mip-Splatting has 0.1 square pixels; the rasterize mode antialiased uses 0.3 instead.",
         )
     validate_splat(splat, path)
     return SplatFile(splat, mode, remarks=remarks)
 
 
 def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) -> tuple[str, ...]:
-    """Return messages about properties and rasterize modes that are not known; raise as in `check_extra_names`."""
+    """Return messages about unknown properties and rasterize modes, or raise the errors of `check_extra_names`."""
     known = {*(name for group in _COLUMNS.values() for name in group), *rest, *_UNUSED, _FILTER}
     remarks = check_extra_names([item.name for item in vertex.properties if item.name not in known], path)
     unknown = [name for name in modes if name.lower() not in _MODES]
     if len(unknown) > 0:
-        remarks += (f"{path.name} has SplatRenderMode {unknown[0][:40]}, which is unknown; see --rasterize-mode.",)
+        remarks += (f"{path.name} has the unknown SplatRenderMode {unknown[0][:40]}; give --rasterize-mode.",)
     return remarks
 
 
 def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Path) -> SplatParameters:
-    """Return the Gaussians after convolution with isotropic ones of these standard deviations, as Mip-Splatting draws
-    them: opacities fall as their volumes grow."""
+    """Convolve Gaussians with isotropic Gaussians of standard deviations `widths`, as Mip-Splatting does.
+
+    The opacity falls in proportion to the growth of the volume.
+    """
     if not bool((widths.isfinite() & (widths >= 0)).all()):
-        raise InputError(f"{path}: filter_3D holds negative numbers, NaN or infinity. Export the scene again.")
+        raise InputError(f"{path}: filter_3D has invalid values, expected finite numbers >= 0. Export the scene again.")
     before = splat.scales.double()
     scales = (before.mul(2).exp() + widths[:, None].square()).log() / 2
     growth = (before - scales).nan_to_num(nan=0.0).sum(dim=1, keepdim=True)  # NaN: a flat Gaussian without a filter
@@ -274,8 +277,11 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file whose header has the form that plyfile reads, with as many bytes: comments in ASCII, and obj_info, which
-    some programs write after the properties, as a comment."""
+    """PLY file whose header is changed to a form that plyfile reads, without a change of its length.
+
+    Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
+    comments.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -291,7 +297,7 @@ class _PlainHeader(io.FileIO):
 
 
 def _parse_ply(path: Path) -> PlyData:
-    """Parse the header, and map the binary data."""
+    """Parse the header of a PLY file, and memory-map its binary data."""
     try:
         with _PlainHeader(path) as stream:
             return PlyData.read(stream, mmap="c")
@@ -303,12 +309,12 @@ def _parse_ply(path: Path) -> PlyData:
             ) from error
         raise InputError(
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
-            "splat-transform converts other formats, for example: splat-transform scene.sog scene.ply"
+            "to convert other formats, run for example: splat-transform scene.sog scene.ply"
         ) from error
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> None:
-    """Raise InputError unless the vertices have the properties of a splat, as plain numbers."""
+    """Raise InputError unless the vertices have all properties of a splat, with one number each."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
@@ -320,14 +326,16 @@ def _check_properties(path: Path, vertex: PlyElement) -> None:
         )
     lists = [item.name for item in vertex.properties if item.name in required and hasattr(item, "len_dtype")]
     if lists:
-        raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+        raise InputError(
+            f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian. Export it again."
+        )
 
 
 def check_ply_header(path: Path) -> None:
-    """Raise if the file is too small for the rows that its header declares, which are allocated before reading.
+    """Raise if a PLY file is too small for the rows that its header declares, before memory is allocated for them.
 
     Raises:
-        ValueError: if the header is invalid, has no end within 1 MB, or declares more data than the file holds.
+        ValueError: The header is invalid, does not end within 1 MB, or declares more data than the file contains.
     """
     size = path.stat().st_size
     with open_regular(path) as file:
@@ -349,7 +357,7 @@ def check_ply_header(path: Path) -> None:
                 f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} with {properties} "
                 "properties. Expected a complete PLY file; copy it again."
             )
-        declared += int(count) * properties  # a property takes at least one byte
+        declared += int(count) * properties  # each property takes at least one byte
     if declared > size:
         raise InputError(
             f"{path} is truncated or damaged: its header declares {declared:,} numbers, but the file has only "
@@ -359,20 +367,20 @@ def check_ply_header(path: Path) -> None:
 
 def _advice(missing: list[str]) -> str:
     if missing == ["scale_2"]:
-        return "2D Gaussians, which have two scales, are not supported; train the scene with 3D Gaussians."
+        return "2D Gaussians, which have two scales, are not supported. Train the scene with 3D Gaussians."
     if all(name.startswith("f_dc_") for name in missing):
-        return "Its colors are not spherical harmonics; export it again with f_dc_*."
-    return "Give the PLY file that its trainer or ns-export gaussian-splat wrote, not the initial point cloud."
+        return "Its colors are not spherical harmonics. Export it again with f_dc_*."
+    return "Give the PLY file that the trainer or ns-export gaussian-splat wrote, not the initial point cloud."
 
 
 def _rest_names(path: Path, names: set[str]) -> list[str]:
-    """Return f_rest_0, f_rest_1, … in order."""
+    """Return the names f_rest_0, f_rest_1, …, or raise InputError if their number does not match a degree."""
     count = sum(name.startswith("f_rest_") for name in names)
     expected = [f"f_rest_{i}" for i in range(count)]
     if count % 3 != 0 or count // 3 not in SH_DEGREES or not set(expected) <= names:
         counts = ", ".join(f"{3 * k} (degree {degree})" for k, degree in SH_DEGREES.items())
         raise InputError(
-            f"{path} has {count} properties f_rest_*, which matches no degree of spherical harmonics. Expected "
+            f"{path} has {count} properties f_rest_*, which does not match a degree of spherical harmonics. Expected "
             f"f_rest_0, f_rest_1, … with one of the counts {counts}. Export the scene again."
         )
     return expected
@@ -386,7 +394,7 @@ def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParame
         for name, group in _COLUMNS.items():
             for i, column in enumerate(group):
                 columns[name].numpy()[start : start + len(rows), i] = rows[column]
-        for i, column in enumerate(rest):  # all of red, then green, then blue
+        for i, column in enumerate(rest):  # all coefficients of red, then green, then blue
             harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
     return SplatParameters(**columns, features_rest=harmonics)
 
@@ -394,7 +402,7 @@ def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParame
 def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Yield blocks of rows, each with the index of its first row.
 
-    Blocks are read rather than mapped, because mapped pages count as memory of the process.
+    The function reads blocks instead of mapping them, because mapped pages count as memory of the process.
     """
     with open_regular(path) as file:
         is_mapped = isinstance(table, np.memmap)
@@ -406,7 +414,7 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _mode(comments: list[str]) -> RasterizeMode | None:
-    """Return the value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
+    """Return the rasterize mode in the comment SplatRenderMode; None without this comment or for unknown values."""
     return next((_MODES.get(value.lower()) for value in _mode_names(comments)), None)
 
 

@@ -1,7 +1,7 @@
-"""SPZ files of Niantic: Gaussians in a few bytes per attribute, compressed (https://github.com/nianticlabs/spz).
+"""Niantic's SPZ files, which store quantized and compressed Gaussians (https://github.com/nianticlabs/spz).
 
-Versions 2 and 3 are one gzip stream of a header and the attributes, one after the other. Version 4 has a plain header,
-a table of sizes, and a zstd stream per attribute.
+A file of version 2 or 3 is one gzip stream of a header and all attributes. A file of version 4 has an uncompressed
+header, a table of sizes, and one zstd stream per attribute.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, number of streams."""
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
-"""The whole header of version 4, and the compressed and uncompressed size of a stream."""
+"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
 _ANTIALIASED = 1
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
 _SH_STEPS = (8, 16)
-"""Steps of the spherical harmonics of degree 1 and of higher degrees, in 1/128: the defaults of Niantic's library."""
+"""Quantization steps of spherical harmonics of degree 1 and of higher degrees, in 1/128, as in Niantic's library."""
 _COMPONENT_STEPS = 511 * 2**0.5
-"""Steps of a quaternion component per unit; components other than the largest are at most sqrt(1/2)."""
+"""Quantization steps per unit of a quaternion component. All components except the largest are at most sqrt(1/2)."""
 _MAX_RATIO = 1032
-"""Ratio that deflate reaches at best."""
+"""Maximum compression ratio of deflate."""
 _MAX_WINDOW = 2**27
 
 
@@ -50,24 +50,25 @@ class _Header(NamedTuple):
 
     @property
     def sizes(self) -> list[int]:
-        """Numbers of bytes of positions, opacities, colors, scales, rotations and spherical harmonics."""
+        """Sizes in bytes of positions, opacities, colors, scales, rotations and spherical harmonics."""
         harmonics = 3 * ((self.degree + 1) ** 2 - 1)
         return [self.gaussians * size for size in (9, 1, 3, 3, 3 if self.version == 2 else 4, harmonics)]
 
 
 def encode_spz(splat: SplatParameters, *, antialiased: bool = False, version: Literal[3, 4] = 3) -> bytes:
-    """Return Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
+    """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
-    Positions take the finest of the 24 steps between 1 and 2^-23 that holds them all. Logarithms of scales are rounded
-    to 1/16 and clamped to -10..5.94, opacities to 1/255, colors to 1/38, spherical harmonics to 1/16 (degree 1) or 1/8
-    and clamped to -1..1, and rotations to 0.004 radians. Gaussians that are never drawn are encoded with opacity 0.
+    Positions are rounded to the smallest power of two from 2^-23 to 1 for which all of them fit into 24 bits.
+    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255, colors to 1/38,
+    and rotations to 0.004 radians. Spherical harmonics are rounded to 1/16 (degree 1) or 1/8, and clamped to -1..1.
+    Gaussians that are never drawn get opacity 0.
 
     Args:
-        splat: the Gaussians, whose colors are spherical harmonics.
+        splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
-        version: 3 is read by more programs; 4 is the newest one.
+        version: Version of the format. More programs read version 3; version 4 is newer.
     Raises:
-        ValueError: if a Gaussian that can be drawn is further than 8,388,607 from the origin along an axis.
+        ValueError: A Gaussian that can be drawn is further than 8,388,607 from the origin along an axis.
     """
     drawable = splat.activated.drawable.cpu()
     means, quats, scales, logits, colors, rest = (
@@ -98,8 +99,8 @@ def read_spz(path: Path) -> SplatFile:
     """Read an SPZ file of version 2, 3 or 4, in its own coordinates.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be drawn.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be drawn.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no SPZ file at {path}. Give the file of the splat with --load-ply.")
@@ -108,7 +109,7 @@ def read_spz(path: Path) -> SplatFile:
 
 
 def decode_spz(data: bytes, path: Path) -> SplatFile:
-    """Return the Gaussians in the bytes of an SPZ file; `path` is for messages. Raises the errors of `read_spz`."""
+    """Decode the bytes of an SPZ file, or raise the ValueErrors of `read_spz`; messages contain `path`."""
     is_gzip = data.startswith(GZIP_MAGIC)
     header, streams = _read_gzip(data, path) if is_gzip else _read_zstd(data, path)
     n, k = header.gaussians, (header.degree + 1) ** 2 - 1
@@ -131,11 +132,11 @@ def decode_spz(data: bytes, path: Path) -> SplatFile:
 
 
 def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:
-    """Return a sentence about the rounding errors of an SPZ file."""
+    """Return a message about the rounding errors of an SPZ file."""
     turn = "0.1" if version == 2 else "0.004"
     return (
-        f"{name} holds rounded numbers: positions within {0.5 ** (fractional_bits + 1):.2g}, logarithms of scales "
-        f"within 0.03 of -10 to 5.9, rotations within {turn} radians, opacities within 0.002."
+        f"{name} contains rounded numbers. Maximum errors: {0.5 ** (fractional_bits + 1):.2g} for positions, 0.03 for "
+        f"logarithms of scales in -10..5.9, {turn} radians for rotations, and 0.002 for opacities."
     )
 
 
@@ -151,20 +152,19 @@ def _read_header(data: bytes, path: Path) -> _Header:
             f"{path} is an SPZ file of version {version}, expected 2, 3 or 4. Write it again as version 3."
         )
     if count == 0:
-        raise InputError(f"{path} holds no Gaussians. Export the scene again.")
+        raise InputError(f"{path} contains no Gaussians. Export the scene again.")
     if degree not in SH_DEGREES.values() or fractional_bits > _MAX_FRACTIONAL_BITS + 1:
         raise InputError(
-            f"{path} is damaged: its header has spherical harmonics of degree {degree} and {fractional_bits} "
-            f"fractional bits, expected a degree of at most {max(SH_DEGREES.values())} and at most 24 bits. Copy it "
-            "again."
+            f"{path} is damaged: its header has degree {degree} of spherical harmonics and {fractional_bits} "
+            f"fractional bits, expected at most {max(SH_DEGREES.values())} and 24. Copy it again."
         )
     return _Header(version, count, degree, fractional_bits, flags)
 
 
 def _check_size(header: _Header, size: int, path: Path) -> None:
-    """Raise if the Gaussians cannot be in a compressed file of so many bytes, or not in memory."""
+    """Raise if a compressed file of `size` bytes is too small for the Gaussians, or if they do not fit into memory."""
     if sum(header.sizes) > size * _MAX_RATIO:
-        raise _damaged(path, f"its header declares {header.gaussians:,} Gaussians, but it has only {size:,} bytes")
+        raise _damaged(path, f"its header declares {header.gaussians:,} Gaussians, too many for {size:,} bytes")
     refuse_small_memory(header.gaussians)
 
 
@@ -173,12 +173,12 @@ def _damaged(path: Path, problem: str) -> InputError:
 
 
 def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
-    """Return the header and the attributes of version 2 or 3, decompressing no more than the header declares."""
+    """Return the header and the attributes of version 2 or 3; never decompress more bytes than the header declares."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = _read_header(stream.decompress(data, _HEADER.size), path)
         if header.version == 4:
-            raise _damaged(path, "it is compressed as version 3, and its header has version 4")
+            raise _damaged(path, "it is compressed like version 3, but its header has version 4")
         _check_size(header, len(data), path)
         content = stream.decompress(stream.unconsumed_tail, sum(header.sizes))
     except zlib.error as error:
@@ -193,13 +193,13 @@ def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
     """Return the header and the attributes of version 4."""
     header = _read_header(data, path)
     if header.version != 4 or len(data) < _TABLE_OFFSET.size:
-        raise _damaged(path, f"it is not compressed, and its header has version {header.version}")
-    _check_size(header, len(data) * 64, path)  # zstd repeats a byte in fewer bytes than deflate
+        raise _damaged(path, f"its header is not compressed, but has version {header.version} or is too short")
+    _check_size(header, len(data) * 64, path)  # zstd can reach a higher compression ratio than deflate
     (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
     sizes = [size for size in header.sizes if size > 0]
     offset = start + number * _TABLE_ENTRY.size
     if number != len(sizes) or start < _TABLE_OFFSET.size or offset > len(data):
-        raise _damaged(path, f"its table of {number} streams begins at byte {start:,}")
+        raise _damaged(path, f"its table of {number} streams at byte {start:,} is not valid")
     streams = []
     for i, size in enumerate(sizes):
         packed, unpacked = _TABLE_ENTRY.unpack_from(data, start + i * _TABLE_ENTRY.size)
@@ -222,12 +222,12 @@ def _decompress_zstd(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
-    """Return the largest number of fractional bits with which all coordinates fit into 24 bits."""
+    """Return the largest number of fractional bits for which all coordinates fit into 24 bits."""
     reach = float(means.abs().max()) if len(means) > 0 else 0.0
     if reach > _MAX_FIXED:
         raise InputError(
-            f"A Gaussian has the coordinate {reach:,.0f}, and SPZ holds at most {_MAX_FIXED:,}. Move the scene to the "
-            "origin, or write a PLY file."
+            f"A Gaussian has the coordinate {reach:,.0f}, but SPZ files allow at most {_MAX_FIXED:,}. Move the scene "
+            "to the origin, or write a PLY file."
         )
     return next(bits for bits in range(_MAX_FRACTIONAL_BITS, -1, -1) if round(reach * 2**bits) <= _MAX_FIXED)
 
@@ -237,7 +237,7 @@ def _floats(values: np.ndarray, *shape: int) -> Tensor:
 
 
 def _pack_quats(quats: Float[Tensor, "n 4"]) -> np.ndarray:
-    """Return 2 bits for the index of the largest component of (x, y, z, w), and 10 bits for each of the others."""
+    """Pack quaternions (x, y, z, w): 2 bits for the index of the largest component, and 10 bits for each other one."""
     index, components = split_largest(normalize_quats(quats).roll(-1, dims=1))
     steps = (components.abs() * _COMPONENT_STEPS).round().clamp(max=511).long() | ((components < 0).long() << 9)
     packed = index << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
@@ -252,7 +252,7 @@ def _unpack_quats(packed: np.ndarray) -> Float[Tensor, "n 4"]:
 
 
 def _unpack_first_three(packed: np.ndarray) -> Float[Tensor, "n 4"]:
-    """Return the quaternions of version 2: a byte for each of x, y and z."""
+    """Unpack quaternions of version 2, which stores x, y and z with one byte each."""
     xyz = _floats(packed, len(packed) // 3, 3) / 127.5 - 1
     w = (1 - xyz.square().sum(dim=1, keepdim=True)).clamp(min=0).sqrt()
     return torch.cat([w, xyz], dim=1)

@@ -1,4 +1,4 @@
-"""transforms.json: schema, cameras, and transforms between the world of the cameras and that of the splat."""
+"""Reader and writer for transforms.json, and transforms from the world of the cameras to the world of the splat."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from normlift_ns.io.atomic import write_text_file
 from normlift_ns.io.guard import check_files_distinct, read_file
 
 _MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
-"""Largest side and largest area of an image, in pixels."""
+"""Maximum side and maximum area of an image, in pixels."""
 _MAX_VALUE = 1e30
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _DISTORTION_VALUES = (*DISTORTION, "k5", "k6", "distortion_params")
 _LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _MAX_JSON_BYTES = 2**27
-"""Largest JSON file that is read; ten thousand frames take a tenth of that."""
+"""Maximum size of a JSON file. Ten thousand frames take a tenth of it."""
 
 
 class CameraEntry(msgspec.Struct):
-    """Camera parameters, given for all frames or for a single frame."""
+    """Camera parameters in a transforms.json, either for all frames or for one frame."""
 
     fl_x: float | None = None
     fl_y: float | None = None
@@ -68,7 +68,7 @@ class CameraEntry(msgspec.Struct):
 
 
 class FrameEntry(CameraEntry, kw_only=True):
-    """A frame, as stored in the file."""
+    """Frame as stored in a transforms.json."""
 
     file_path: str
     transform_matrix: list[list[float]]
@@ -76,7 +76,7 @@ class FrameEntry(CameraEntry, kw_only=True):
 
 
 class TransformsEntries(CameraEntry, kw_only=True):
-    """The contents of a transforms.json."""
+    """Contents of a transforms.json."""
 
     frames: list[FrameEntry]
     applied_transform: list[list[float]] | None = None
@@ -88,39 +88,39 @@ class TransformsEntries(CameraEntry, kw_only=True):
 
     @property
     def lists(self) -> dict[str, list[str] | None]:
-        """The lists of files by split."""
+        """Lists of file names by split; None for a split without a list."""
         return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}
 
     def value(self, frame: FrameEntry, name: str) -> Any:
-        """Return a parameter of a camera. As in nerfstudio, values for all frames take precedence over its own."""
+        """Return a camera parameter of a frame. As in nerfstudio, a value for all frames takes precedence."""
         shared = getattr(self, name)
         return getattr(frame, name) if shared is None else shared
 
     def applied_rows(self, folder: Path) -> list[list[float]] | None:
-        """Return the transform of the poses before they were stored, if any.
+        """Return the transform that was applied to the poses before they were stored, or None.
 
-        As in nerfstudio, files of an old ns-process-data in a folder imply one without naming it.
+        As in nerfstudio, a file without this entry next to colmap/sparse/0 comes from an old ns-process-data, which
+        applied a fixed transform.
         """
         is_legacy = self.applied_transform is None and (folder / "colmap/sparse/0").exists()
         return _LEGACY_FLIP if is_legacy else self.applied_transform
 
 
 def read_json_file(path: Path, expected: str) -> Any:
-    """Read a JSON file.
+    """Return the decoded content of a JSON file.
 
     Args:
-        path: the file.
-        expected: noun phrase for error messages that describes the expected file.
+        path: File to read.
+        expected: Noun phrase that describes the expected file, for error messages.
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is too large, is not valid JSON or is nested too deeply.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is too large, is not valid JSON, or is nested too deeply.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(
-            f"{path} has {path.stat().st_size:,} bytes, more than the limit of {_MAX_JSON_BYTES:,}. Expected "
-            f"{expected}."
+            f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_JSON_BYTES:,}. Give {expected}."
         )
     text = read_file(path, max_bytes=_MAX_JSON_BYTES).removeprefix(codecs.BOM_UTF8)
     try:
@@ -132,12 +132,12 @@ def read_json_file(path: Path, expected: str) -> Any:
 
 
 def read_transforms_entries(path: Path) -> TransformsEntries:
-    """Read and validate a transforms.json, without looking for its images.
+    """Read and validate a transforms.json, without a check that its images exist.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not valid JSON, does not match the schema, or has no frames, invalid poses or
-            invalid sizes.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not valid JSON, does not match the schema, or has no frames, invalid poses or invalid
+            sizes.
     """
     expected = "a transforms.json of nerfstudio, instant-ngp or Blender's synthetic scenes"
     values = read_json_file(path, expected)
@@ -146,7 +146,7 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not match the schema: {error}. Expected {expected}.") from error
     if len(entries.frames) == 0:
-        raise InputError(f"{path} has no frames, so no cameras. Expected a frame for every training image.")
+        raise InputError(f"{path} has no frames. Expected a frame for every training image.")
     _check_numbers(entries, str(path))
     for frame in entries.frames:
         _check_numbers(frame, f"{path}: {frame.file_path}")
@@ -155,35 +155,35 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
             raise InputError(f"{path}: the file_path or mask_path {names} is not a valid file name.")
         if not _is_matrix(frame.transform_matrix):
             raise InputError(
-                f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4 finite numbers. Expected a "
-                "camera-to-world matrix."
+                f"{path}: the transform_matrix of {frame.file_path} is not valid. Expected a camera-to-world matrix of "
+                "4 x 4 finite numbers."
             )
     return entries
 
 
 def _is_matrix(rows: list[list[float]], bound: float = _MAX_VALUE) -> bool:
-    """Return whether these are 3 or 4 rows of 4 numbers below a bound."""
+    """Return True if a matrix has 3 or 4 rows of 4 numbers with absolute values below a bound."""
     return len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and bool((np.abs(rows) < bound).all())
 
 
 def _check_numbers(entry: CameraEntry, source: str) -> None:
-    """Raise if a size is not a whole number in range, a focal length not positive, or a number beyond float32."""
+    """Raise InputError if a size, a focal length or another parameter of a camera is out of range."""
     for name, side in _given(entry, "w", "h"):
         if not (0 < side <= _MAX_SIDE and float(side).is_integer()):
-            raise InputError(f"{source}: {name} is {side:g}, expected a whole number of pixels, 1 to {_MAX_SIDE:,}.")
+            raise InputError(f"{source}: {name} is {side:g}, expected a whole number of pixels in 1..{_MAX_SIDE:,}.")
     if (entry.w or 1) * (entry.h or 1) > _MAX_PIXELS:
-        raise InputError(f"{source}: w and h are {entry.w:g} and {entry.h:g}, more than {_MAX_PIXELS:,} pixels in all.")
+        raise InputError(f"{source}: w x h is {entry.w:g} x {entry.h:g}, expected at most {_MAX_PIXELS:,} pixels.")
     for name, focal in _given(entry, "fl_x", "fl_y"):
         if not 0 < focal < _MAX_VALUE:
             raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
     parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
     for name, value in (*_given(entry, "cx", "cy", *DISTORTION), *parameters):
         if not abs(value) < _MAX_VALUE:
-            raise InputError(f"{source}: {name} is {value:g}, expected a number that float32 can hold.")
+            raise InputError(f"{source}: {name} is {value:g}, expected a finite number below 1e30.")
 
 
 def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:
-    """Return the parameters of these names that an entry has."""
+    """Return the names and values of the named parameters that are not None."""
     return [(name, value) for name in names if (value := getattr(entry, name)) is not None]
 
 
@@ -194,21 +194,21 @@ class CameraFile(NamedTuple):
     """Contents of a transforms.json or a COLMAP reconstruction."""
 
     frames: list[Frame]
-    """All images, sorted by file, with cameras in the file's world."""
+    """All images with their cameras in the world of the file, sorted by file."""
     held_out: frozenset[str]
-    """Names of the images that the file excludes from the training; most files exclude none."""
+    """Names of the images that the file excludes from the training; usually empty."""
     source: Path
-    """The file, or the folder of the COLMAP reconstruction."""
+    """Path of the file, or of the folder of the COLMAP reconstruction."""
     folder: Path
     """Folder of the dataset."""
     names_root: Path
-    """Folder that image names are relative to."""
+    """Base folder of the relative image names."""
     applied_transform: Float[np.ndarray, "4 4"] | None = None
-    """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
+    """Transform from the world of the capture to the world of the file, as applied by ns-process-data."""
     applied_scale: float = 1.0
     """Scale of `applied_transform`."""
     remarks: tuple[str, ...] = ()
-    """Messages about the choices that the file left open, in whole sentences."""
+    """Messages about choices that the reader made, in whole sentences."""
 
 
 def read_transforms(
@@ -219,16 +219,19 @@ def read_transforms(
     base: Path | None = None,
     advice: str = GIVE_IMAGES,
 ) -> CameraFile:
-    """Read the frames of a transforms.json; images are located, but only opened if the file does not give their size.
+    """Read the frames of a transforms.json, and find their images.
+
+    The function opens an image only if the file does not contain its size.
 
     Args:
-        path: the file, or the folder that holds it.
-        images, masks: folders of the images and masks, instead of those that the file names.
-        base: folder that names are relative to; None: that of the file, or the parent of `images`.
-        advice: what to do about missing images, for error messages.
+        path: Path of the file or of its folder.
+        images: Folder of the images, which replaces the paths in the file.
+        masks: Folder of the masks, which replaces the paths in the file.
+        base: Base folder of the image names. If None, the parent of `images`, or else the folder of the file.
+        advice: Advice on missing images, for error messages.
     Raises:
-        FileNotFoundError: if the file, an image or a mask is missing.
-        ValueError: if the file is not valid JSON, does not match the schema, or names a camera model that cannot be
+        FileNotFoundError: The file, an image or a mask is missing.
+        ValueError: The file is not valid JSON, does not match the schema, or has a camera model that cannot be
             undistorted.
     """
     path = path / "transforms.json" if path.is_dir() else path
@@ -256,14 +259,17 @@ def read_transforms(
 
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
-    """Return whether the file excludes each frame from the training. Like nerfstudio, reject lists of other files."""
+    """Return True for each frame that the file excludes from the training.
+
+    As in nerfstudio, a list must not contain files without a frame.
+    """
     files = [root / plain_name(frame.file_path) for frame in entries.frames]
     for split, names in entries.lists.items():
         unknown = [name for name in names or () if root / plain_name(name) not in files]
         if unknown:
             raise InputError(
-                f"{path}: its {split}_filenames list {unknown[0]}, which is not the file_path of any frame. Expected "
-                "the same names in both."
+                f"{path}: {split}_filenames contains {unknown[0]}, expected only names that are the file_path of a "
+                "frame. Correct the list."
             )
     if entries.train_filenames is not None:
         trained = {root / plain_name(name) for name in entries.train_filenames}
@@ -273,7 +279,7 @@ def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
 
 
 def relative_name(file: Path, folder: Path) -> str:
-    """Return the file relative to the folder, or unchanged if it lies elsewhere, with forward slashes."""
+    """Return the path of a file relative to a folder, with forward slashes; unchanged if the file is outside of it."""
     return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
 
 
@@ -295,20 +301,23 @@ def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, p
     if len(names) < len(entries.frames):
         unmasked = next(frame.file_path for frame in entries.frames if frame.mask_path is None)
         raise InputError(
-            f"{path} lists masks for some images, but none for {unmasked}. Expected one for each, or none."
+            f"{path} lists masks for some images, but not for {unmasked}. Expected a mask for each image, or no masks."
         )
     files = [_find_mask(name, root, images) for name in names]
     missing = [name for name, file in zip(names, files) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} masks that {path} lists are missing; the first is "
-            f"{root / missing[0]}. Put them back, or next to the images if those were moved."
+            f"{len(missing)} of the {len(names)} masks in {path} are missing; the first is {root / missing[0]}. Copy "
+            "them to these paths, or give their folder with --masks."
         )
     return [file.absolute() for file in files if file is not None]
 
 
 def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
-    """Find a mask at its path in the file, or in a folder of the same name inside or next to the image folder."""
+    """Return the path of an existing mask, or None.
+
+    The function tries the path in the file, and folders of the same name inside and next to the image folder.
+    """
     own, *ends = possible_paths(root, name)
     tail = Path(*Path(plain_name(str(own))).parts[-2:])
     moved = () if images is None else (images / relative_name(own, root), images / tail, images.parent / tail)
@@ -316,17 +325,17 @@ def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
 
 
 def _is_named_like(mask: Path, frame: FrameEntry) -> bool:
-    """Return whether a mask has the name of its image, so that it cannot be the mask of a whole camera."""
+    """Return True if a mask has the name of its image; other masks may be shared by all images of a camera."""
     image = Path(plain_name(frame.file_path))
     return mask.stem in (image.name, image.stem)
 
 
 _SAME = 1e-3
-"""Largest difference of equal intrinsics: a fraction of the longer side of the image, or a distortion parameter."""
+"""Tolerance for equal intrinsics: pixels as a fraction of the longer image side, distortion as an absolute number."""
 
 
 def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrinsics, path: Path) -> None:
-    """Raise if programs read different intrinsics, because two values of the file differ."""
+    """Raise InputError if the file has two different values for a parameter, because programs read different ones."""
     found: dict[str, tuple[str, float]] = {}
     differ: list[tuple[str, tuple[str, float], tuple[str, float]]] = []
     pixels = _SAME * max(lens.width, lens.height)
@@ -349,9 +358,9 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         name, first, second = differ[0]
         kept, others = (", ".join(dict.fromkeys(item[i][0] for item in differ)) for i in (1, 2))  # type: ignore[index]
         raise InputError(
-            f"{path} can be read in two ways: for {frame.file_path}, {name} is {first[1]:g} by {first[0]}, which "
-            f"nerfstudio reads, and {second[1]:g} by {second[0]}, which other programs such as instant-ngp and Brush "
-            f"read. Remove those that the splat was not trained with, and give the new file with --transforms: "
+            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} by {first[0]}, which "
+            f"nerfstudio reads, and {second[1]:g} by {second[0]}, which programs such as instant-ngp and Brush read. "
+            f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
         )
 
@@ -359,7 +368,7 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
 def _readings(
     entry: CameraEntry, start: str, names: Sequence[str], lens: Intrinsics
 ) -> Iterator[tuple[str, str, float]]:
-    """Yield parameters in pixels: name, place in the file and value."""
+    """Yield the name, key in the file and value of each given parameter, with angles converted to pixels."""
     for name, value in _given(entry, *names):
         if name.startswith("camera_angle"):
             if 0 < value < math.pi:
@@ -370,19 +379,19 @@ def _readings(
 
 
 def _check_model(entries: TransformsEntries, frame: FrameEntry, path: Path) -> None:
-    """Raise if there are two camera models, or one that cannot be undistorted."""
+    """Raise InputError if a frame has two camera models, or a model that cannot be undistorted."""
     models = [item.camera_model for item in (entries, frame) if item.camera_model is not None]
     if len(set(models)) > 1:
         raise InputError(
-            f"{path} can be read in two ways: the camera_model is {models[0]}, but that of {frame.file_path} is "
-            f"{models[1]}. Remove the one that the splat was not trained with: jq 'del(.frames[].camera_model)' "
+            f"{path} can be read in two ways: the camera_model is {models[0]} for the file, but {frame.file_path} has "
+            f"{models[1]}. Remove the model that the splat was not trained with: jq 'del(.frames[].camera_model)' "
             f"{path.name} > new.json, or jq 'del(.camera_model)' {path.name} > new.json"
         )
     model = "OPENCV_FISHEYE" if entries.value(frame, "is_fisheye") else [*models, "OPENCV"][0].upper()
     if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE"):
         raise InputError(
-            f"{path}: {frame.file_path}: the camera_model is {model}; supported models are "
-            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, and give their cameras, in the same world."
+            f"{path}: the camera_model of {frame.file_path} is {model}, expected one of "
+            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, and give their new cameras in the same world."
         )
 
 
@@ -390,7 +399,8 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
     """Return the intrinsics of a frame.
 
     Raises:
-        ValueError: if values of the file and of the frame, or focal lengths and angles of view, differ.
+        ValueError: A value is missing or invalid, or values of the file and the frame, or focal lengths and angles of
+            view, differ.
     """
     value, source = partial(entries.value, frame), f"{path}: {frame.file_path}"
     _check_model(entries, frame, path)
@@ -399,10 +409,10 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
     angles = value("camera_angle_x"), value("camera_angle_y")
     for angle in angles:
         if angle is not None and not 0 < angle < math.pi:
-            raise InputError(f"{source}: a camera_angle is {angle}, expected radians between 0 and pi.")
+            raise InputError(f"{source}: a camera_angle is {angle}, expected an angle between 0 and pi radians.")
     fx, fy = _focal(value("fl_x"), angles[0], width), _focal(value("fl_y"), angles[1], height)
     if fx is None:
-        raise InputError(f"{source} has neither fl_x nor camera_angle_x. Expected a focal length.")
+        raise InputError(f"{source} has neither fl_x nor camera_angle_x. Add fl_x, the focal length in pixels.")
     cx, cy = value("cx"), value("cy")
     is_shared = len(_given(entries, *_DISTORTION_VALUES)) > 0
     lens = Intrinsics(
@@ -419,12 +429,12 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
 
 
 def _focal(focal: float | None, angle: float | None, side: float) -> float | None:
-    """Return a focal length in pixels: the given one, or that of an angle of view in radians."""
+    """Return the focal length in pixels, computed from the angle of view in radians if it is None."""
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 
 def _distortion(entry: CameraEntry, source: str) -> tuple[float, float, float, float, float]:
-    """Return k1, k2, k3, p1, p2."""
+    """Return the distortion parameters k1, k2, k3, p1 and p2; raise InputError if there are others."""
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
     if entry.distortion_params is not None:
         values = [*entry.distortion_params, *[0.0] * 6][:6]
@@ -433,8 +443,8 @@ def _distortion(entry: CameraEntry, source: str) -> tuple[float, float, float, f
     if others:
         name, number = others[0]
         raise InputError(
-            f"{source} has the distortion {name} = {number:g}; only k1, k2, k3, p1 and p2 can be undistorted. "
-            "Undistort the images, and give their cameras, in the same world."
+            f"{source} has the distortion {name} = {number:g}, but only k1, k2, k3, p1 and p2 are supported. "
+            "Undistort the images, and give their new cameras in the same world."
         )
     return k1, k2, k3, p1, p2
 
@@ -444,18 +454,21 @@ def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarr
     matrix = np.eye(4)
     if rows is not None:
         if not _is_matrix(rows, math.inf):
-            raise InputError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
+            raise InputError(f"{path}: applied_transform is not valid, expected 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _MIN_DETERMINANT or not 0 < entries.applied_scale < math.inf:
         raise InputError(
-            f"{path}: applied_transform cannot be inverted, or applied_scale is {entries.applied_scale}. Expected a "
-            "rotation and a positive number."
+            f"{path}: applied_transform cannot be inverted, or applied_scale is {entries.applied_scale}. Expected an "
+            "invertible transform and a positive scale."
         )
     return matrix
 
 
 def write_transforms(path: Path, frames: Sequence[Frame], held_out: Sequence[Frame]) -> None:
-    """Write frames for nerfstudio-data, which sorts them by file and reads them as float32."""
+    """Write frames to a transforms.json for the data parser nerfstudio-data.
+
+    The data parser sorts frames by file, and reads numbers as float32.
+    """
     splits = {"train_filenames": frames, "val_filenames": held_out, "test_filenames": held_out}
     content: dict[str, Any] = {"camera_model": "OPENCV"}
     if len(held_out) > 0:
@@ -473,14 +486,14 @@ def _entry(frame: Frame) -> dict[str, Any]:
 
 
 _TOLERANCE = 1e-3
-"""Largest deviation of a matrix from a similarity, because files round."""
+"""Maximum deviation of a matrix from a similarity; numbers in files are rounded."""
 _MAX_MATRIX_BYTES = 2**16
 _EXPECTED_DATAPARSER = "the dataparser_transforms.json that ns-train wrote; copy it again from the run"
 _EXPECTED_MATRIX = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
 
 
 class _DataparserTransforms(msgspec.Struct):
-    """nerfstudio's dataparser_transforms.json: p -> scale * (transform @ p) maps to the scene's world."""
+    """Contents of nerfstudio's dataparser_transforms.json: scale * (transform @ p) is in the world of the scene."""
 
     transform: list[list[float]]
     scale: float
@@ -490,8 +503,8 @@ def read_dataparser_transforms(path: Path) -> WorldTransform:
     """Read the dataparser_transforms.json of a nerfstudio run.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file does not hold a finite transform and a positive scale.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file does not contain a finite transform and a positive scale.
     """
     return _to_world(read_json_file(path, _EXPECTED_DATAPARSER), path)
 
@@ -500,24 +513,25 @@ def _to_world(values: Any, path: Path) -> WorldTransform:
     try:
         stored = msgspec.convert(values, _DataparserTransforms)
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path} does not hold a transform ({error}). Expected {_EXPECTED_DATAPARSER}.") from error
+        raise InputError(f"{path} does not contain a transform ({error}). Expected {_EXPECTED_DATAPARSER}.") from error
     rows = stored.transform
     if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
         raise InputError(
-            f"{path} does not hold a transform: {len(rows)} rows and scale {stored.scale:g}. Expected 3 rows of 4 "
-            f"finite numbers and a positive scale: {_EXPECTED_DATAPARSER}."
+            f"{path} does not contain a transform: {len(rows)} rows and scale {stored.scale:g}, expected 3 rows of 4 "
+            f"finite numbers and a positive scale. Give {_EXPECTED_DATAPARSER}."
         )
     return WorldTransform(np.array(rows[:3]), stored.scale)
 
 
 def capture_transforms(run_dir: Path, identity: Mapping[str, Any]) -> tuple[WorldTransform, ...]:
-    """Return the successive transforms from the world of the capture to that of a lifted run's Gaussians.
+    """Return the successive transforms from the world of the capture to the world of a lifted run.
 
     Args:
-        run_dir: folder of the lifted run.
-        identity: identity of the scene; for a splat without a nerfstudio run, it stores the transform of its cameras.
+        run_dir: Folder of the lifted run.
+        identity: Identity of the scene. For a splat without a nerfstudio run, `source_world` is the transform of its
+            cameras.
     Raises:
-        FileNotFoundError, ValueError: as in `read_dataparser_transforms`, also for `source_world` of the identity.
+        FileNotFoundError, ValueError: The errors of `read_dataparser_transforms`, or `source_world` is invalid.
     """
     trained = read_dataparser_transforms(run_dir / "dataparser_transforms.json")
     source = identity.get("source_world")
@@ -527,15 +541,17 @@ def capture_transforms(run_dir: Path, identity: Mapping[str, Any]) -> tuple[Worl
 def read_world_transform(
     path: Path, applied: Float[np.ndarray, "4 4"] | None = None, applied_scale: float = 1.0
 ) -> WorldTransform:
-    """Read a similarity.
+    """Read a similarity from the world of the cameras to the world of the splat.
+
+    A dataparser_transforms.json starts from the world of the capture, so the inverse of `applied` precedes it.
 
     Args:
-        path: a 4 x 4 matrix in JSON, .npy or .txt, or a dataparser_transforms.json.
-        applied, applied_scale: only used for a dataparser_transforms.json, which starts from the world of the capture:
-            the transform from there to the world of the cameras, as their file states it.
+        path: A 4 x 4 matrix in JSON, .npy or .txt, or a dataparser_transforms.json.
+        applied: Transform from the world of the capture to the world of the cameras, from the camera file.
+        applied_scale: Scale of `applied`.
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file does not hold a similarity.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file does not contain a similarity.
     """
     try:
         values = _read_values(path)
@@ -544,7 +560,7 @@ def read_world_transform(
     except InputError:
         raise
     except (TypeError, ValueError, EOFError, OverflowError, MemoryError, OSError, tokenize.TokenError) as error:
-        raise InputError(f"{path} does not hold a transform ({error}). Expected {_EXPECTED_MATRIX}.") from error
+        raise InputError(f"{path} does not contain a transform ({error}). Expected {_EXPECTED_MATRIX}.") from error
     world = _to_world(values, path)
     matrix = np.eye(4)
     matrix[:3] = world.transform
@@ -567,17 +583,17 @@ def _read_values(path: Path) -> Any:
 
 
 def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> WorldTransform:
-    """Split a 4 x 4 matrix into scale and transform.
+    """Split a 4 x 4 matrix into a scale and a rigid transform.
 
     Args:
-        matrix: the matrix.
-        source: its origin, for error messages.
+        matrix: Matrix of a similarity.
+        source: File or step that the matrix comes from, for error messages.
     Raises:
-        ValueError: if the matrix does not consist of a rotation, a scale and a translation.
+        ValueError: The matrix does not consist of a rotation, a scale and a translation.
     """
     if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_VALUE).all():
         raise InputError(
-            f"{source} has the shape {matrix.shape}, or its numbers are not finite. Expected {_EXPECTED_MATRIX}."
+            f"{source} has the shape {matrix.shape}, or numbers that are not finite. Expected {_EXPECTED_MATRIX}."
         )
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
@@ -591,20 +607,20 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
 
 
 def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) -> list[WorldTransform]:
-    """Recompute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
+    """Compute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
 
-    The steps are those of its datasets/normalize.py and datasets/colmap.py (1.5). First, put the cameras upright around
-    the origin at a median distance of 1. Then turn the points' principal axes to x, y and z, and flip the half with
-    more points to the bottom.
+    The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step turns the cameras
+    upright around the origin, at a median distance of 1. The second step rotates the principal axes of the points to x,
+    y and z, and flips the half with more points to the bottom.
 
     Args:
-        frames: all registered images, sorted by name.
-        points: points of the reconstruction, at least four.
-    Raises:
-        ValueError: if the normalization cannot be computed, or the trainer's formula mirrors the world.
+        frames: All registered images, sorted by name.
+        points: Points of the reconstruction, at least four.
     Returns:
-        The trainer's similarity, followed by the three that differ from it by half a turn about an axis. gsplat before
-        1.5 did not flip, and the signs of the axes depend on the linear algebra library of the training.
+        The similarity of the trainer, followed by the three that differ from it by half a turn about an axis. The signs
+        of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip the points.
+    Raises:
+        ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """
     poses = np.array([np.concatenate([frame.pose, [[0, 0, 0, 1]]]) for frame in frames]) * [1, -1, -1, 1]
     with np.errstate(all="ignore"):
@@ -612,8 +628,8 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
     if not np.isfinite(upright).all():
         raise InputError(
             "gsplat's normalization cannot be computed from these cameras: all are at one point, or their up axes "
-            "cancel out. Give --world-transform, or --gsplat-normalize False if the training used "
-            "--no-normalize-world-space."
+            "cancel out. Give --world-transform. If the training used --no-normalize-world-space, give "
+            "--gsplat-normalize False."
         )
     if np.linalg.det(upright[:3, :3]) < 0:
         raise InputError(
@@ -633,10 +649,10 @@ def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -
 
 
 def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform that maps the cameras' mean up axis to -y and the point that they look at to the origin.
+    """Return the transform that maps the mean up axis of the cameras to -y, and their focus point to the origin.
 
     Args:
-        poses: camera-to-world matrices in OpenCV convention.
+        poses: Camera-to-world matrices in OpenCV convention.
     """
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
@@ -645,9 +661,9 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
         skew = np.cross(np.eye(3), axis)
         rotation = np.eye(3) + skew + skew @ skew / (1 + cosine)
     else:
-        rotation = np.diag([-1.0, 1.0, 1.0])  # mirrors, as gsplat's code does
+        rotation = np.diag([-1.0, 1.0, 1.0])  # a reflection, as in gsplat's code
     centers, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
-    nearest = centers - (forward * centers).sum(axis=1)[:, None] * forward  # points of viewing rays nearest the origin
+    nearest = centers - (forward * centers).sum(axis=1)[:, None] * forward  # closest point to the origin on each ray
     shift = -np.median(nearest, axis=0)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, shift
@@ -656,11 +672,14 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform that maps the points' median to the origin, their widest axis to x, their narrowest to z."""
+    """Return the transform that maps the median of points to the origin, their widest axis to x, narrowest to z."""
     center = np.median(points, axis=0)
     covariance = np.cov(points - center, rowvar=False)
     if not np.isfinite(covariance).all():
-        raise InputError("gsplat's normalization cannot be computed: the points of the project are too far away.")
+        raise InputError(
+            "gsplat's normalization cannot be computed, because the points of the COLMAP project are too far away. "
+            "Give --world-transform."
+        )
     axes = np.linalg.eigh(covariance)[1][:, ::-1].copy()
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1

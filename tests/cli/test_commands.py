@@ -95,7 +95,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
         views = ("--render-views", "0003") if pictures else ()
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 1
-        assert "holds text" in said(capsys) and existing.read_text() == "mine"
+        assert "contains text" in said(capsys) and existing.read_text() == "mine"
         existing.write_text("")
         assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
         assert existing.stat().st_size > 100
@@ -292,8 +292,8 @@ def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, litt
     for kind, name, *facts in (
         ("ply", "points.ply", "not a splat", "5", "f_dc_0"),
         ("gsplat", "other.pt", "normalized"),
-        ("ply", "scene.ply", "does not show"),
-        ("ply", "far.ply", "do not look at this splat"),
+        ("ply", "scene.ply", "does not match its images"),
+        ("ply", "far.ply", "do not show this splat"),
     ):
         assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
         text = said(capsys).replace("│", " ")

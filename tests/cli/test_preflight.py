@@ -60,7 +60,7 @@ LIFT = [
     ("--queries oragne", "oragne", "orange"),
     ("--threshold 0.5", "--threshold"),
     ("--device cuda:x:", "--device must be auto, cpu or cuda, got 'cuda:x:'"),
-    ("--timestamp ../x", "'../x'", "name of a folder"),
+    ("--timestamp ../x", "'../x'", "valid folder name"),
     ("--timestamp old", "old exists", "--timestamp", "--output-dir", "--overwrite True"),
     ("--output-dir file", "file, named with --output-dir"),
     ("--output-dir dangling/x", "dangling", "link"),

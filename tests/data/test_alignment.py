@@ -76,7 +76,7 @@ def test_cameras_and_images_of_another_scene_are_refused(scene) -> None:
         alignment_warning(measure_alignment(Changed(scene, shifted)), trained_cameras=True)
     upside_down = Changed(scene, lambda view: view._replace(image=255 - view.image.flip(0)))
     match = measure_alignment(upside_down)
-    with pytest.raises(InputError, match="does not show"):
+    with pytest.raises(InputError, match="does not match"):
         alignment_warning(match, trained_cameras=False)
     assert "stopped early" in str(
         alignment_warning(match, trained_cameras=True)
@@ -95,7 +95,7 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         match = measure_alignment(Changed(scene, change))
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
         warning = alignment_warning(match, trained_cameras=True)
-        assert warning is not None and f"dB on {name}, one of the three training images" in warning
+        assert warning is not None and f"{name}, one of three training images" in warning
 
 
 def test_masked_pixels_do_not_count(scene) -> None:
@@ -114,4 +114,4 @@ def test_real_captures() -> None:
     for name, factor in (("fox", 0.98), ("tabletop", 1.02)):
         scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
         assert alignment_warning(measure_alignment(scene), trained_cameras=True) is None
-        assert "fit the images better" in warning_of(scene, focal(factor))
+        assert "increase the PSNR" in warning_of(scene, focal(factor))

@@ -99,7 +99,7 @@ def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, k
         errors["rest"] = (ours.features_rest - kept).abs().max()
     for name, error in errors.items():
         assert float(error) <= limits[name], (name, float(error))
-    said = [re.search(r"positions within ([\d.e-]+)", text) for text in found.remarks]
+    said = [re.search(r"([\d.e-]+) for positions", text) for text in found.remarks]
     if kind in ("spz", "spz4"):  # the message has the true size
         assert float(errors["means"]) <= float(said[0][1]) * 1.05 < 10 * float(errors["means"]) + 1e-6
 
@@ -228,8 +228,8 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.glb", _with_glb(lambda d: d["meshes"].append(d["meshes"][0])), "2 splats"),
         ("a.glb", _with_glb(lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"])), "EXT_meshopt"),
         ("a.glb", _with_glb(lambda d: _settings(d).update(kernel="disc")), "disc"),
-        ("a.glb", _with_glb(lambda d: _primitive(d)["attributes"].pop("POSITION")), "without POSITION"),
-        ("a.glb", _with_glb(lambda d: d["accessors"][0].update(count=10**12)), "declares 1,000,000,000,000 rows"),
+        ("a.glb", _with_glb(lambda d: _primitive(d)["attributes"].pop("POSITION")), "no attribute POSITION"),
+        ("a.glb", _with_glb(lambda d: d["accessors"][0].update(count=10**12)), "1,000,000,000,000 rows"),
         ("a.glb", _with_glb(lambda d: d["bufferViews"][0].update(byteOffset=-4)), "buffer view"),
         ("a.glb", _with_glb(lambda d: d["buffers"][0].update(uri="../a.bin")), "in the same folder"),
         ("a.glb", _with_glb(lambda d: d["accessors"][3].update(bufferView=0, byteOffset=4)), "damaged|linear scales"),

@@ -87,9 +87,9 @@ def test_worlds_that_differ_are_refused_by_name(scene, larger) -> None:
         add_extra_images(scene, larger(move=moved))
     with pytest.raises(InputError, match="already belong to"):
         add_extra_images(scene, larger(frames=slice(0, -2)))
-    with pytest.raises(InputError, match="has 1 of the"):
+    with pytest.raises(InputError, match="contains 1 of the"):
         add_extra_images(scene, larger(frames=slice(-3, None)))
-    with pytest.raises(InputError, match="has 0 of the"):
+    with pytest.raises(InputError, match="contains 0 of the"):
         add_extra_images(scene, larger(frames=slice(-2, None)))
 
 

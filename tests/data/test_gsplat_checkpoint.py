@@ -50,7 +50,7 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
     path = tmp_path / "a.pt"
     for content, message in (
         ({"step": 1, "pipeline": {}}, "config.yml with --load-config"),
-        ([1, 2], "`splats` in it, found list"),
+        ([1, 2], "`splats`, found list"),
         ({"splats": {"means": torch.zeros(2, 3)}}, "quats, scales, opacities, sh0, shN"),
         ({"splats": {"means": _Payload()}}, "Python objects"),
     ):

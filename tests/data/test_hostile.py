@@ -111,7 +111,7 @@ def test_other_states_are_refused(tmp_path: Path) -> None:
     for pipeline, message in (
         ({0: torch.zeros(1), **state()}, r"key 0 \(int\)"),
         ({**state(), "module._model.gauss_params.means": torch.zeros(N, 3)}, "gauss_params.means twice"),
-        ({**state(), "_model.camera_optimizer.x": torch.zeros(1).expand(10**12)}, "not stored as a dense array"),
+        ({**state(), "_model.camera_optimizer.x": torch.zeros(1).expand(10**12)}, "expected a dense array"),
         ({name: value[:0] for name, value in state().items()}, "no Gaussians"),
         (state(features_rest=torch.zeros(N, 7, 3)), r"\(20, 7, 3\) .* 0, 3, 8, 15, 24"),
         ([1], "`step` and `pipeline`"),
@@ -163,13 +163,13 @@ def test_headers_of_arrays_are_not_believed(tmp_path: Path) -> None:
     path = tmp_path / "world.npy"
     head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000, 4), }"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + head.ljust(117) + b"\n" + bytes(128))
-    with pytest.raises(InputError, match=r"world\.npy does not hold a transform"):
+    with pytest.raises(InputError, match=r"world\.npy does not contain a transform"):
         read_world_transform(path)
     path.write_bytes(bytes(2**17))
     with pytest.raises(InputError, match="4 x 4"):
         read_world_transform(path)
     for array, message in (
-        (np.array([{}], dtype=object), "does not hold a transform"),
+        (np.array([{}], dtype=object), "does not contain a transform"),
         (np.eye(4) * 1e200, "not finite"),
     ):
         np.save(path, array)

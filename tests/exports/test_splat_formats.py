@@ -18,7 +18,7 @@ from tests.cli.conftest import run_entry, said
 def test_every_format_has_the_gaussians_of_the_run(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", "a.glb", "--select", "selection")
     assert run_entry(monkeypatch, export.entrypoint, *given, "--exporters", "spz", "spz4", "compressed_ply") == 0
-    assert said(capsys).count("holds rounded numbers") == 3
+    assert said(capsys).count("contains rounded numbers") == 3
     run = open_run(lifted)
     answer = run.ask_stored()
     scene, trained = run.scene, run.scene.parameters

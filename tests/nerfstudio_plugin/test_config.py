@@ -50,7 +50,7 @@ def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
         assert re.search(problem, refusal(tmp_path, text))
     with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
         read_trainer_config(tmp_path / "nowhere.yml")
-    with pytest.raises(FileNotFoundError, match=f"{stock.config} exists"):
+    with pytest.raises(FileNotFoundError, match=f"{stock.config}; give"):
         read_trainer_config(stock.config.parent)
 
 
@@ -96,7 +96,7 @@ def test_beside_an_absolute_output_directory_relative_data_is_found(copied: Path
 
 def test_a_moved_dataset_is_named_or_given(copied: Path, tmp_path: Path) -> None:
     (tmp_path / "moved" / "scene").rename(tmp_path / "elsewhere")
-    with pytest.raises(FileNotFoundError, match=f"{tmp_path}/moved/scene nor at .*'scene'.*--data"):
+    with pytest.raises(FileNotFoundError, match=f"{tmp_path}/moved/scene or .*'scene'.*--data"):
         opened(copied)
     with pytest.raises(FileNotFoundError, match=r"/nowhere, given with --data"):
         opened(copied, data=tmp_path / "nowhere")

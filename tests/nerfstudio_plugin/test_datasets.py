@@ -64,7 +64,7 @@ def test_missing_small_images_are_refused_without_a_question(moved: Path, tmp_pa
     factors = {"as given": text.replace("downscale_factor: null", "downscale_factor: 2"), "as guessed": text}
     for content in factors.values():
         moved.write_text(content)
-        with pytest.raises(FileNotFoundError, match=r"touch x.*_2 .* 1/2 "):
+        with pytest.raises(FileNotFoundError, match=r"touch x.*_2.* 1/2 "):
             opened(moved)
         assert sorted(scene.rglob("*")) == before
     (scene / f"{name}_2").mkdir()
@@ -136,7 +136,7 @@ def test_changes_after_the_training_are_noticed(copied: Path) -> None:
     one_moved = [*frames[:3], {**frames[3], "transform_matrix": place}, *frames[4:]]
     for changed in (frames[:8], frames[1:], one_moved):
         path.write_text(json.dumps({**whole, "frames": changed}))
-        with pytest.raises(InputError, match=rf"trained with.* scale \S+, .* {scale:.6g}, .*{trained.name}"):
+        with pytest.raises(InputError, match=rf"changed.* scale \S+, .*{trained.name} has {scale:.6g}"):
             opened(copied)
     path.write_text(json.dumps({**whole, "frames": frames[::-1]}))
     run = opened(copied)
@@ -176,8 +176,8 @@ def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
         (lambda file: file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 36\n"), "cannot be read"),
         (lambda file: file.write_bytes(b""), "cannot be read as an image"),
         (lambda file: Image.new("RGB", (20, 10)).save(file), "is 20 x 10 pixels"),
-        (os.mkfifo, "is not a regular file"),
-        (lambda file: file.mkdir(), "is not a regular file"),
+        (os.mkfifo, "regular file"),
+        (lambda file: file.mkdir(), "regular file"),
     ):
         file.unlink()
         make(file)
@@ -208,7 +208,7 @@ def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
     copied.write_text(text)
     for name in ("means", "scales"):
         torch.save({"step": 2, "pipeline": {**whole["pipeline"], f"_model.gauss_params.{name}": nothing}}, path)
-        with pytest.raises(InputError, match=r"none of its 60 Gaussians"):
+        with pytest.raises(InputError, match="all 60 Gaussians"):
             opened(copied)
 
 
@@ -264,7 +264,7 @@ def test_datasets_of_another_machine(copied: Path, start: str) -> None:
             opened(copied, **how)
         assert ("--data" in str(caught.value)) == (how == {})  # not what was done already
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"transforms\.json is missing.* as it was in the training"):
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json is missing.* as it was during the training"):
         opened(copied, data=folder)
     whole["frames"][0]["file_path"] = whole["frames"][1]["file_path"].replace("images", "right")
     path.write_text(json.dumps(whole))
@@ -277,7 +277,7 @@ def test_datasets_of_another_machine(copied: Path, start: str) -> None:
 def test_settings_of_other_versions(copied: Path) -> None:
     text = copied.read_text()
     for old, new, said in (
-        ("cache_images: gpu", "cache_images: disk", "cache_images is 'disk', .*changes nothing"),
+        ("cache_images: gpu", "cache_images: disk", "cache_images is 'disk', .*ignored"),
         ("profiler: basic", "profiler: full", "profiler is 'full'"),
         ("masks_on_gpu: false", "masks_on_gpu: false\n\\1prefetch_factor: 4", r"Config\.prefetch_factor"),
         ("sh_degree: 3", "sh_degree: 3\n\\1strategy: mcmc\n\\1max_gs_num: 9", r"Config\.strategy, .*max_gs_num"),
@@ -323,5 +323,5 @@ def test_smaller_copies_of_images_of_one_name_are_refused(copied: Path) -> None:
         whole["frames"][i]["file_path"] = f"{side}/000.jpg"
     path.write_text(json.dumps(whole))
     copied.write_text(config.replace("downscale_factor: null", "downscale_factor: 2"))
-    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg would share the file .*images_2/000\.jpg"):
+    with pytest.raises(InputError, match=r"left/000\.jpg and right/000\.jpg .*share the file .*images_2/000\.jpg"):
         opened(copied)

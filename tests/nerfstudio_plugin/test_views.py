@@ -81,7 +81,7 @@ def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> N
         _ = opened(run.config).train[0]
     for radius in (None, 15, 1e9, 0.0):
         arias(tmp_path / "scene", fisheye_crop_radius=radius)
-        with pytest.raises(InputError, match=rf"fisheye_crop_radius is {radius}.* {WIDTH + HEIGHT}"):
+        with pytest.raises(InputError, match=rf"fisheye_crop_radius is {radius}.*0\.5\.\.{WIDTH + HEIGHT}"):
             _ = opened(run.config).train.cameras
 
 

@@ -107,7 +107,7 @@ def test_an_existing_directory_is_replaced_only_if_told(copied: Path, field: Sem
     assert {path: path.read_text() for path in mine} == mine and os.listdir(run_dir.parent) == ["now"]
     assert sorted(os.listdir(run_dir / "nerfstudio_models")) == ["a.ckpt", CHECKPOINT]
     lifted = opened(run_dir / "config.yml")
-    with pytest.raises(InputError, match="cannot replace it"):
+    with pytest.raises(InputError, match="contains the run to lift"):
         write(lifted, field, timestamp="now", overwrite=True)
     (run_dir / "added_photographs.json").write_text("mine")  # a name of ours that the manifest does not list
     assert write(source, field, timestamp="now", overwrite=True) == run_dir
@@ -141,7 +141,7 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field:
     torch.save({"step": 2, "pipeline": fewer}, path)
     with pytest.raises(ValueError, match=rf"normlift has 60 Gaussians, but {path} has 59"):
         field_of(opened(run_dir / "config.yml"))
-    with pytest.raises(FileNotFoundError, match=r"without semantics \(no normlift/"):
+    with pytest.raises(FileNotFoundError, match=r"without semantics.* normlift/"):
         field_of(opened(stock.config))
 
 

@@ -1,1 +1,1 @@
-"""nerfstudio's splatfacto runs, read and written without importing nerfstudio."""
+"""Readers and writers for nerfstudio's splatfacto runs, mostly without an import of nerfstudio."""

@@ -1,4 +1,4 @@
-"""Safe reading of a nerfstudio run's config.yml: its YAML, allowed classes, checks of values, and the run's files."""
+"""Safe reader for the config.yml of a nerfstudio run: YAML, allowed classes, value checks, and paths of the run."""
 
 from __future__ import annotations
 
@@ -29,43 +29,43 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.guard import read_text
 from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 
-# The YAML of a config.yml, and the current paths of its run's files; reading them constructs no objects.
+# The YAML of a config.yml, and the current paths of the files of its run. This part constructs no objects.
 
 
 OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _MAX_BYTES = 2**18
-"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
-_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+"""Maximum size of a config.yml in bytes. Those of nerfstudio have about 6,000."""
+_EXPECTED = "With --load-config, give the config.yml that ns-train splatfacto wrote."
 
 
 def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
-    """Raise FileNotFoundError unless the path is that of a file.
+    """Raise FileNotFoundError unless a config.yml exists and is a file.
 
     Args:
-        path: path of a config.yml.
-        wrote: command that wrote it, for the message.
+        path: Path of a config.yml.
+        wrote: Command that writes such files, for the error message.
     """
     if not path.is_file():
-        hint = f"; {path / 'config.yml'} exists, give that path" if (path / "config.yml").is_file() else ""
+        hint = f", but at {path / 'config.yml'}; give that path" if (path / "config.yml").is_file() else ""
         method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
-            f"No config at {path}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"There is no config at {path}{hint}. Expected the config.yml that {wrote} wrote, for example "
             f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
         )
 
 
 def compose_config(path: Path) -> yaml.MappingNode:
-    """Return the YAML of a nerfstudio config, which names a method.
+    """Return the YAML tree of a nerfstudio config.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        OSError, ValueError: if the file cannot be read, or is not a nerfstudio config.
+        FileNotFoundError: The file does not exist.
+        OSError, ValueError: The file cannot be read, or is not a nerfstudio config with a method name.
     """
     check_config_exists(path)
     size = path.stat().st_size
     if size > _MAX_BYTES:
         raise InputError(
-            f"{path} is not a nerfstudio config: it has {size:,} bytes, more than {_MAX_BYTES:,}. {_EXPECTED}"
+            f"{path} is not a nerfstudio config: it has {size:,} bytes, expected at most {_MAX_BYTES:,}. {_EXPECTED}"
         )
     try:
         root = yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -82,7 +82,7 @@ def compose_config(path: Path) -> yaml.MappingNode:
 
 
 def describe_yaml_error(error: Exception) -> str:
-    """Summarize a YAML error in one line: problem and line number."""
+    """Return the problem and the line number of a YAML error as one line."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, yaml.MarkedYAMLError):
@@ -92,7 +92,7 @@ def describe_yaml_error(error: Exception) -> str:
 
 
 def config_string(node: yaml.Node | None, *keys: str) -> str | None:
-    """Return the text at a path of keys in nested mappings; None if there is none."""
+    """Return the scalar at a path of keys in nested mappings as text, or None if it does not exist."""
     value = _value(node, *keys)
     return value.value if isinstance(value, yaml.ScalarNode) else None
 
@@ -105,7 +105,7 @@ def _value(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
 
 
 def _stored_path(node: yaml.Node | None, *keys: str) -> Path | None:
-    """Return a path that nerfstudio wrote as a list of its parts."""
+    """Return a path that nerfstudio stored as a list of its parts, or None if it does not exist."""
     value = _value(node, *keys)
     if not isinstance(value, yaml.SequenceNode) or not value.tag.endswith("Path"):
         return None
@@ -115,7 +115,7 @@ def _stored_path(node: yaml.Node | None, *keys: str) -> Path | None:
 
 @dataclass(frozen=True)
 class ConfigPaths:
-    """Names and paths of a trained or lifted run; None if the config does not store them as nerfstudio does."""
+    """Names and paths in the config of a trained or lifted run; None for missing or invalid ones."""
 
     experiment: str | None
     output_dir: Path | None
@@ -125,10 +125,10 @@ class ConfigPaths:
 
 
 def read_config_paths(path: Path) -> ConfigPaths:
-    """Read names and paths from a config.yml, in the time that its YAML takes.
+    """Read names and paths from the YAML of a config.yml, without the construction of the config.
 
     Raises:
-        FileNotFoundError, OSError, ValueError: as in `compose_config`.
+        FileNotFoundError, OSError, ValueError: The errors of `compose_config`.
     """
     root = compose_config(path)
     names = [config_string(root, key) for key in ("experiment_name", "method_name", "timestamp")]
@@ -143,19 +143,21 @@ def read_config_paths(path: Path) -> ConfigPaths:
 
 @dataclass(frozen=True)
 class RunLocation:
-    """Current absolute paths of a run's files."""
+    """Current absolute paths of the files of a run."""
 
     run_dir: Path
     """Folder of config.yml."""
     output_dir: Path
-    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
+    """Folder that contains experiment/method/timestamp (default: outputs/)."""
     root: Path | None
-    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
-    because output_dir is absolute or the run was moved."""
+    """Working directory of the training, which stock ns-* commands need.
+
+    None if it is unknown, because output_dir is absolute or the run was moved.
+    """
     data: Path
-    """The dataset: a folder or a .json file."""
+    """Path of the dataset, a folder or a .json file."""
     data_moved: bool
-    """True if `data` differs from the path in the config, read relative to `root`."""
+    """True if `data` differs from the path in the config relative to `root`."""
 
     @property
     def folder(self) -> Path:
@@ -163,22 +165,22 @@ class RunLocation:
         return self.data.parent if self.data.suffix == ".json" else self.data
 
     def relative_to_root(self, path: Path) -> Path:
-        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
+        """Return a path relative to `root`, as stored in configs; unchanged if it is outside of `root`."""
         return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
 
 
 def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
-    """Locate the files of a run from the path of its config.yml, whatever the current directory.
+    """Locate the files of a run from the path of its config.yml, independent of the current directory.
 
-    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
-    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
+    Paths in a config.yml are relative to the working directory of the training, which it does not contain. The function
+    infers this directory, because config.yml is in output_dir/experiment/method/timestamp.
 
     Args:
-        config: contents of config.yml.
-        config_path: path of config.yml.
-        data: current path of the dataset, relative to the current directory; None: the path in the config.
+        config: Contents of config.yml.
+        config_path: Path of config.yml.
+        data: Current path of the dataset, relative to the current directory; None for the path in the config.
     Raises:
-        FileNotFoundError: if there is no dataset; the message names every path tried.
+        FileNotFoundError: The dataset does not exist. The message gives all paths that were tried.
     """
     run_dir = _absolute(config_path).parent
     names = (str(config.experiment_name), str(config.method_name), config.timestamp)
@@ -186,8 +188,8 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
     if data is not None:
         if not data.exists():
             raise FileNotFoundError(
-                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
-                "transforms.json that the run was trained with."
+                f"There is no dataset at {_absolute(data)}, given with --data. Give the folder or the transforms.json "
+                "that the run was trained with."
             )
         return RunLocation(run_dir, output_dir, root, _absolute(data), data_moved=True)
     stored = dataset_in_config(config)
@@ -197,41 +199,41 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
             moved = root is None or path != _absolute(root / stored)
             return RunLocation(run_dir, output_dir, root, path, data_moved=moved)
     raise FileNotFoundError(
-        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
-        "If it was moved, give its path with --data."
+        f"The dataset of {config_path} is not at {' or '.join(map(str, tried))}; the config has {str(stored)!r}. "
+        "If it was moved, give its new path with --data."
     )
 
 
 def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tuple[Path, Path | None]:
-    """Return the folder above experiment/method/timestamp, and the working directory of the training if it is known.
+    """Return the folder that contains experiment/method/timestamp, and the working directory of the training or None.
 
     Args:
-        run_dir: folder of config.yml.
-        names: experiment, method and timestamp.
-        output_dir: the folder in the config, which is relative to the working directory.
+        run_dir: Folder of config.yml.
+        names: Experiment, method and timestamp.
+        output_dir: Folder in the config, relative to the working directory.
     """
     inferred = _strip_tail(run_dir, Path(*filter(None, names))) if all(names) else None
     if inferred is not None:
         return inferred, _strip_tail(inferred, Path(os.path.normpath(output_dir)))
-    # a moved run: inside the current directory, whatever its config names
+    # for a moved run, a folder inside the current directory, also if the config has a folder outside of it
     is_elsewhere = output_dir.is_absolute() or ".." in output_dir.parts
     return _absolute(Path("outputs") if is_elsewhere else output_dir), None
 
 
 def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> list[Path]:
-    """Return the possible paths of a dataset: in the working directory of the training, and in the current one."""
+    """Return the possible paths of a dataset, relative to the working directory of the training or the current one."""
     roots = output_dir.parents if root is None else (root,)
     return list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
 
 
 def _strip_tail(path: Path, tail: Path) -> Path | None:
-    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
+    """Return `path` without the relative path `tail` at its end, or None if it has another end."""
     count = len(path.parts) - len(tail.parts)
     return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
 
 
 def dataset_in_config(config: Any) -> Path:
-    """Return the path of the dataset in the config."""
+    """Return the path of the dataset as stored in a config."""
     datamanager = config.pipeline.datamanager
     return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
 
@@ -240,7 +242,7 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-# Construction of the objects in a config.yml, from allowed classes only, and writing them.
+# Construction of the objects in a config.yml from allowed classes only, and a writer for such files.
 
 
 _NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"
@@ -252,49 +254,51 @@ CONFIG_TARGETS: dict[str, str | None] = {
     else CLASS_TARGETS.get(cls)
     for name, cls in CONFIG_CLASSES.items()
 }
-"""Names of the configuration classes, and of the classes that they instantiate."""
+"""Names of the classes that configuration classes instantiate, by the name of the configuration class."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
 _TARGET = "_target"
-"""Field with the class or function that a configuration class instantiates. It follows from the class, so it is checked
-when a config is read, and added when one is written."""
+"""Field of a config.yml with the class or function that a configuration class instantiates.
+
+The mirror classes do not have it. The loader checks its value, and the dumper adds it.
+"""
 _PATHS = {f"pathlib.{name}" for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath", "Path")}
 
 
 @dataclass(frozen=True)
 class _Name:
-    """Name of a class or function in a config, which is neither imported nor called."""
+    """Name of a class or function in a config, which the loader neither imports nor calls."""
 
     name: str
 
 
 class ConfigLoader(yaml.SafeLoader):
-    """YAML loader that constructs the parts of splatfacto's configs and rejects everything else.
+    """YAML loader that constructs the parts of splatfacto's configs and rejects all other objects.
 
-    nerfstudio reads config.yml with `yaml.Loader`, which imports any module and calls any function that the file names.
-    This loader imports nothing and calls only the constructors of paths and of one enum; objects are instances of the
-    mirrors of nerfstudio's classes. `unknown` collects the fields that these do not have, with their values.
+    nerfstudio uses `yaml.Loader`, which can import any module and call any function in the file. This loader imports
+    no modules, and calls only the constructors of paths and one enum. Objects become instances of the mirror classes.
+    `unknown` collects the fields, with their values, that the mirror classes do not have.
     """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self.unknown: list[tuple[str, str, Any]] = []
-        """Class, field and value."""
+        """Name of the class, name and value of each unknown field."""
 
     def pass_over(self, cls: type, known: dict[str, Any], values: dict[str, Any]) -> None:
-        """Record the values whose fields a class does not know."""
+        """Append the values of fields that a class does not have to `unknown`."""
         self.unknown += [(cls.__name__, name, value) for name, value in values.items() if name not in known]
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Reject merge keys (`<<`). Configs do not use them, and a few nested ones would fill the memory."""
+        """Reject merge keys (`<<`), which configs do not use. A few nested ones could fill the memory."""
         for key, _ in node.value:
             if key.tag == "tag:yaml.org,2002:merge":
-                raise _error("<< is not part of a configuration", key)
+                raise _error("<< is not allowed in a configuration", key)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping, and reject duplicate keys."""
         mapping = super().construct_mapping(node, deep)
         if len(mapping) < len(node.value):
-            raise _error("a key is listed twice", node)
+            raise _error("a key occurs twice", node)
         return mapping
 
 
@@ -317,7 +321,7 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
         stored_name = stored.name.rpartition(".")[2] if isinstance(stored, _Name) else type(stored).__name__
         raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
     if hasattr(config, "__setstate__"):
-        config.__setstate__(values)  # translates the field names of version 0.1
+        config.__setstate__(values)  # renames the fields of version 0.1
         values = dict(vars(config))
     loader.pass_over(cls, known, values)
     vars(config).clear()
@@ -325,7 +329,7 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
         if key in values:
             vars(config)[key] = values[key]
         elif field.default is not MISSING:
-            vars(config)[key] = field.default  # a field that the writer's version did not have
+            vars(config)[key] = field.default  # the version that wrote the file does not have this field
         else:
             raise _error(f"{name} has no {key}", node)
 
@@ -336,7 +340,7 @@ def _construct_call(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     parts = loader.construct_sequence(node, deep=True)
     if not all(isinstance(part, str) for part in parts):
         raise _error(f"the arguments of {name} are not text", node)
-    return Path(*parts) if name in _PATHS else EventName(*parts)  # paths of another operating system work too
+    return Path(*parts) if name in _PATHS else EventName(*parts)  # also for paths of another operating system
 
 
 def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
@@ -356,7 +360,7 @@ ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)
 
 
 class _ConfigDumper(yaml.Dumper):
-    """YAML dumper that writes the mirrors as nerfstudio writes its own classes."""
+    """YAML dumper that writes mirror classes under the names of nerfstudio's classes."""
 
 
 def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
@@ -368,14 +372,14 @@ def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
 
 
 _NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
-"""One object per name, which a dump references like a single class."""
+"""One object per name, so that a dump repeats it by reference, like a class."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent)
 _ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
 
 
 def dump_config(config: Any) -> str:
-    """Return the text of a config.yml, as nerfstudio writes it."""
+    """Return a config as the text of a config.yml in nerfstudio's format."""
     return yaml.dump(config, Dumper=_ConfigDumper)
 
 
@@ -397,27 +401,27 @@ _RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "pipeline.datamanager.dataparser.train_split_fraction": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
     "pipeline.datamanager.dataparser.eval_interval": (lambda x: x >= 1, "at least 1"),
 }
-"""Ranges of the numbers that a lift depends on, each with its description; not every data parser has all of them."""
+"""Checks and descriptions of the ranges of numbers that affect a lift. Some data parsers lack some numbers."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote."
 _TRAINING_ONLY = re.compile(
     r"(machine|logging|viewer)\..*|pipeline\.datamanager\.(cache_images|cache_images_type|train_cameras_sampling_strategy)"
 )
-"""Fields that change neither what is drawn nor which images are lifted."""
+"""Names of fields that affect neither rendering nor the choice of the lifted images."""
 _DRAWN = re.compile(
     r"2d|3dgut|unscented|kernel|filter|near_plane|far_plane|radius_clip|eps2d|camera_model|raster|render|modifier|"
     r"activation|antialias|appearance|embed|deform|motion|exposure|blur|distort"
 )
-"""Words in the names of fields that change what is drawn, or where cameras are."""
+"""Words in the names of fields that affect rendering or camera poses."""
 _CLASSES_OF_DRAWN = ("SplatfactoModelConfig", "NormLiftModelConfig", "CameraOptimizerConfig")
 _NOTHING = (None, False, 0, "", "off", "none", "default")
 
 
 def export_advice(path: Path) -> str:
-    """Return the commands that lift the Gaussians of a run whose config or dataset is not read.
+    """Return advice with commands that lift the Gaussians of a run with an unsupported config or dataset.
 
     Args:
-        path: config.yml of the run.
+        path: Path of the config.yml of the run.
     """
     return (
         f"Export its Gaussians with: ns-export gaussian-splat --load-config {path} --output-dir exports, and lift them "
@@ -427,17 +431,17 @@ def export_advice(path: Path) -> str:
 
 
 def check_config_values(config: Any, path: Path, say: Callable[[str], None] = lambda text: None) -> None:
-    """Raise if a config holds values with which stock splatfacto cannot have been trained.
+    """Raise if a config contains values that stock splatfacto does not accept.
 
-    Unknown choices of newer versions that change nothing are replaced by the default.
+    The function replaces unknown choices of newer versions by the default if they do not affect a lift.
 
     Args:
-        config: the config.
-        path: its file.
-        say: function that is called with a sentence for each choice that was replaced.
+        config: Config to check.
+        path: Path of its file, for error messages.
+        say: Function that is called with a sentence for each replaced choice.
     Raises:
-        ValueError: if a value does not match its type, a number is out of range, a folder name is invalid, or a
-            component is not splatfacto's.
+        ValueError: A value does not match its type, a number is out of range, or a folder name or a component is not
+            supported.
     """
     if type(config) is not TrainerConfig:
         raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")
@@ -449,7 +453,7 @@ def check_config_values(config: Any, path: Path, say: Callable[[str], None] = la
             part, _, field = name.rpartition(".")
             owner: Any = attrgetter(part)(config)
             setattr(owner, field, next(item.default for item in fields(owner) if item.name == field))
-            say(f"{path}: {name} is {_format(value)}, which changes nothing in a lift and is passed over.")
+            say(f"{path}: {name} is {_format(value)}, which is ignored, because it does not affect a lift.")
             continue
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     pipeline: Any = config.pipeline
@@ -458,10 +462,10 @@ def check_config_values(config: Any, path: Path, say: Callable[[str], None] = la
 
 
 def check_components(config: Any, path: Path) -> None:
-    """Raise if the pipeline, data manager, data parser or model is not one of the supported classes.
+    """Raise if the pipeline, data manager, data parser or model of a config is not supported.
 
     Raises:
-        ValueError: if one of them is an instance of another class; the message names both classes.
+        ValueError: One of them is an instance of another class. The message gives its class and the expected classes.
     """
     for name, classes in _PARTS.items():
         cls = type(attrgetter(name)(config))
@@ -469,23 +473,23 @@ def check_components(config: Any, path: Path) -> None:
         if cls.__name__ not in classes or full_name not in CONFIG_TARGETS:
             raise InputError(
                 f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
-                f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
-                f"If its Gaussians are standard ones: {export_advice(path)}"
+                f"{' or '.join(classes)}. Only stock splatfacto runs can be lifted. "
+                f"If the run has standard Gaussians: {export_advice(path)}"
             )
 
 
 def _format(value: Any) -> str:
-    """Format any value briefly."""
+    """Return a short description of a value for error messages."""
     if isinstance(value, str | bool | int | float | Path):
         return short_repr(str(value) if isinstance(value, Path) else value)
     return "null" if value is None else f"a {type(value).__name__}"
 
 
 def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
-    """Yield values that violate their type hints: field name, value, and what was expected."""
+    """Yield the field name, value and expected type of each value that does not match its type hint."""
     parts, origin = get_args(hint), get_origin(hint)
     if depth > _MAX_DEPTH:
-        yield name, value, "no more than a few levels"
+        yield name, value, "less deeply nested values"
     elif hint is Any:
         yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
     elif origin in (Union, types.UnionType):
@@ -508,7 +512,7 @@ def _union_errors(value: Any, parts: tuple[Any, ...], name: str, depth: int) -> 
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value matches a type hint, apart from the items in it."""
+    """Return True if a value matches a type hint; the items of containers are not checked."""
     parts, origin = get_args(hint), get_origin(hint)
     if origin is tuple:
         return isinstance(value, tuple | list) and (parts[-1] is Ellipsis or len(value) == len(parts))
@@ -518,7 +522,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _items(value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the items of a value, each with its part of the name and its type hint."""
+    """Yield the suffix of the name, the value and the type hint of each item in a value."""
     parts, origin = get_args(hint), get_origin(hint)
     if origin is tuple:
         hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
@@ -528,7 +532,7 @@ def _items(value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
     elif is_dataclass(hint):
         hints = get_type_hints(type(value))
         for name in (field.name for field in fields(value)):
-            if name != "vis":  # only matters for training; programs set it to values that the flag does not accept
+            if name != "vis":  # affects only training, and programs set it to values that ns-train does not accept
                 yield f".{name}", getattr(value, name), hints[name]
 
 
@@ -539,11 +543,11 @@ _SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
     type(None): (lambda x: x is None, "null"),
 }
-"""Checks of values by their type hint, each with a description of valid values."""
+"""Check of values and description of valid values, by type hint."""
 
 
 def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
-    """Check an entry of `optimizers`, for which nerfstudio has no type hints."""
+    """Yield the errors in an entry of `optimizers`, for which nerfstudio has no type hints."""
     if not isinstance(value, dict) or set(value) != {"optimizer", "scheduler"}:
         yield name, value, "an optimizer and a scheduler"
         return
@@ -558,7 +562,7 @@ def _describe(hint: Any) -> str:
 
 
 def _name_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
-    """Yield names and paths that would lead out of the run's folders."""
+    """Yield invalid folder names, and paths outside of the folder of the run."""
     for name in ("experiment_name", "method_name", "timestamp"):
         value = getattr(config, name)
         if (
@@ -567,7 +571,7 @@ def _name_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
             or {"/", "\\", "\0", "\n"} & set(value)
             or len(value) > 255
         ):
-            yield name, value, "the name of one folder"
+            yield name, value, "the name of a single folder"
     for name in ("viewer.relative_log_filename", "logging.relative_log_dir", "relative_model_dir"):
         value = Path(attrgetter(name)(config))
         if value.is_absolute() or ".." in value.parts:
@@ -575,7 +579,7 @@ def _name_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
 
 
 def _range_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
-    """Yield numbers that a lift depends on and that are out of range."""
+    """Yield the numbers of `_RANGES` that are out of range."""
     for name, (in_range, expected) in _RANGES.items():
         part, _, field = name.rpartition(".")
         values = vars(attrgetter(part)(config))
@@ -584,10 +588,13 @@ def _range_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
 
 
 def check_lift_options(options: LiftOptions, name: str) -> None:
-    """Run the constructors' checks, which neither a config.yml nor `ns-train --load-config` triggers.
+    """Check the ranges of lift options. Reading them from a config.yml does not check them.
 
+    Args:
+        options: Options to check.
+        name: Path or name of the options, for error messages.
     Raises:
-        ValueError: if an option is out of range.
+        ValueError: An option is out of range.
     """
     try:
         RefineConfig(**vars(options.vote))
@@ -597,7 +604,7 @@ def check_lift_options(options: LiftOptions, name: str) -> None:
 
 
 SUPPORTED_METHODS = (
-    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one comes from nerfstudio's main branch
+    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # splatfacto-mcmc is in nerfstudio's main branch
     *("normlift", "normlift-lerf-ovs", "normlift-scannet"),
 )
 
@@ -606,45 +613,45 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
     """Read the config.yml of a splatfacto or normlift run, with its paths unchanged.
 
     Args:
-        path: the file.
-        say: function that is called with a sentence for each setting that is passed over.
+        path: Path of the config.yml.
+        say: Function that is called with a sentence about ignored settings.
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
-            other than nerfstudio's configuration classes, or invalid values.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not a nerfstudio config, or it has an unsupported method, data parser or class, or
+            invalid values.
     """
     root = compose_config(path)
     method = config_string(root, "method_name")
     if method not in SUPPORTED_METHODS:
         raise InputError(
-            f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
-            "Train the capture with: ns-train splatfacto --data ...; or, if the run's Gaussians are standard ones: "
+            f"{path} has the method {method!r}, expected one of {', '.join(SUPPORTED_METHODS)}. "
+            "Train the capture with: ns-train splatfacto --data DATASET. If the run has standard Gaussians instead: "
             f"{export_advice(path)}"
         )
     loader = ConfigLoader("")
     try:
         config = loader.construct_document(root)
-    except Exception as error:  # PyYAML converts values to dates, numbers and sets without catching their errors
+    except Exception as error:  # PyYAML does not catch errors of dates, numbers and sets
         raise InputError(
-            f"{path} cannot be read: {describe_yaml_error(error)}. Only the configuration classes of splatfacto and "
-            "normlift_ns are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
-            f"blender-data. {export_advice(path)}"
+            f"{path} cannot be read: {describe_yaml_error(error)}. Expected only configuration classes of splatfacto "
+            "and normlift_ns, nerfstudio's optimizers, and the data parsers nerfstudio-data, colmap and blender-data. "
+            f"{export_advice(path)}"
         ) from error
     for cls, name, value in loader.unknown:
         if cls in _CLASSES_OF_DRAWN and _DRAWN.search(name) and value not in _NOTHING:
             raise InputError(
-                f"{path}: {cls} has the setting {name}: {_format(value)}, which changes what is drawn and is not known "
-                f"here. If its Gaussians are standard ones: {export_advice(path)}"
+                f"{path}: {cls} has the unknown setting {name}: {_format(value)}, which may affect rendering. "
+                f"If the run has standard Gaussians: {export_advice(path)}"
             )
     if len(loader.unknown) > 0:
         names = ", ".join(f"{cls}.{name}" for cls, name, _ in loader.unknown)
-        say(f"{path} has settings of another version of nerfstudio, which are passed over: {names[:1000]}.")
+        say(f"{path} has settings of another version of nerfstudio, which are ignored: {names[:1000]}.")
     check_config_values(config, path, say)
     return config
 
 
 def with_absolute_paths(config: Any, location: RunLocation) -> Any:
-    """Return a copy of the config with absolute paths, valid in any directory, and without seed points."""
+    """Return a copy of a config with absolute paths and without seed points, for use in any directory."""
     config = deepcopy(config)
     set_dataset(config, location.data)
     skip_seed_points(config)
@@ -655,13 +662,13 @@ def with_absolute_paths(config: Any, location: RunLocation) -> Any:
 
 
 def set_dataset(config: Any, data: Path) -> None:
-    """Change the dataset in the three fields in which nerfstudio stores it."""
+    """Set the path of the dataset in all three fields of a config that contain it."""
     datamanager = config.pipeline.datamanager
     config.data = datamanager.data = datamanager.dataparser.data = data
 
 
 def skip_seed_points(config: Any) -> None:
-    """Stop the dataparser from reading the initial point cloud, which a trained run does not need."""
+    """Change a config so that the data parser does not read the initial point cloud, which only trainings need."""
     dataparser = config.pipeline.datamanager.dataparser
     for name, value in (("load_3D_points", False), ("ply_path", None)):
         if hasattr(dataparser, name):

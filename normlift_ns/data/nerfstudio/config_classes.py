@@ -1,7 +1,7 @@
-"""Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
+"""Mirrors of the nerfstudio configuration classes in splatfacto's config.yml, with fields, types and defaults only.
 
-A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because each
-imports the class that it configures, its `_target`; the mirrors store only its name.
+The import of nerfstudio's own classes takes 13 s of CPU time, because each imports the class that it configures, its
+`_target`. The mirrors store only the name of this class.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ _Class = TypeVar("_Class", bound=type)
 _BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "normlift_ns.nerfstudio_plugin"
 _SCHEDULERS = "nerfstudio.engine.schedulers"
 CONFIG_CLASS_NAMES: dict[type, str] = {}
-"""Name of each class in a config.yml."""
+"""Name of each mirror class in a config.yml."""
 CLASS_TARGETS: dict[type, str] = {}
-"""Name of the class or function that each class configures, if it has a `_target`."""
+"""Name of the class or function that each mirror class configures, if it has a `_target`."""
 
 
 @dataclass_transform(field_specifiers=(field,))
 def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class]:
-    """Make a class a dataclass, and register it as the mirror of the one of the same name in a module.
+    """Return a decorator that makes a class a dataclass, and registers it as the mirror of the class of that name.
 
     Args:
-        module: module of the original.
-        target: its `_target`, in the same module unless the name has a module of its own.
+        module: Module of the mirrored class.
+        target: Name of its `_target`, in the same module unless it contains another module; None for no target.
     """
 
     def register(cls: _Class) -> _Class:
@@ -45,7 +45,7 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
 
 @dataclass
 class PosedDataParserConfig:
-    """Fields that the configs of nerfstudio's data parsers for posed images share."""
+    """Options that nerfstudio's data parsers for posed images share."""
 
     data: Path = Path()
     scale_factor: float = 1.0
@@ -62,7 +62,7 @@ class PosedDataParserConfig:
 
 @_mirror(f"{_DATA}.dataparsers.nerfstudio_dataparser", "Nerfstudio")
 class NerfstudioDataParserConfig(PosedDataParserConfig):
-    """Mirror of nerfstudio's NerfstudioDataParserConfig."""
+    """Options of nerfstudio-data, the data parser for transforms.json."""
 
     mask_color: tuple[float, float, float] | None = None
     load_3D_points: bool = False
@@ -70,7 +70,7 @@ class NerfstudioDataParserConfig(PosedDataParserConfig):
 
 @_mirror(f"{_DATA}.dataparsers.colmap_dataparser", "ColmapDataParser")
 class ColmapDataParserConfig(PosedDataParserConfig):
-    """Mirror of nerfstudio's ColmapDataParserConfig."""
+    """Options of colmap, the data parser for COLMAP projects."""
 
     downscale_rounding_mode: Literal["floor", "round", "ceil"] = "floor"
     assume_colmap_world_coordinate_convention: bool = True
@@ -85,7 +85,7 @@ class ColmapDataParserConfig(PosedDataParserConfig):
 
 @_mirror(f"{_DATA}.dataparsers.blender_dataparser", "Blender")
 class BlenderDataParserConfig:
-    """Mirror of nerfstudio's BlenderDataParserConfig."""
+    """Options of blender-data, the data parser for synthetic scenes made with Blender."""
 
     data: Path = Path("data/blender/lego")
     scale_factor: float = 1.0
@@ -94,12 +94,12 @@ class BlenderDataParserConfig:
 
 
 SupportedDataParserConfig = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
-"""Supported data parsers."""
+"""Options of the supported data parsers."""
 
 
 @_mirror(f"{_DATA}.datamanagers.full_images_datamanager", "FullImageDatamanager")
 class FullImageDatamanagerConfig:
-    """Mirror of nerfstudio's FullImageDatamanagerConfig."""
+    """Options of the data manager that splatfacto uses, which loads whole images."""
 
     data: Path | None = None
     masks_on_gpu: bool = False
@@ -119,7 +119,7 @@ class FullImageDatamanagerConfig:
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
 class OptimizerConfig:
-    """Mirror of nerfstudio's OptimizerConfig."""
+    """Options that nerfstudio's optimizers share."""
 
     lr: float = 0.0005
     eps: float = 1e-08
@@ -128,26 +128,26 @@ class OptimizerConfig:
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.adam.Adam")
 class AdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's AdamOptimizerConfig."""
+    """Options of the optimizer Adam."""
 
     weight_decay: float = 0
 
 
 @_mirror("nerfstudio.engine.optimizers", "torch.optim.radam.RAdam")
 class RAdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's RAdamOptimizerConfig."""
+    """Options of the optimizer RAdam."""
 
     weight_decay: float = 0
 
 
 @_mirror(_SCHEDULERS, "Scheduler")
 class SchedulerConfig:
-    """Mirror of nerfstudio's SchedulerConfig."""
+    """Base class of the options of learning rate schedulers."""
 
 
 @_mirror(_SCHEDULERS, "MultiStepScheduler")
 class MultiStepSchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's MultiStepSchedulerConfig."""
+    """Options of the scheduler that multiplies the learning rate by gamma at each milestone."""
 
     max_steps: int = 1000000
     gamma: float = 0.33
@@ -156,7 +156,7 @@ class MultiStepSchedulerConfig(SchedulerConfig):
 
 @_mirror(_SCHEDULERS, "ExponentialDecayScheduler")
 class ExponentialDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's ExponentialDecaySchedulerConfig."""
+    """Options of the scheduler with exponential decay of the learning rate."""
 
     lr_pre_warmup: float = 1e-8
     lr_final: float | None = None
@@ -167,7 +167,7 @@ class ExponentialDecaySchedulerConfig(SchedulerConfig):
 
 @_mirror(_SCHEDULERS, "CosineDecayScheduler")
 class CosineDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's CosineDecaySchedulerConfig."""
+    """Options of the scheduler with cosine decay of the learning rate."""
 
     warm_up_end: int = 5000
     learning_rate_alpha: float = 0.05
@@ -191,7 +191,7 @@ CONFIG_CLASS_NAMES[EventName] = "nerfstudio.utils.writer.EventName"
 
 @_mirror(_BASE)
 class MachineConfig:
-    """Mirror of nerfstudio's MachineConfig."""
+    """Random seed and devices of a training."""
 
     seed: int = 42
     num_devices: int = 1
@@ -203,7 +203,7 @@ class MachineConfig:
 
 @_mirror(_BASE, "nerfstudio.utils.writer.LocalWriter")
 class LocalWriterConfig:
-    """Mirror of nerfstudio's LocalWriterConfig."""
+    """Options of the statistics that nerfstudio prints during training."""
 
     enable: bool = False
     stats_to_track: tuple[EventName, ...] = (
@@ -219,7 +219,7 @@ class LocalWriterConfig:
 
 @_mirror(_BASE)
 class LoggingConfig:
-    """Mirror of nerfstudio's LoggingConfig."""
+    """Options of nerfstudio's logs and profiler."""
 
     relative_log_dir: Path = Path()
     steps_per_log: int = 10
@@ -230,7 +230,7 @@ class LoggingConfig:
 
 @_mirror(_BASE)
 class ViewerConfig:
-    """Mirror of nerfstudio's ViewerConfig."""
+    """Options of nerfstudio's viewer."""
 
     relative_log_filename: str = "viewer_log_filename.txt"
     websocket_port: int | None = None
@@ -248,7 +248,7 @@ class ViewerConfig:
 
 @_mirror("nerfstudio.cameras.camera_optimizers", "CameraOptimizer")
 class CameraOptimizerConfig:
-    """Mirror of nerfstudio's CameraOptimizerConfig."""
+    """Options of the camera optimizer, which adjusts camera poses during training."""
 
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
     trans_l2_penalty: float = 1e-2
@@ -259,7 +259,7 @@ class CameraOptimizerConfig:
 
 @_mirror("nerfstudio.models.splatfacto", "SplatfactoModel")
 class SplatfactoModelConfig:
-    """Mirror of nerfstudio's SplatfactoModelConfig."""
+    """Options of the splatfacto model."""
 
     enable_collider: bool = True
     collider_params: dict[str, float] | None = field(default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0})
@@ -300,14 +300,14 @@ class SplatfactoModelConfig:
 
 @_mirror(f"{_OURS}.model", "NormLiftModel")
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
+    """Options of the model of a lifted run: splatfacto with the path of the semantics."""
 
     semantics: Path | None = None
 
 
 @_mirror("nerfstudio.pipelines.base_pipeline", "VanillaPipeline")
 class VanillaPipelineConfig:
-    """Mirror of nerfstudio's VanillaPipelineConfig."""
+    """Options of the data manager and the model of a run."""
 
     datamanager: FullImageDatamanagerConfig = field(default_factory=FullImageDatamanagerConfig)
     model: SplatfactoModelConfig = field(default_factory=SplatfactoModelConfig)
@@ -315,7 +315,7 @@ class VanillaPipelineConfig:
 
 @_mirror(f"{_OURS}.pipeline", "NormLiftPipeline")
 class NormLiftPipelineConfig(VanillaPipelineConfig):
-    """Mirror of `normlift_ns.nerfstudio_plugin.pipeline.NormLiftPipelineConfig`."""
+    """Options of the pipeline of a lifted run, with the options of its lift."""
 
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
@@ -324,7 +324,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 @_mirror("nerfstudio.engine.trainer", "Trainer")
 class TrainerConfig:
-    """Mirror of nerfstudio's TrainerConfig."""
+    """Options of a training, the root object of a config.yml."""
 
     output_dir: Path = Path("outputs")
     method_name: str | None = None
@@ -375,7 +375,7 @@ CONFIG_CLASSES: dict[str, type] = {
     "normlift_ns.options.SourceOptions": SourceOptions,
     "normlift_ns.options.RefineConfig": RefineConfig,
 }
-"""Classes that a config.yml may contain, by name."""
+"""Classes that a config.yml may contain, by their names there."""
 
 
 NAMED_COLORS = {

@@ -1,6 +1,6 @@
-"""Datasets of trained runs: validation, and cameras, poses and splits as the data parsers of nerfstudio compute them.
+"""Validation of the datasets of trained runs, and cameras, poses and splits as in nerfstudio's data parsers.
 
-All steps are nerfstudio's own, in float32, so the cameras are bit-identical.
+All steps are the same as in nerfstudio, in float32, so the cameras are bit-exact.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
 def normalize_poses(
     rows: Any, parser: config_classes.PosedDataParserConfig, orientation: str
 ) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"], float]:
-    """Return poses in the scene's world, the transform to that world, and its scale.
+    """Return poses in the world of the scene, the transform to this world, and its scale.
 
     Args:
-        rows: 4 x 4 camera-to-world matrices in the dataset's world.
-        parser: config of the data parser.
-        orientation: nerfstudio's orientation method.
+        rows: 4 x 4 camera-to-world matrices in the world of the dataset.
+        parser: Config of the data parser.
+        orientation: Orientation method of nerfstudio.
     Raises:
-        ValueError: if poses are not 4 x 4 matrices, or nerfstudio does not have the orientation method.
+        ValueError: A pose is not a 4 x 4 matrix, or nerfstudio does not have the orientation method.
     """
     poses = torch.from_numpy(np.array(rows).astype(np.float32))
     if poses.shape[1:] != (4, 4):
@@ -59,7 +59,10 @@ def normalize_poses(
 def compose_applied_transform(
     transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
 ) -> Float[Tensor, "3 4"]:
-    """Return the transform from the capture's original world if its poses were transformed before they were stored."""
+    """Return a transform that starts from the original world of the capture.
+
+    `applied` was applied to the poses before they were stored; None if there was no such transform.
+    """
     if applied is None:
         return transform
     rows = torch.cat([torch.tensor(applied, dtype=transform.dtype), torch.tensor([[0.0, 0.0, 0.0, 1.0]])], 0)
@@ -72,9 +75,9 @@ def _orient_and_center(
     """Orient and center poses like nerfstudio's `auto_orient_and_center_poses`.
 
     Returns:
-        The poses in the scene's world before scaling, and the transform to that world.
+        The poses in the world of the scene before scaling, and the transform to this world.
     Raises:
-        ValueError: if nerfstudio does not have the orientation method.
+        ValueError: nerfstudio does not have the orientation method.
     """
     origins = poses[..., :3, 3]
     mean = torch.mean(origins, dim=0)
@@ -91,7 +94,7 @@ def _orient_and_center(
     elif method == "none":
         transform = torch.cat([torch.eye(3), -translation[:, None]], dim=-1)
     else:
-        raise InputError(f"unknown orientation method {method!r}")
+        raise InputError(f"the orientation method is {method!r}, expected pca, up, vertical or none")
     return transform @ poses, transform
 
 
@@ -105,7 +108,7 @@ def _orient_by_pca(
     transform = torch.cat([axes, axes @ -translation[..., None]], dim=-1)
     oriented = transform @ poses
     if oriented.mean(dim=0)[2, 1] < 0:
-        oriented[1:3, :] = -1 * oriented[1:3, :]  # flips the second and third pose, as nerfstudio does
+        oriented[1:3, :] = -1 * oriented[1:3, :]  # also flips the second and third pose in nerfstudio
         transform[1:3, :] = -1 * transform[1:3, :]
     return oriented, transform
 
@@ -124,7 +127,7 @@ def _up_direction(poses: Float[Tensor, "v 4 4"], *, vertical: bool) -> Float[Ten
 
 
 def _rotation_between(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
-    """Return the rotation from one direction to another."""
+    """Return the rotation matrix that maps direction `a` to direction `b`."""
     a = a / torch.linalg.norm(a)
     b = b / torch.linalg.norm(b)
     axis = torch.linalg.cross(a, b)
@@ -143,7 +146,7 @@ def _skew(axis: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
 
 
 def _focus_point(poses: Float[Tensor, "v 4 4"], focus: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Return the point closest to the optical axes of all cameras that have it in front of them."""
+    """Return the point that is closest to the optical axes of the cameras, without cameras that face away from it."""
     directions, origins = -poses[:, :3, 2:3], poses[:, :3, 3:4]
     active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
     converged = False
@@ -160,10 +163,10 @@ def _focus_point(poses: Float[Tensor, "v 4 4"], focus: Float[Tensor, " 3"]) -> F
 def apply_pose_adjustments(
     poses: Float[Tensor, "v 3 4"], moves: Float[Tensor, "v 6"], mode: str
 ) -> Float[Tensor, "v 3 4"]:
-    """Return the poses after the camera optimizer's adjustments, in mode SO3xR3 or SE3."""
+    """Apply the adjustments of nerfstudio's camera optimizer, in mode SO3xR3 or SE3, to camera-to-world poses."""
     exponential = _exp_so3xr3 if mode == "SO3xR3" else _exp_se3
     optimized = []
-    for pose, move in zip(poses[:, None], moves.float()[:, None]):  # one by one, as in nerfstudio, for equal rounding
+    for pose, move in zip(poses[:, None], moves.float()[:, None]):  # one by one, for the same rounding as nerfstudio
         change = exponential(move)
         rotation = torch.bmm(change[..., :3, :3], pose[..., :3, :3])
         optimized.append(torch.cat([rotation, pose[..., :3, 3:] + change[..., :3, 3:]], dim=-1))
@@ -216,24 +219,24 @@ _ROUNDING = {"floor": torch.floor, "ceil": torch.ceil, "round": lambda sides: to
 
 @dataclass(frozen=True)
 class DatasetSplit:
-    """One split of a dataset: V image files and their cameras, before undistortion."""
+    """Split of a dataset, with V image files and their cameras before undistortion."""
 
     files: list[Path]
     masks: list[Path] | None
     camera_type: str
-    """PERSPECTIVE, FISHEYE or another of nerfstudio's camera types."""
+    """Camera type of nerfstudio, such as PERSPECTIVE or FISHEYE."""
     poses: Float[Tensor, "v 3 4"]
     intrinsics: Float[Tensor, "v 4"]
-    """fx, fy, cx, cy."""
+    """Focal lengths fx, fy and principal point cx, cy, in pixels."""
     sizes: Int64[Tensor, "v 2"]
-    """Width, height."""
+    """Width and height in pixels."""
     distortion: Float[Tensor, "v k"] | None
 
     def __len__(self) -> int:
         return len(self.files)
 
     def select(self, indices: Int[np.ndarray, " m"]) -> DatasetSplit:
-        """Return the images and cameras at these indices."""
+        """Return a split with only the images and cameras at the given indices."""
         rows = torch.tensor(indices, dtype=torch.long)
         return replace(
             self,
@@ -246,7 +249,12 @@ class DatasetSplit:
         )
 
     def resized(self, factor: float, rounding: str = "floor") -> DatasetSplit:
-        """Return the split with cameras for resized images, like nerfstudio's `rescale_output_resolution`."""
+        """Return the split with cameras for resized images, like nerfstudio's `rescale_output_resolution`.
+
+        Args:
+            factor: Factor on the width and the height.
+            rounding: Rounding of the new sizes: floor, ceil or round.
+        """
         scale = torch.tensor([factor])
         sides = _ROUNDING[rounding](self.sizes * scale)
         return replace(self, intrinsics=self.intrinsics * scale, sizes=sides.to(torch.int64))
@@ -260,19 +268,20 @@ class ParsedDataset:
     held_out: DatasetSplit
     transform: Float[Tensor, "3 4"]
     scale: float
-    """Map from the poses in the capture to the scene's world: scale * (transform @ point)."""
+    """Scale of the map from the capture to the world of the scene: scale * (transform @ point)."""
 
 
 def split_files(
     files: Sequence[Path], lists: Mapping[str, Any], parser: config_classes.PosedDataParserConfig
 ) -> tuple[Any, Any]:
-    """Return the indices of the training and the evaluation images: by the dataset's lists, or else by eval_mode.
+    """Return the indices of the training images and of the evaluation images.
 
-    Evaluation images are those of the test list, else those that ns-train itself evaluates on: of the validation list.
+    The lists of the dataset take precedence over eval_mode. Evaluation images are in the test list, or else in the
+    validation list, which ns-train evaluates on.
 
     Raises:
-        ValueError: if there are lists, but not that of the training images, a listed file is missing, or eval_mode is
-            filename and a file name does not contain its split.
+        ValueError: There are lists, but no list of training images, or a listed file is missing. Or eval_mode is
+            filename, and a file name does not contain its split.
     """
     if any(names is not None for names in lists.values()):
         held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]
@@ -288,27 +297,27 @@ def split_files(
     if parser.eval_mode == "filename":
         for file in files:
             if "train" not in file.name and "eval" not in file.name:
-                raise InputError(f"eval_mode is filename, but {file.name} has neither train nor eval in its name")
+                raise InputError(f"eval_mode is filename, but the name {file.name} contains neither train nor eval")
         is_eval = np.array(["train" not in file.name for file in files], dtype=bool)
     return indices[~is_eval], indices[is_eval]
 
 
 def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarray, " m"]:
-    """Return the indices of the files in a list of the dataset."""
+    """Return the indices of the files in the list of a split; raise InputError if the list or a file is missing."""
     if names is None:
-        raise InputError(f"the dataset's list of filenames for split {split} is missing")
+        raise InputError(f"the list of files of split {split} is missing")
     listed = set(names)
     unknown = sorted(map(str, listed - set(files)))
     if unknown:
-        raise InputError(f"some filenames for split {split} were not found; the first is {unknown[0]}")
+        raise InputError(f"the list of split {split} contains files that do not exist; the first is {unknown[0]}")
     return np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32)
 
 
 MAX_AUTO_RESOLUTION = 1600
-_ADVICE = "Restore it, or give the path of the dataset with --data."
-_ADVICE_IF_GIVEN = "Restore the dataset as it was in the training."
+_ADVICE = "Restore the dataset, or give its path with --data."
+_ADVICE_IF_GIVEN = "Restore the dataset as it was during the training."
 _COLMAP_MODELS = (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-"""COLMAP's camera models that nerfstudio reads."""
+"""COLMAP's camera models that nerfstudio supports."""
 _FLIP = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
 _CAMERA_TYPES = {
     **dict.fromkeys(PERSPECTIVE_MODELS, "PERSPECTIVE"),
@@ -321,36 +330,36 @@ _CAMERA_TYPES = {
         )
     },
 }  # fmt: skip
-"""nerfstudio's camera types by the camera_model of a file."""
+"""Camera types of nerfstudio, by the camera_model in a transforms.json."""
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig, *, data_given: bool = False) -> ParsedDataset:
     """Read the dataset of a run.
 
-    If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts
-    all numbers in the files. Here, these are errors with advice instead.
+    This function raises an error if downscaled images are missing, whereas nerfstudio offers to create them. It also
+    checks the numbers in camera files, which nerfstudio does not check.
 
     Args:
-        datamanager: the config.
-        data_given: True if the path of the dataset was given with --data, which messages then do not advise.
+        datamanager: Config of the data manager.
+        data_given: True if the dataset was given with --data, so that messages do not advise this option.
     Raises:
-        FileNotFoundError: if a camera file, an image folder or an image whose size matters is missing.
-        ValueError: if a camera file is damaged or holds invalid numbers, or nerfstudio could not read the dataset.
+        FileNotFoundError: A camera file, an image folder or an image of unknown size is missing.
+        ValueError: A camera file is damaged or contains invalid numbers, or nerfstudio cannot read the dataset.
     """
     parser, advice = datamanager.dataparser, _ADVICE_IF_GIVEN if data_given else _ADVICE
     try:
         dataset = _PARSERS[type(parser)](parser)
         if len(dataset.train) == 0:
-            raise InputError("no image is left for the training")
+            raise InputError("the dataset has no training images")
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{error} {advice}") from error
-    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy on unusable numbers
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy for invalid numbers
         if isinstance(error, InputError) and str(parser.data) in str(error):
             raise InputError(f"{str(error).removesuffix('.')}. {advice}") from error
         raise InputError(
             f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
-            f"that the run was trained with. {advice}"
+            f"of the training. {advice}"
         ) from error
     scale = datamanager.camera_res_scale_factor
     return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))
@@ -363,21 +372,21 @@ def _entries(path: Path, data: Path) -> TransformsEntries:
 
 
 def _image_size(file: Path, data: Path) -> tuple[int, int]:
-    """Return the width and height of an image."""
+    """Return the width and height of an image in pixels."""
     if not file.exists():
         raise FileNotFoundError(f"{file} is missing from the dataset {data}.")
     return read_image_header(file).size
 
 
 def _check_files(files: Sequence[Path], path: Path) -> None:
-    """Raise if an existing path is not a regular file; reading a pipe would block forever."""
+    """Raise InputError if an existing path is not a regular file, because a pipe would block the reader forever."""
     invalid = next((file for file in files if file.exists() and not file.is_file()), None)
     if invalid is not None:
-        raise InputError(f"{path} lists {invalid}, which is not a regular file. Expected images.")
+        raise InputError(f"{path} lists {invalid}, which is not a regular file. Replace it with the image.")
 
 
 def _row(entries: TransformsEntries, frame: FrameEntry) -> list[float]:
-    """Return focal lengths, principal point, size and distortion of an image."""
+    """Return the focal lengths, principal point, size and distortion of an image as one row of numbers."""
     is_shared = any(getattr(entries, name) is not None for name in ("k1", "k2", "k3", "p1", "p2", "distortion_params"))
     source = entries if is_shared else frame
     distortion = source.distortion_params
@@ -391,19 +400,19 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classe
         incomplete = [frame.file_path for frame in meta.frames if meta.value(frame, name) is None]
         if incomplete:
             raise InputError(
-                f"{path} has no {name} for {incomplete[0]}. Expected focal lengths, principal point and size for every "
+                f"{path} has no {name} for {incomplete[0]}. Expected focal lengths, principal point and size of every "
                 "frame."
             )
     positions = {tuple(row[3] for row in frame.transform_matrix[:3]) for frame in meta.frames}
     if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
         raise InputError(
             f"{path}: all {len(meta.frames)} cameras have the same position, so nerfstudio cannot scale them. Expected "
-            "the cameras that the run was trained with."
+            "the cameras of the training."
         )
     _check_files([path.parent / frame.file_path for frame in meta.frames], path)
     count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
     if masked not in (0, count):
-        raise InputError(f"{path} lists masks for {masked} of {count} images; expected one for each, or none")
+        raise InputError(f"{path} lists masks for {masked} of {count} images, expected a mask for each, or no masks")
 
 
 def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedDataset:
@@ -441,7 +450,7 @@ def _transforms_factor(folder: Path, meta: TransformsEntries, parser: config_cla
 def _locate_all(
     frames: Sequence[FrameEntry], files: Sequence[Path], masks: Sequence[Path], path: Path, *, are_copies: bool
 ) -> tuple[list[Path], list[Path]]:
-    """Return the images and masks as `_locate` does; raise if two names lead to one image, or to one copy of a mask."""
+    """Apply `_locate` to all images and masks; raise InputError if two frames share an image or a copy of a mask."""
     found = [[_locate(file, path.parent) for file in group] for group in (files, masks)]
     remedy = f"in the folders that {path} lists"
     check_files_distinct(zip((frame.file_path for frame in frames), found[0]), "file", remedy)
@@ -451,12 +460,12 @@ def _locate_all(
 
 
 def _listed(folder: Path, name: str) -> Path:
-    """Return the path of a file in a folder by a name that may have been written on Windows."""
+    """Return the path of a file in a folder, given a relative name that may have the backslashes of Windows."""
     return folder / (name if (folder / name).exists() else plain_name(name))
 
 
 def _locate(file: Path, folder: Path) -> Path:
-    """Return a listed file, or the one in the folder if its path is that of another machine."""
+    """Return the path of a listed file, or its path in the folder if the listed path is from another machine."""
     if file.exists():
         return file
     name = relative_name(file, folder)
@@ -466,12 +475,12 @@ def _locate(file: Path, folder: Path) -> Path:
 def _camera_type(meta: TransformsEntries) -> str:
     model = "OPENCV" if meta.camera_model is None else meta.camera_model
     if model not in _CAMERA_TYPES:
-        raise InputError(f"unknown camera_model {model!r}")
+        raise InputError(f"the camera_model is {model!r}, expected a model of nerfstudio such as OPENCV")
     return _CAMERA_TYPES[model]
 
 
 def _lenses(rows: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "v 4"], Int64[Tensor, "v 2"], Float[Tensor, "v k"]]:
-    """Return the intrinsics, sizes and distortion of images, given all of them in one row per image."""
+    """Split rows of camera parameters, one per image, into tensors of intrinsics, sizes and distortion."""
     return (
         torch.tensor([row[:4] for row in rows], dtype=torch.float32),
         torch.tensor([[int(side) for side in row[4:6]] for row in rows], dtype=torch.int64),
@@ -482,7 +491,13 @@ def _lenses(rows: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "v 4"], Int6
 def _downscale_factor(
     file: Path, parser: config_classes.PosedDataParserConfig, has_copies: Callable[[int], bool] = lambda factor: True
 ) -> int:
-    """Return nerfstudio's downscale factor for images; if the config has none, it depends on the size of one image."""
+    """Return the downscale factor of nerfstudio, from the config or else from the size of an image.
+
+    Args:
+        file: Image that determines the factor if the config has none.
+        parser: Config of the data parser.
+        has_copies: Function that returns True if images downscaled by a factor exist.
+    """
     if parser.downscale_factor is not None:
         return parser.downscale_factor
     longest, factor = max(_image_size(file, parser.data)), 1
@@ -503,7 +518,7 @@ def _blender_split(parser: config_classes.BlenderDataParserConfig, split: str) -
     meta = _entries(path, parser.data)
     angle = meta.camera_angle_x
     if angle is None or not 0 < angle < math.pi:
-        raise InputError(f"{path}: camera_angle_x is {angle}, expected radians between 0 and pi.")
+        raise InputError(f"{path}: camera_angle_x is {angle}, expected an angle between 0 and pi radians.")
     files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in meta.frames]
     _check_files(files, path)
     width, height = _image_size(files[0], parser.data)
@@ -528,10 +543,10 @@ def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDatase
     files = _downscaled(full_size, images_dir, factor)
     check_files_distinct(zip((image.name for image in images), files), "file", f"in the folders that {model} lists")
     missing = sorted({file.parent for file in files if factor > 1 and not file.parent.is_dir()})
-    if missing:  # nerfstudio would offer to create it
+    if missing:  # nerfstudio offers to create it
         raise FileNotFoundError(
-            f"There is no folder {missing[0]} of images at 1/{factor} of their size, with which the run was trained. "
-            f"Create it by resizing the images in {images_dir}; normlift_ns does not write into datasets."
+            f"There is no folder {missing[0]}, expected the images at 1/{factor} of their size, which the run was "
+            f"trained with. Resize the images in {images_dir}; normlift_ns does not write into datasets."
         )
     masks = None
     if parser.masks_path is not None:
@@ -551,23 +566,29 @@ def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDatase
 
 
 def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> tuple[str, list[list[float]]]:
-    """Return nerfstudio's type of all cameras, and a row for each image: fx, fy, cx, cy, width, height, distortion."""
+    """Return nerfstudio's type of all cameras, and a row of parameters for each image.
+
+    A row has fx, fy, cx, cy, width, height, k1, k2, k3, k4, p1 and p2.
+    """
     rows = {}
     for camera in cameras.values():
         if camera.model not in _COLMAP_MODELS:
-            raise InputError(f"{camera.model} camera model is not supported yet")
+            raise InputError(f"nerfstudio does not support the camera model {camera.model}")
         values = {"w": camera.width, "h": camera.height, **camera.named_parameters()}
         rows[camera.camera_id] = [values.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", "w", "h", *DISTORTION)]
     kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera_id].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
-        raise InputError("multiple camera models are not supported")
+        raise InputError("the images have perspective and fisheye cameras, expected only one of these types")
     if any(rows[image.camera_id][9] != 0 for image in images):
-        raise InputError("the distortion k4 of a camera is not zero")
+        raise InputError("the distortion k4 of a camera is not zero, expected zero")
     return kinds.pop(), [rows[image.camera_id] for image in images]
 
 
 def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
-    """Return the camera-to-world pose in OpenGL convention; with `flip`, the first camera's up direction is along z."""
+    """Return the camera-to-world pose of an image in OpenGL convention.
+
+    With `flip`, the up direction of the first camera is along z.
+    """
     w, x, y, z = image.rotation
     rotation = np.array(
         [
@@ -590,13 +611,13 @@ def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]
     for split, name in (("train", "train"), ("test", "test"), ("val", "validation"), ("val", "val")):
         path = parser.data / f"{name}_list.txt"
         if lists.get(split) is not None or (name == "val" and lists["train"] is None):
-            continue  # nerfstudio reads val_list.txt, but looks for validation_list.txt
+            continue  # nerfstudio reads val_list.txt only if validation_list.txt is missing
         lists[split] = [_listed(folder, name) for name in read_text(path).splitlines()] if path.is_file() else None
     return lists
 
 
 def _downscaled(files: list[Path], folder: Path, factor: int) -> list[Path]:
-    """Return the copies of files in the folder of this downscale factor."""
+    """Return the paths of the copies of files that are downscaled by a factor; unchanged for factor 1."""
     smaller = folder.parent / f"{folder.name}_{factor}"
     return files if factor == 1 else [smaller / file.relative_to(folder) for file in files]
 
@@ -606,4 +627,4 @@ _PARSERS: dict[type, Any] = {
     config_classes.ColmapDataParserConfig: _parse_colmap,
     config_classes.BlenderDataParserConfig: _blender,
 }
-"""Functions that read the dataset of each data parser."""
+"""Functions that read datasets, by the config class of the data parser."""

@@ -1,4 +1,4 @@
-"""Images and cameras of a run as nerfstudio itself makes them, without lens distortion. Imports nerfstudio."""
+"""Images and cameras of a run, read and undistorted by nerfstudio itself. This module imports nerfstudio."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _SUPPORTED_CAMERAS = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, Ca
 
 
 class DatasetViews(SplitViews):
-    """Views of a split that nerfstudio reads and undistorts.
+    """Views of a split of a dataset, read and undistorted by nerfstudio.
 
     Args:
-        dataset: a split as made by nerfstudio's datamanager; it is not changed.
-        folder: folder of the dataset, to which `names` are relative.
-        poses, background: as in `SplitViews`.
+        dataset: Split from nerfstudio's datamanager, which stays unchanged.
+        folder: Folder of the dataset, the base of the relative `names`.
+        poses, background: As in `SplitViews`.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class DatasetViews(SplitViews):
         super().__init__(files, names, masks, sizes, poses, background, dataset.scale_factor)
         self._dataset = dataset
         self._pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}
-        """Undistorted cameras by their parameters, which most images share."""
+        """Cache of undistorted cameras by their parameters, because most images share a camera."""
 
     def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
         camera = self._dataset.cameras[index].reshape(())
@@ -74,7 +74,7 @@ class DatasetViews(SplitViews):
 def _undistort(
     cameras: Cameras, index: int, data: dict[str, Any]
 ) -> tuple[UInt8[Tensor, "h w c"], Float[Tensor, "3 3"], Bool[Tensor, "h w 1"] | None]:
-    """Return image, intrinsics and mask after nerfstudio's undistortion, as in `FullImageDatamanager`."""
+    """Return the image, camera matrix and mask after the undistortion of nerfstudio's `FullImageDatamanager`."""
     camera = cameras[index].reshape(())
     intrinsics = camera.get_intrinsics_matrices()
     if camera.distortion_params is None or bool((camera.distortion_params == 0).all()):
@@ -84,39 +84,39 @@ def _undistort(
         _check_aria(camera, masked="mask" in data)
     try:
         matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
-    except Exception as error:  # OpenCV's errors, and any that nerfstudio raises for invalid coefficients
-        raise InputError(f"its distortion {distortion.tolist()} cannot be removed ({error})") from error
+    except Exception as error:  # OpenCV and nerfstudio raise different exceptions for invalid coefficients
+        raise InputError(f"the distortion {distortion.tolist()} cannot be removed ({error})") from error
     if 0 in image.shape:
-        raise InputError(f"removing its distortion {distortion.tolist()} leaves no pixel of the image")
+        raise InputError(f"the image has no pixels after its distortion {distortion.tolist()} is removed")
     pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
 
 
 def _check_aria(camera: Cameras, *, masked: bool) -> None:
-    """Raise if nerfstudio cannot undistort images of an Aria camera, or would make enormous images of them."""
+    """Raise InputError if nerfstudio cannot undistort the images of an Aria camera, or if they would become huge."""
     if masked:
-        raise InputError("nerfstudio cannot undistort images of FISHEYE624 cameras that have masks")
+        raise InputError("nerfstudio cannot undistort FISHEYE624 images with masks; remove the masks from the dataset")
     radius = (camera.metadata or {}).get("fisheye_crop_radius")
     width, height = int(camera.width), int(camera.height)
     if not isinstance(radius, float) or not 0.5 <= radius <= width + height:
         raise InputError(
-            f"its fisheye_crop_radius is {radius!r}. Expected the radius, in pixels, of the circle that a FISHEYE624 "
-            f"camera sees: a number with a decimal point, from 0.5 to {width + height}"
+            f"the fisheye_crop_radius is {radius!r}. Expected the radius in pixels of the image circle of a FISHEYE624 "
+            f"camera, a number with a decimal point in 0.5..{width + height}"
         )
 
 
 def nerfstudio_views(
     config: Any, folder: Path, poses: Float[Tensor, "v 3 4"], background: Float[Tensor, " 3"]
 ) -> tuple[DatasetViews, DatasetViews]:
-    """Return the training views and the held-out views of a run that was read without nerfstudio.
+    """Open the dataset of a run with nerfstudio, and return its training views and its held-out views.
 
     Args:
-        config: the run's config with absolute paths.
-        folder: folder of the dataset.
-        poses: camera-to-world poses of the training views.
-        background: RGB in 0..1 behind images with an alpha channel.
+        config: Config of the run with absolute paths.
+        folder: Folder of the dataset.
+        poses: Camera-to-world poses of the training views.
+        background: RGB in 0..1, blended behind images with an alpha channel.
     """
-    # Loader is safe here: dump_config wrote the text, and it names allowed classes only
+    # Loader is safe here: dump_config wrote the text, which contains allowed classes only
     datamanager = yaml.load(dump_config(config.pipeline.datamanager), Loader=yaml.Loader)
     manager = datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
     held_out = manager.eval_dataset

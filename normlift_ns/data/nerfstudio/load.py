@@ -1,4 +1,4 @@
-"""A trained splatfacto run as a `Scene`, with its images as splatfacto trained on them."""
+"""Reader for trained splatfacto runs, which returns a `Scene` with the images that splatfacto trained on."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import view_colors
 
 _NUM_DISTORTION = {"PERSPECTIVE": 6, "FISHEYE": 4}
-"""Number of distortion parameters k1, k2, k3, k4, p1, p2 that a camera of each supported type needs if it has any."""
+"""Minimum number of distortion parameters of a distorted camera, in the order k1, k2, k3, k4, p1, p2, by type."""
 
 
 class TrainedViews(SplitViews):
-    """Views of one split of a dataset, in its order, that are read and undistorted without nerfstudio.
+    """Views of a split of a dataset in its order, read and undistorted without nerfstudio.
 
-    Images, masks and intrinsics are those of nerfstudio's `FullImageDatamanager.cached_train`, which holds all of them
-    in memory (and pins that memory, which needs CUDA).
+    Images, masks and intrinsics equal those of nerfstudio's `FullImageDatamanager.cached_train`. Each access reads one
+    image, whereas nerfstudio keeps all of them in memory.
 
     Args:
-        split: image files and cameras, before undistortion.
-        folder: folder of the dataset, to which `names` are relative.
-        poses, background: as in `SplitViews`.
-        datamanager: the config, some of whose settings affect pixels.
+        split: Image files and cameras, before undistortion.
+        folder: Folder of the dataset, the base of the relative `names`.
+        poses, background: As in `SplitViews`.
+        datamanager: Config of the data manager. Some of its settings affect pixels.
     """
 
     def __init__(
@@ -57,8 +57,10 @@ class TrainedViews(SplitViews):
         self._split, parser = split, datamanager.dataparser
         alpha = parser.alpha_color if isinstance(parser, config_classes.BlenderDataParserConfig) else None
         self._alpha_color = None if alpha is None else config_classes.NAMED_COLORS[alpha.lower()]
-        """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them; None: it blends
-        the background later."""
+        """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them.
+
+        None if nerfstudio blends the background later.
+        """
         self._mask_color = parser.mask_color if isinstance(parser, config_classes.NerfstudioDataParserConfig) else None
         """Color that nerfstudio writes into pixels whose mask is zero."""
 
@@ -69,14 +71,14 @@ class TrainedViews(SplitViews):
         distortion = [] if self._split.distortion is None else self._split.distortion[index].tolist()
         needed = _NUM_DISTORTION[kind]
         if any(distortion) and len(distortion) < needed:
-            raise InputError(f"its distortion {distortion} cannot be removed (expected {needed} parameters)")
+            raise InputError(f"the distortion {distortion} cannot be removed (expected {needed} parameters)")
         k1, k2, k3, k4, p1, p2 = [*distortion, *[0.0] * 6][:6]
         fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         width, height = self._sizes[index]
         return Intrinsics(fx, fy, cx, cy, width, height, k1, k2, k3, p1, p2, k4, kind == "FISHEYE")
 
     def _load(self, index: int) -> tuple[UInt8[np.ndarray, "h w c"], Bool[np.ndarray, "h w"] | None]:
-        """Read pixels and mask like nerfstudio's `InputDataset`."""
+        """Read an image and its mask like nerfstudio's `InputDataset`."""
         image, mask = super()._load(index)
         if mask is not None and self._mask_color is not None and any(self._mask_color):
             filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._mask_color)
@@ -89,7 +91,7 @@ class TrainedViews(SplitViews):
         if image.ndim == 2:
             image = image[:, :, None].repeat(3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
-            raise InputError(f"its shape is {image.shape}")
+            raise InputError(f"its shape is {image.shape}, expected 1, 3 or 4 channels")
         if self._alpha_color is None or image.shape[2] == 3:
             return image
         blended, color = torch.from_numpy(image), torch.tensor(self._alpha_color)
@@ -99,68 +101,70 @@ class TrainedViews(SplitViews):
 
 _TRANSFORM_TOLERANCE = 1e-3
 _ASSUMED_STEP = 30000
-"""Step that splatfacto assumes for a loaded checkpoint, whatever its actual step."""
+"""Step that splatfacto assumes for all loaded checkpoints."""
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 def _background_color(config: config_classes.SplatfactoModelConfig) -> Float[Tensor, " 3"]:
-    """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
+    """Return splatfacto's background color after the training, RGB in 0..1; for "random", the color of the viewer."""
     name = config.background_color
     return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(config_classes.NAMED_COLORS[name])
 
 
 def active_sh_degree(config: Any, step: int) -> int | None:
-    """Return the degree of the spherical harmonics at a training step; None: colors do not depend on the view.
+    """Return the active degree of the spherical harmonics at a training step; None if colors do not use harmonics.
 
     Args:
-        config: splatfacto's model config, nerfstudio's own or its mirror.
-        step: training step.
+        config: Config of the splatfacto model, from nerfstudio or a mirror class.
+        step: Training step.
     """
     return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None
 
 
 @dataclass(frozen=True)
 class NerfstudioScene:
-    """A `Scene` made from a trained splatfacto run, or a lifted copy of one, on the CPU."""
+    """Scene made from a trained splatfacto run, or a lifted copy of such a run, on the CPU."""
 
     config: config_classes.TrainerConfig
-    """The config as stored; its paths are those of the training."""
+    """Config as stored, with the paths of the training."""
     location: RunLocation
-    """Current paths of the run's files."""
+    """Current paths of the files of the run."""
     checkpoint: Checkpoint
     gaussians: GaussianScene
-    """The activated Gaussians, without cropping."""
+    """Gaussians with activated scales and opacities, without cropping."""
     train: Views
-    """Training views; if the run optimized its camera poses, with the optimized ones."""
+    """Training views, with optimized camera poses if the run optimized them."""
     held_out: Views
     """Evaluation views."""
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
-    """Map from the poses in the dataset to the scene's world: scale * (transform @ point)."""
+    """Scale of the map from the dataset to the world of the scene: scale * (dataparser_transform @ point)."""
     identity: Mapping[str, Any]
-    """Config and step, for the manifest; for a lifted run also the gsplat rules of its rasterization."""
+    """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     extra_frames: tuple[Frame, ...] = ()
-    """Frames of the extra views at the end of `train`, which the run was not trained with, in the world of the
-    Gaussians."""
+    """Frames of the extra views at the end of `train`, in the world of the Gaussians.
+
+    The run was not trained with these views.
+    """
 
     renderer = None
-    """None, because `normlift_ns` renders the scene as splatfacto does."""
+    """Renderer of another package; None, because `normlift_ns` renders the scene like splatfacto."""
 
     @property
     def name(self) -> str:
-        """The experiment name."""
+        """Name of the experiment."""
         return str(self.config.experiment_name)
 
     @property
     def checkpoint_path(self) -> Path:
-        """The checkpoint of the Gaussians."""
+        """Path of the checkpoint of the Gaussians."""
         return self.checkpoint.path
 
     @property
     def runs_dir(self) -> Path:
-        """The folder above the runs of this experiment, outputs/ by default."""
+        """Folder that contains the experiment (default: outputs/)."""
         return self.location.output_dir
 
     @property
@@ -170,7 +174,7 @@ class NerfstudioScene:
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """The checkpoint's gauss_params by name."""
+        """Tensors gauss_params.* of the checkpoint, by name without this prefix."""
         return self.checkpoint.splat.parameters
 
     @property
@@ -180,7 +184,7 @@ class NerfstudioScene:
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """Rasterize mode of the training, which a lift must share."""
+        """Rasterize mode of the training, which a lift must also use."""
         return self.model_config.rasterize_mode
 
     @cached_property
@@ -190,13 +194,13 @@ class NerfstudioScene:
         return torch.cat([splat.features_dc[:, None], splat.features_rest], dim=1)
 
     def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
-        """Return each Gaussian's RGB color, >= 0, as seen from the camera."""
+        """Return the RGB color of each Gaussian as seen from a camera, with values >= 0."""
         degree = active_sh_degree(self.model_config, _ASSUMED_STEP)
         return view_colors(self.gaussians.means, self.coefficients, camera, degree)
 
     @property
     def model_config(self) -> config_classes.SplatfactoModelConfig:
-        """The model's part of the config."""
+        """Config of the model."""
         return self.config.pipeline.model
 
 
@@ -205,16 +209,17 @@ def load_nerfstudio_scene(
 ) -> NerfstudioScene:
     """Load a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
 
-    Only the config, the checkpoint, the dataset's cameras and image headers are read; images are read on access.
+    The function reads the config, the checkpoint, the cameras of the dataset and the image headers. Views read their
+    images when they are accessed.
 
     Args:
-        load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
-        data: current path of the dataset, if it was moved.
-        load_step: step of the checkpoint; None: the last.
+        load_config: Path of the config.yml of the run, in output_dir/experiment/method/timestamp.
+        data: Current path of the dataset, if it was moved.
+        load_step: Step of the checkpoint; None for the last step.
     Raises:
-        FileNotFoundError: if the config, the checkpoint, the dataset or an image is missing.
-        ValueError: if the config belongs to another method or program, the checkpoint is damaged, or the dataset is not
-            the one of the run.
+        FileNotFoundError: The config, the checkpoint, the dataset or an image is missing.
+        ValueError: The config is from another method or program, the checkpoint is damaged, or the dataset is not the
+            dataset of the run.
     """
     said: list[str] = []
     stored = read_trainer_config(load_config, said.append)
@@ -225,29 +230,29 @@ def load_nerfstudio_scene(
     count, expected = checkpoint.splat.features_rest.shape[1], (model.sh_degree + 1) ** 2 - 1
     if count != expected:
         raise InputError(
-            f"{checkpoint.path} has {count} spherical harmonics beyond the first, but {load_config} has sh_degree "
-            f"{model.sh_degree}, which needs {expected}. Expected the checkpoint and the config of one training run; "
-            "copy both again."
+            f"{checkpoint.path} has {count} spherical harmonics without the constant one, but {load_config} has "
+            f"sh_degree {model.sh_degree}, which needs {expected}. Copy the checkpoint and the config of the same "
+            "training run again."
         )
     gaussians = checkpoint.splat.activated
     if not bool(gaussians.drawable.any()):
         raise InputError(
-            f"{checkpoint.path}: none of its {len(gaussians):,} Gaussians can be drawn, because all have parameters "
-            "that are NaN or infinite, or zero quaternions. Give another checkpoint with --load-step."
+            f"{checkpoint.path}: all {len(gaussians):,} Gaussians have NaN or infinite parameters, or zero "
+            "quaternions, so they cannot be drawn. Give another checkpoint with --load-step."
         )
     dataset = parse_dataset(datamanager, data_given=data is not None)
     advice = "" if data is not None else ", or give the path of the dataset with --data"
     files = [*dataset.train.files, *(dataset.train.masks or ())]
     missing = [file for file in files if not file.is_file()]
-    if missing:  # found before a lift that takes minutes
+    if missing:  # report missing files before a long lift
         raise FileNotFoundError(
             f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing; the first is "
-            f"{missing[0]}. Put them back{advice}."
+            f"{missing[0]}. Copy them to these paths{advice}."
         )
     remarks = _check_transform(dataset.transform, dataset.scale, location, advice)
     poses = _training_poses(dataset.train, model, checkpoint, advice)
     color = _background_color(model)
-    if dataset.train.camera_type == "FISHEYE624":  # Aria's cameras, which only nerfstudio can undistort
+    if dataset.train.camera_type == "FISHEYE624":  # only nerfstudio can undistort Aria's cameras
         from normlift_ns.data.nerfstudio.dataset_views import nerfstudio_views  # noqa: PLC0415 (nerfstudio takes 13 s)
 
         train, held_out = nerfstudio_views(config, location.folder, poses, color)
@@ -264,12 +269,14 @@ def load_nerfstudio_scene(
 def _check_transform(
     transform: Float[Tensor, "3 4"], scale: float, location: RunLocation, advice: str
 ) -> tuple[str, ...]:
-    """Raise if the dataset does not lead to the world of the Gaussians, which nerfstudio derives from all poses.
+    """Raise InputError if the dataset gives another world than the training.
+
+    nerfstudio computes the world of the Gaussians from all poses, so a changed dataset leads to another world.
 
     Args:
-        transform, scale: map from the poses in the dataset to the world of the Gaussians.
-        location: paths of the run.
-        advice: what to do besides restoring the dataset, for error messages.
+        transform, scale: Map from the poses in the dataset to the world of the Gaussians.
+        location: Paths of the run.
+        advice: Alternative to restoring the dataset, for error messages.
     Returns:
         Warnings in whole sentences.
     """
@@ -282,11 +289,11 @@ def _check_transform(
     trained_transform = torch.from_numpy(trained.transform).to(transform)
     gap = float((_in_scene_units(trained_transform, trained.scale) - _in_scene_units(transform, scale)).abs().max())
     is_close = gap <= _TRANSFORM_TOLERANCE and abs(scale / trained.scale - 1) <= _TRANSFORM_TOLERANCE
-    if not is_close:  # also for NaN
+    if not is_close:  # or NaN
         raise InputError(
-            f"The dataset {location.data} is not the one that {location.run_dir} was trained with: its poses give "
-            f"scale {scale:.6g}, the training had {trained.scale:.6g}, and the world coordinates differ by up to "
-            f"{gap:.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json{advice}."
+            f"The dataset {location.data} has changed since the training of {location.run_dir}: frames were added, "
+            f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and world "
+            f"coordinates differ by up to {gap:.3g}. Restore transforms.json{advice}."
         )
     return ()
 
@@ -299,7 +306,7 @@ def _in_scene_units(transform: Tensor, scale: float) -> Tensor:
 def _training_poses(
     split: DatasetSplit, model: config_classes.SplatfactoModelConfig, checkpoint: Checkpoint, advice: str
 ) -> Float[Tensor, "v 3 4"]:
-    """Return the poses that the Gaussians were fitted to; splatfacto applies optimized poses during training only."""
+    """Return the poses of the training views, with the adjustments of the camera optimizer if the run used it."""
     if model.camera_optimizer.mode == "off":
         return split.poses
     adjustment = checkpoint.model.get("camera_optimizer.pose_adjustment")
@@ -307,12 +314,12 @@ def _training_poses(
     if adjustment is None or count != len(split):
         raise InputError(
             f"The run optimized its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
-            f"{count} pose adjustments for {len(split)} training images. Restore the checkpoint and the dataset "
-            f"of the run{advice}."
+            f"{count} pose adjustments for {len(split)} training images. Restore the checkpoint and the dataset of the "
+            f"run{advice}."
         )
     if adjustment.shape[1:] != (6,) or not bool(adjustment.isfinite().all()):
         raise InputError(
-            f"{checkpoint.path}: its camera_optimizer.pose_adjustment is {adjustment.dtype} {tuple(adjustment.shape)} "
-            f"or not finite. Expected finite numbers of shape ({len(split)}, 6); copy the checkpoint again."
+            f"{checkpoint.path}: camera_optimizer.pose_adjustment has type {adjustment.dtype} and shape "
+            f"{tuple(adjustment.shape)}, expected finite numbers of shape ({len(split)}, 6). Copy the checkpoint again."
         )
     return apply_pose_adjustments(split.poses, adjustment, model.camera_optimizer.mode)
