@@ -124,7 +124,7 @@ def _prompt_codes(state: State, rows: np.ndarray, table: list[Any], *, full: boo
     table.append((*_bytes(BY_HAND_COLOR), _FULL_SHARE, 1))
     codes = np.where(selection, _FIRST, _GRAY)
     if answer is None:
-        return codes
+        return codes if bool(state.selection.any()) else np.full(len(rows), _OWN)
     prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
     levels = 1 if full else (_CODES - 1) // len(answer.texts)
     low, high = overlay_scale(state)
