@@ -265,6 +265,14 @@ def test_everything_has_a_name_and_fits(own: Server, browser: Browser, size: tup
     page.leave()
 
 
+def test_the_pointer_tells_what_is_drawn(page: OnPage) -> None:
+    things(page)
+    page.ask("red, yellow, sky blue")
+    page.selects(lambda count: count > 0, "an answer")
+    same, named = page.pointed()
+    assert same >= 95 and named >= 95
+
+
 def test_a_browser_without_webgl_gets_stills(page: OnPage, own: Server, browser: Browser) -> None:
     _, *drawn = things(page)
     blind = OnPage(browser, own.address, webgl=False)

@@ -65,6 +65,7 @@ def walks(page: OnPage, walk: Walk, folder: Path) -> None:
     mask = coloured(page.sees(lambda seen: 0.001 < coloured(seen).mean() < 0.6, "an overlay"))
     assert walk.looks(photo[mask].astype(int)).mean() > 2 * walk.looks(photo[~mask].astype(int)).mean()
 
+    assert min(page.pointed()) >= 95
     slider = page.page.locator("#threshold")
     higher = min(0.99, 0.5 * (page.state("threshold") + float(slider.get_attribute("max") or 1)))
     fewer = page.changes(lambda: slider.fill(f"{higher:.3f}"), "a higher threshold")
