@@ -88,9 +88,12 @@ def test_a_person_asks(page: OnPage) -> None:
     page.page.keyboard.press("4")
     assert changed(page.sees(lambda seen: changed(seen, heat) > 10, "RGB"), photo) < 3
 
+    page.ask(", ".join(f"red {i}" for i in range(65)))
+    page.until(lambda: page.page.locator("#answers.stale").count() == 1, "too many: the old answer is dimmed")
     page.ask("glorp")
     page.until(lambda: "not understood" in page.chips()[0] and page.selected() == 0, "no old answer")
     assert "glorp" in page.toast()[0] and len(page.chips()) == 1 and page.page.locator("#answer").is_hidden()
+    assert page.page.locator("#answers.stale").count() == 0
     page.does("do-undo")
     page.until(lambda: page.selected() == both and page.prompts.input_value() == "red, zebra, yellow", "it is back")
     page.does("mode-overlay")
