@@ -2,6 +2,7 @@
 import { cp, mkdir, readFile, rm, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
+import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
 const here = dirname(fileURLToPath(import.meta.url));
@@ -22,6 +23,11 @@ const { metafile } = await build({
   logLevel: "warning",
 });
 await cp(join(here, "index.html"), join(target, "index.html"));
+// the server sends these to browsers that accept gzip
+for (const name of ["page.js", "style.css"]) {
+  const path = join(target, "assets", name);
+  await writeFile(`${path}.gz`, gzipSync(await readFile(path), { level: 9 }));
+}
 
 // Spark carries fflate in itself
 const names = Object.keys(metafile.inputs).map((path) => path.match(/node_modules\/((?:@[^/]+\/)?[^/]+)/)?.[1]);

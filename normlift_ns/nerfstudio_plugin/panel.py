@@ -145,8 +145,10 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
 def prompt_table(state: State) -> str:
     """Return a table with the color, count and highest relevancy of each prompt, or with its error."""
     answer = state.answer
-    if len(state.prompts) == 0 or answer is None:
+    if len(state.prompts) == 0:
         return ""
+    if answer is None:  # no prompt is understood
+        return "\n".join(prompt_rows(state.prompts, ("selected", "peak"), {}, max_rows=_MAX_TABLE_ROWS))
     counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
     peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
     numbers = {text: (f"{counts[i]:,}", f"{peaks[i]:.2f}") for i, text in enumerate(answer.texts)}

@@ -6,7 +6,9 @@ import contextlib
 import ctypes
 import html
 import ipaddress
+import mimetypes
 import os
+import re
 import secrets
 import socket
 import threading
@@ -163,6 +165,15 @@ def _limited(receive: Receive) -> Receive:
     return limited
 
 
+def _accepts_gzip(header: str) -> bool:
+    """Return True if a header Accept-Encoding names gzip, and not with the weight 0.
+
+    >>> [_accepts_gzip(one) for one in ("br, gzip;q=0.8", "GZIP", "gzip;q=0", "gzip; q=0.0", "br", "")]
+    [True, True, False, False, False, False]
+    """
+    return re.search(r"(?:^|,)\s*gzip\s*(?!;\s*q=0(?:\.0*)?\s*(?:,|$))(?:[;,]|$)", header, re.IGNORECASE) is not None
+
+
 async def _refuse_websocket(scope: Scope, receive: Receive, send: Send, reason: str) -> None:
     await receive()
     if "websocket.http.response" in scope.get("extensions", {}):
@@ -270,7 +281,12 @@ class WarmServer:
         path = folder / request.path_params["path"]
         if ".." in path.parts or not path.is_file() or folder.resolve() not in path.resolve().parents:
             raise HTTPException(404)
-        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+        headers = {"Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+        compressed = path.with_name(f"{path.name}.gz")
+        if compressed.is_file() and _accepts_gzip(request.headers.get("accept-encoding", "")):
+            media_type = mimetypes.guess_type(path.name)[0]
+            return FileResponse(compressed, headers={**headers, "Content-Encoding": "gzip"}, media_type=media_type)
+        return FileResponse(path, headers=headers)
 
     async def _list_runs(self, request: Request) -> Response:
         runs = [await self.run_of(name) for name in self.runs.ids]

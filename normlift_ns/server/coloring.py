@@ -27,7 +27,7 @@ _FIRST, _CODES = 2, 253
 _MIN_SHARE, _FULL_SHARE = 0.45, 0.85
 """Opacity of a prompt's color over gray, at the threshold and at the best match."""
 _MIN_SPAN = 0.05
-_MIN_LUMINANCE = 0.35
+_MIN_LUMINANCE = 0.4
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 _PCA_LEVELS = 6
 _PCA_QUANTILES = (0.02, 0.98)
@@ -124,7 +124,7 @@ def _prompt_codes(state: State, rows: np.ndarray, table: list[Any], *, full: boo
     table.append((*_bytes(BY_HAND_COLOR), _FULL_SHARE, 1))
     codes = np.where(selection, _FIRST, _GRAY)
     if answer is None:
-        return codes
+        return codes if bool(state.selection.any()) else np.full(len(rows), _OWN)
     prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
     levels = 1 if full else (_CODES - 1) // len(answer.texts)
     low, high = overlay_scale(state)
@@ -160,7 +160,7 @@ def _lightened(color: RGB) -> RGB:
     """Mix a dark color with white so that its luminance is `_MIN_LUMINANCE`.
 
     >>> [round(x, 2) for x in _lightened((0.2, 0.0, 0.25))]
-    [0.45, 0.31, 0.48]
+    [0.49, 0.36, 0.52]
     """
     luminance = sum(weight * x for weight, x in zip(_LUMINANCE, color))
     white = max(0.0, (_MIN_LUMINANCE - luminance) / (1 - luminance)) if luminance < _MIN_LUMINANCE else 0.0

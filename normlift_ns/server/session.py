@@ -39,6 +39,7 @@ from normlift_ns.session.prompts import (
     encode_prompts,
     is_click,
     join_prompts,
+    not_understood,
 )  # fmt: skip
 from normlift_ns.session.state import RequestTokens, State
 
@@ -339,35 +340,36 @@ class PageSession:
             **settings,
         }
 
-        def compute() -> Callable[[State], State]:
+        def compute() -> tuple[Callable[[State], State], str]:
             known = self._run.known(memory.clicks)
             prompts = encode_prompts(line, self._run.read, known)
+            message = not_understood(prompts)
+            if message:
+                return lambda state: actions.ask(state, prompts, None), message
             rows, query = build_query(self._run.space.field, prompts, self._run.read, **options)
             self._run.space.answer(query)  # the state gets this answer from the cache
-            return lambda state: self._visible(actions.ask(state, rows, query))
+            return lambda state: self._visible(actions.ask(state, rows, query)), ""
 
         await self._start("Searching …", compute, seq)
 
     async def _select_floaters(self, pending: _Pending) -> None:
-        def compute() -> Callable[[State], State]:
+        def compute() -> tuple[Callable[[State], State], str]:
             floaters = self._run.floaters
-            return lambda state: self._visible(actions.select_floaters(state, floaters))
+            return lambda state: self._visible(actions.select_floaters(state, floaters)), actions.FLOATERS_HINT
 
-        await self._start("Finding likely floaters …", compute, pending.seq, actions.FLOATERS_HINT)
+        await self._start("Finding likely floaters …", compute, pending.seq)
 
-    async def _start(
-        self, text: str, compute: Callable[[], Callable[[State], State]], seq: int, done: str = ""
-    ) -> None:
-        """Start a slow request, whose result is a function from the current state to the new state."""
+    async def _start(self, text: str, compute: Callable[[], tuple[Callable[[State], State], str]], seq: int) -> None:
+        """Start a slow request, whose result is a function from the current state to the new one, and a message."""
         token = self._tokens.start(text)
 
         async def work() -> None:
             try:
-                change = await self._in_thread(compute, self._limits.asking)
+                change, message = await self._in_thread(compute, self._limits.asking)
                 if self._tokens.finish(token):
                     self._append(_Pending("apply", change, seq))
-                    if done:
-                        await self._tell(done, "info", seq)
+                    if message:
+                        await self._tell(message, "info", seq)
             except Exception as error:
                 if self._tokens.finish(token):
                     await self._tell(describe_error(error)[0], "error", seq)

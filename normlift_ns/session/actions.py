@@ -114,12 +114,12 @@ MIN_THRESHOLD, MAX_THRESHOLD = -0.2, 1.0
 FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo shows them again."
 
 
-def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
+def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> State:
     """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
         prompts: all rows, from `build_query`.
-        question: query of these rows, from `build_query`.
+        question: query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
     Raises:
         ValueError: the vectors have a different dimension than the field.
     """

@@ -109,6 +109,15 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
     )
 
 
+def not_understood(prompts: Sequence[Prompt]) -> str:
+    """Return the error of the first prompt if no prompt has a vector; "" otherwise.
+
+    >>> not_understood([Prompt("glorp", error="'glorp' is unknown")])
+    "'glorp' is unknown"
+    """
+    return prompts[0].error if all(prompt.vector is None for prompt in prompts) else ""
+
+
 def build_query(
     field: HasManifest,
     prompts: Sequence[Prompt],

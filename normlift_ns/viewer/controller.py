@@ -17,7 +17,7 @@ from normlift_ns.errors import InputError, describe_error
 from normlift_ns.session import actions
 from normlift_ns.session.actions import ClickMode, carry_threshold
 from normlift_ns.session.objects import ObjectRow
-from normlift_ns.session.prompts import build_query, click_name, encode_prompts
+from normlift_ns.session.prompts import build_query, click_name, encode_prompts, not_understood
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
@@ -258,13 +258,16 @@ class Controller(ABC):
         with self._encoder_lock:  # no two threads may load the encoder
             if not self._turns.is_current(token):
                 return
-            prompts = encode_prompts(line, self._encode, vectors)
-            prompts, query = build_query(space.field, prompts, self._encode, **settings)
+            prompts, query = encode_prompts(line, self._encode, vectors), None
+            message = not_understood(prompts)
+            if not message:
+                prompts, query = build_query(space.field, prompts, self._encode, **settings)
 
         def ask(state: State) -> State:
-            return actions.ask(state, prompts, query if "threshold" in settings else carry_threshold(state, query))
+            fixed = query is None or "threshold" in settings
+            return actions.ask(state, prompts, query if fixed else carry_threshold(state, query))
 
-        self._show_result(token, ask)
+        self._show_result(token, ask, message)
 
     def _select_floaters(self, token: RequestToken) -> None:
         floaters = self._find_floaters()

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from tests.browser.person import Person
+from normlift_ns.server.permalink import PageView
+from tests.browser.person import Person, coloured
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator
@@ -55,6 +56,23 @@ _WATCH = """() => {
   };
 }"""
 """Looks at every frame: the share of pixels that show the scene, and of neighbors in the wrong order."""
+
+_HOVER = """async (rays) => {
+  const found = [], {connection} = page;
+  for (const ray of rays) {
+    found.push(await new Promise((resolve) => {
+      const hear = ({message}) => {
+        if (message.seq !== seq) return;
+        connection.removeEventListener("hover", hear);
+        resolve(message);
+      };
+      connection.addEventListener("hover", hear);
+      const seq = connection.send("hover", ray);
+    }));
+  }
+  return found;
+}"""
+"""What the server tells of some rays."""
 
 
 class OnPage(Person):
@@ -167,6 +185,26 @@ class OnPage(Person):
 
     def frames(self) -> list[dict[str, float]]:
         return self.page.evaluate("frames45")
+
+    def pointed(self, count: int = 100) -> tuple[int, int]:
+        """Points at random places: how often the pointer tells what the server finds there with its own camera, and how
+        often it names a prompt just where the picture has a color. The picture has the colors of the prompts."""
+        self.does("mode-prompts")
+        drawn = coloured(self.sees(lambda seen: coloured(seen).any(), "colors"))
+        view = {**self.page.evaluate("page.view.view()")}
+        view["fov"] = float(np.radians(view["fov"]))
+        camera = PageView(**view).camera(16384)
+        turn, origin = camera.world_to_camera[:3, :3].double(), camera.camera_to_world()[:3, 3]
+        rng = np.random.default_rng(0)
+        places = rng.integers(8, [drawn.shape[1] - 8, drawn.shape[0] - 8], (count, 2))
+        ahead = np.c_[places + 0.5, np.ones(count)] @ np.linalg.inv(camera.K.double().numpy()).T @ turn.numpy()
+        theirs = [{"origin": origin.tolist(), "direction": one.tolist()} for one in ahead]
+        ours = [self.page.evaluate("([x, y]) => page.view.ray(x, y)", [x + 0.5, y + 0.5]) for x, y in places.tolist()]
+        found = list(zip(*(self.page.evaluate(_HOVER, rays) for rays in (ours, theirs)), places))
+        names = ("label", "relevancy", "reliability", "object", "position")
+        same = [all(one[name] == other[name] for name in names) for one, other, _ in found]
+        named = [(one["label"] is not None) == bool(drawn[y, x]) for one, _, (x, y) in found]
+        return sum(same), sum(named)
 
     def measured(self, name: str) -> list[float]:
         """Milliseconds from a press to "colors", to a "coarse" picture or to the full "picture"."""

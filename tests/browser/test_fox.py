@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from plyfile import PlyData
 from tests.browser.person import needs_chromium
 from tests.browser.server import STOCK, Server
 from tests.browser.viewer import Tab, overlaid
-from tests.captures import SHARED, needs_shared
+from tests.captures import needs_shared
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -20,15 +21,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.slow, needs_shared, needs_chromium]
 
 
-@pytest.mark.usefixtures("nerfstudio")
-def test_a_person_finds_the_fox(tmp_path: Path, browser: Browser) -> None:
-    from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
-    from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
-
-    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    options, colour = LiftOptions(max_views=6, lift_downscale=4), SourceOptions(encoder="color")
-    fox = NormLift(source, source=colour, lift=options, check_alignment=False, output_dir=tmp_path).main().config
-    with Server(STOCK, fox, tmp_path / "viewer.log", cwd=tmp_path).running() as address:
+def test_a_person_finds_the_fox(colored: Callable[[str], Path], tmp_path: Path, browser: Browser) -> None:
+    with Server(STOCK, colored("fox"), tmp_path / "viewer.log", cwd=tmp_path).running() as address:
         tab = Tab(browser, address)
         assert tab.typed("Prompts") == "" and tab.selected() == -1  # nothing is stored
         tab.fresh()

@@ -22,6 +22,21 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 
+_SWATCH_CONTRAST = """() => {
+  const light = (css) => css.match(/[\\d.]+/g).slice(0, 3).map((x) => x / 255)
+    .map((x) => x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, x, i) => sum + x * [0.2126, 0.7152, 0.0722][i], 0);
+  const contrast = (one, other) => {
+    const [dark, bright] = [light(one), light(other)].sort((a, b) => a - b);
+    return (bright + 0.05) / (dark + 0.05);
+  };
+  const panel = getComputedStyle(document.querySelector("#panel")).backgroundColor, scene = "rgb(20 23 28)";
+  const styles = [...document.querySelectorAll(".swatch")].map((one) => getComputedStyle(one));
+  return Math.min(...styles.flatMap((one) => [contrast(one.boxShadow, panel), contrast(one.backgroundColor, scene)]));
+}"""
+"""The least contrast of the ring of a swatch with the panel, and of its color with the dark scene."""
+
+
 def things(page: OnPage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The picture of the room, and where its red and its yellow thing are."""
     photo = page.sees(lambda seen: min(hue_mask(seen, *rule).sum() for rule in (RED, YELLOW)) > 500, "the room")
@@ -38,6 +53,9 @@ def test_a_person_asks(page: OnPage) -> None:
     assert "normlift" in page.page.title() and page.page.locator("#name").inner_text() in page.page.title()
     assert page.page.locator("#examples button").count() >= 2
     assert page.prompts.input_value() == "red, yellow"  # those that the run stores
+    assets = "performance.getEntriesByType('resource').filter((one) => one.name.includes('/assets/'))"
+    sizes = page.page.evaluate(f"{assets}.map((one) => one.encodedBodySize)")
+    assert len(sizes) == 2 and 1e5 < sum(sizes) <= 1.6e6  # compressed
 
     page.ask("red, zebra; yellow")
     both = page.selects(lambda count: count > 0, "an answer")
@@ -70,9 +88,16 @@ def test_a_person_asks(page: OnPage) -> None:
     page.page.keyboard.press("4")
     assert changed(page.sees(lambda seen: changed(seen, heat) > 10, "RGB"), photo) < 3
 
+    page.ask(", ".join(f"red {i}" for i in range(65)))
+    page.until(lambda: page.page.locator("#answers.stale").count() == 1, "too many: the old answer is dimmed")
     page.ask("glorp")
-    page.until(lambda: page.page.locator("#answers.stale").count() == 1, "the old answer is dimmed")
-    assert "glorp" in page.toast()[0]
+    page.until(lambda: "not understood" in page.chips()[0] and page.selected() == 0, "no old answer")
+    assert "glorp" in page.toast()[0] and len(page.chips()) == 1 and page.page.locator("#answer").is_hidden()
+    assert page.page.locator("#answers.stale").count() == 0
+    page.does("do-undo")
+    page.until(lambda: page.selected() == both and page.prompts.input_value() == "red, zebra, yellow", "it is back")
+    page.does("mode-overlay")
+    page.sees(lambda seen: covers(seen, red | yellow), "its overlay")
     page.does("do-clear")
     page.until(lambda: page.prompts.input_value() == "", "an empty box")
     page.sees(lambda seen: changed(seen, photo) < 3, "the colors of the scene")
@@ -144,6 +169,8 @@ def test_a_person_looks_around_explains_and_exports(page: OnPage, own: Server, t
     page.ask("red")
     some = page.selects(lambda count: count > 0, "an answer")
     page.until(lambda: page.page.locator("#objects button").count() > 1, "objects")
+    best = re.findall(r"\d\.\d\d", page.chips()[0])[0]
+    assert page.page.locator("#legend").inner_text().endswith(best)  # the same number
 
     def distance() -> float:
         return page.page.evaluate("page.view.camera.position.distanceTo(page.view.controls.target)")
@@ -218,6 +245,7 @@ def test_pages_are_their_own_and_outlive_the_server(own: Server, browser: Browse
     one.page.keyboard.press("Control+z")
     one.until(lambda: one.state("hidden") == 0, "history comes back too")
 
+    assert one.page.request.head(own.address).status == 200
     one.does("do-link")
     one.until(lambda: "?q=" in one.page.evaluate("location.search"), "a link")
     link = one.page.evaluate("location.href")
@@ -240,7 +268,7 @@ def test_pages_are_their_own_and_outlive_the_server(own: Server, browser: Browse
 @pytest.mark.parametrize("size", [(390, 760), (1300, 800)])
 def test_everything_has_a_name_and_fits(own: Server, browser: Browser, size: tuple[int, int]) -> None:
     page = OnPage(browser, own.address, size)
-    page.ask("red, sky blue")
+    page.ask("red, eggplant")
     page.until(lambda: page.page.locator(".histogram").count() == 2, "histograms")
     assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0]
     assert page.page.evaluate("document.querySelector('#panel').scrollWidth") <= size[0]
@@ -257,7 +285,29 @@ def test_everything_has_a_name_and_fits(own: Server, browser: Browser, size: tup
         seen.add(page.page.evaluate("document.activeElement.id"))
     assert {"prompts", "ask", "do-hide", "threshold", "mode-heat", "tool-select"} <= seen
     assert page.page.locator("#stage").bounding_box() == stage  # nothing shifts
+    tipless = """[...document.querySelectorAll("button, input, select, summary, [role=slider]")].filter((one) =>
+      !one.closest("[data-tip], #help") && one.checkVisibility()).map((one) => one.outerHTML)"""
+    for name in ("layers", "history", "cameras", "advanced"):
+        page.page.locator(f"#fold-{name} summary").click()
+    assert page.page.evaluate(tipless) == []
+    listed = page.page.locator("#help kbd").all_text_contents()
+    keys = page.page.evaluate("[...document.querySelectorAll('[data-keys]')].map((one) => one.dataset.keys)")
+    assert len(keys) > 25 and {key for key in keys if key not in " / ".join(listed)} == set()
+    for _ in range(2):  # dark and light
+        assert page.page.evaluate(_SWATCH_CONTRAST) >= 3
+        page.does("do-theme")
+    page.page.set_viewport_size({"width": 1690 - size[0], "height": 700})  # across the breakpoint
+    page.until(lambda: page.page.locator("#stage").bounding_box() != stage, "another layout")
+    assert page.page.evaluate("!document.body.innerText.includes(page.connection.memory.token)")
     page.leave()
+
+
+def test_the_pointer_tells_what_is_drawn(page: OnPage) -> None:
+    things(page)
+    page.ask("red, yellow, sky blue")
+    page.selects(lambda count: count > 0, "an answer")
+    same, named = page.pointed()
+    assert same >= 95 and named >= 95
 
 
 def test_a_browser_without_webgl_gets_stills(page: OnPage, own: Server, browser: Browser) -> None:
@@ -290,6 +340,9 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
     modes = ("heat", "prompts", "rgb", "reliability", "pca", "overlay")
     names = "hide show invert hide show undo undo redo grow shrink isolate show theme theme"
     steps = [*(f"mode-{mode}" for mode in modes), *(f"do-{name}" for name in names.split()), "mode-heat", "mode-rgb"]
+    threshold = page.state("threshold")
+    for _ in range(4):
+        page.page.locator("#threshold").press("ArrowRight")
     for step in steps:
         page.does(step)
         page.page.wait_for_timeout(150)
@@ -306,3 +359,9 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
         == geometry
     )
     assert min(page.measured("colors")) <= 150
+    assert page.state("threshold") > threshold
+    before = page.page.evaluate("page.revision")
+    assert page.page.evaluate("(page.search.ask('yellow'), !document.querySelector('#busy').hidden)")
+    page.until(lambda: page.page.evaluate("page.revision") > before and page.page.locator("#busy").is_hidden(), "done")
+    assert page.state("threshold") == threshold  # that of the question before is not carried over
+    assert re.fullmatch(r"\d\.\d\d", page.page.locator("#threshold-value").inner_text())

@@ -154,7 +154,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, stock: Server, browser: Brows
     other.asks("red", answered=1)  # but a question ends the waiting
     tab.until(lambda: ARMED not in tab.text() and tab.answered() == 1, "disarmed")
     tab.asks("red", answered=1)
-    for text, prompts in (("yellow", 1), (", ".join(f"red {i}" for i in range(50)), 8), ("x" * 10_000, 8)):
+    for text, prompts in (("yellow", 1), (", ".join(f"red {i}" for i in range(50)), 8), ("x" * 10_000, 0)):
         tab.ask(text)
         other.drag(15, 0)
         for one in (tab, other):

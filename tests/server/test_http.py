@@ -1,5 +1,6 @@
 """The HTTP API of a small lifted run, its client, and what the server refuses."""
 
+import gzip
 import io
 import json
 import socket
@@ -183,6 +184,17 @@ def test_bodies_are_bounded_headers_are_strict_and_no_file_outside_is_served(cli
     assert "build" in client.get("/").text
     monkeypatch.setattr(app_module, "PAGE_FOLDER", tmp_path / "page")
     assert client.get("/").text == "<p>the page" and client.get("/assets/a.js").text == "1"
+    (tmp_path / "page" / "assets" / "a.js.gz").write_bytes(gzip.compress(b"compressed"))
+    compressed, plain = ("compressed", "gzip"), ("1", None)
+    for accepted, expected in (("gzip, br", compressed), ("identity", plain), ("gzip;q=0", plain)):
+        given = {"accept-encoding": accepted}
+        answer, head = (ask("/assets/a.js", headers=given) for ask in (client.get, client.head))
+        assert (answer.text, answer.headers.get("content-encoding")) == expected
+        assert answer.headers["vary"] == "Accept-Encoding" and "javascript" in answer.headers["content-type"]
+        assert (head.status_code, head.headers["content-length"]) == (200, answer.headers["content-length"])
+    part = client.get("/assets/a.js", headers={"accept-encoding": "identity", "range": "bytes=0-0"})
+    assert (part.status_code, part.text, part.headers["content-range"]) == (206, "1", "bytes 0-0/1")
+    assert "content-encoding" not in client.get("/api/runs", headers={"accept-encoding": "gzip"}).headers  # no secrets
     for path in (
         "/assets/../../secret",
         "/assets/%2e%2e/%2e%2e/secret",

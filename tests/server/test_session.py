@@ -82,7 +82,15 @@ def test_questions_colors_and_history(page):
     page.do("ask", {"line": "green"})
     assert page.state["selected"] == 0 and page.state["threshold"] < 0.9999  # not that of the question before
     assert "Nothing is selected" in page.refused("isolate")
+    page.do("ask", {"line": "red"})
+    page.do("ask", {"line": "zebra"})  # the answer before it goes
+    assert "unknown" in page.state["prompts"][0]["error"] and page.state["selected"] == 0
+    assert page.state["histogram"] is page.state["threshold"] is None and set(page.codes) == {0}
+    assert any(message["type"] == "message" and "zebra" in message["text"] for message in page.told)
+    page.do("undo")
+    assert page.state["selected"] == 2 * BLOCK and page.state["line"] == "red" and page.color(0)[3] > 0
     page.do("clear")
+    assert set(page.codes) == {0}  # the colors of the scene
     assert page.state["line"] == "" and page.state["prompts"] == [] and page.state["histogram"] is None
 
 

@@ -30,6 +30,9 @@ export const grouped = (count) => count.toLocaleString("en-US");
 /** @param {number} value @param {number} [digits] */
 export const fixed = (value, digits = 2) => (Number.isFinite(value) ? value.toFixed(digits) : "–");
 
+/** Color of a selection made by hand. */
+export const BY_HAND = [1, 0.75, 0.1];
+
 /** @param {number[]} rgb Values in 0..1. */
 export const cssColor = (rgb) => `rgb(${rgb.map((x) => Math.round(255 * x)).join(" ")})`;
 

@@ -34,9 +34,10 @@ export function startTooltips() {
   document.addEventListener("pointerover", (event) => event.pointerType !== "touch" && show(event));
   document.addEventListener("pointerdown", hide, true);
   document.addEventListener("focusin", (event) => {
-    if (event.target instanceof Element && event.target.matches(":focus-visible")) show(event, 600);
+    if (event.target instanceof Element && event.target.matches(":focus-visible:not(#prompts, [type=text])")) show(event, 600);
   });
   document.addEventListener("focusout", hide);
+  document.addEventListener("input", hide);
   addEventListener("scroll", hide, true);
 }
 

@@ -1,5 +1,5 @@
 /** Panel with selection, objects, layers, history, cameras and advanced settings. */
-import { $, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
+import { $, BY_HAND, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 
 const COLORMAPS = ["viridis", "cividis", "inferno", "magma", "turbo"];
@@ -38,12 +38,12 @@ export function button(label, name, tip, keys, press, more = {}) {
   );
 }
 
-/** @param {string} id @param {string} title @param {Node[]} children @param {boolean} [open] */
-function fold(id, title, children, open = false) {
+/** @param {string} id @param {string} title @param {string} tip @param {Node[]} children @param {boolean} [open] */
+function fold(id, title, tip, children, open = false) {
   return h(
     "details",
     { id: `fold-${id}`, open },
-    h("summary", {}, title, h("span.count", { id: `${id}-count` })),
+    h("summary", { "data-tip": tip }, title, h("span.count", { id: `${id}-count` })),
     h("div", {}, ...children),
   );
 }
@@ -189,6 +189,7 @@ export class Panel {
             step: 0.005,
             oninput: () => this.slid("threshold"),
             onchange: () => this.rested(),
+            "data-tip": "Select Gaussians above this relevancy.",
           }),
         ),
         h(
@@ -208,17 +209,17 @@ export class Panel {
           }),
         ),
       ),
-      fold("objects", "Objects", [h("ul.list", { id: "objects" })], true),
-      fold("layers", "Layers", [
+      fold("objects", "Objects", "Separate parts of the selection.", [h("ul.list", { id: "objects" })], true),
+      fold("layers", "Layers", "Selections that you have saved.", [
         h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to restore it later."),
         h("ul.list", { id: "layers" }),
       ]),
-      fold("history", "History", [h("ol.list", { id: "history" })]),
-      fold("cameras", "Training cameras", [h("div", { id: "cameras" })]),
-      fold("advanced", "Advanced", this.advanced()),
+      fold("history", "History", "All steps. Press one to go back to it.", [h("ol.list", { id: "history" })]),
+      fold("cameras", "Training cameras", "Look from where an image was taken.", [h("div", { id: "cameras" })]),
+      fold("advanced", "Advanced", "Negative prompts, rule, colormap, floaters and saved prompts.", this.advanced()),
     );
     $("facts").textContent =
-      `${grouped(run.num_drawn)} Gaussians · ${grouped(run.num_views)} images` +
+      `${grouped(run.num_gaussians)} Gaussians · ${grouped(run.num_views)} images` +
       (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} not drawn, to keep the browser responsive` : "");
     $("fold-cameras").addEventListener("toggle", () => this.showCameras(), { once: true });
   }
@@ -249,7 +250,15 @@ export class Panel {
         "label.field",
         {},
         h("span", {}, "Relevancy rule"),
-        h("select", { id: "rule", onchange: () => act("rule", $("rule").value, $("rule")) }, ...options(RULES)),
+        h(
+          "select",
+          {
+            id: "rule",
+            "data-tip": "Formula that compares a Gaussian with prompts and negative prompts.",
+            onchange: () => act("rule", $("rule").value, $("rule")),
+          },
+          ...options(RULES),
+        ),
       ),
       h(
         "label.field",
@@ -257,7 +266,11 @@ export class Panel {
         h("span", {}, "Colormap"),
         h(
           "select",
-          { id: "colormap", onchange: () => act("colormap", $("colormap").value, $("colormap")) },
+          {
+            id: "colormap",
+            "data-tip": "Colors of the heat map.",
+            onchange: () => act("colormap", $("colormap").value, $("colormap")),
+          },
           ...options(COLORMAPS.map((name) => [name, name])),
         ),
       ),
@@ -384,7 +397,8 @@ export class Panel {
       parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
     if (hidden > 0) parts.push(`${grouped(hidden)} hidden`);
     if (some && state.by_hand) parts.push("by hand");
-    $("selected-more").textContent = parts.join(" · ") || (some ? "Gaussians" : "Search, or click an object.");
+    if (some) parts.unshift(`of ${grouped(state.total)} Gaussians`);
+    $("selected-more").textContent = parts.join(" · ") || "Search, or click an object.";
     $("warning").textContent = state.warning ?? "";
     for (const id of [
       "do-hide",
@@ -443,6 +457,7 @@ export class Panel {
     $("objects-count").textContent = state.objects.length
       ? grouped(state.objects.length + (state.more_objects ?? 0))
       : "";
+    const colors = new Map(state.prompts.map((/** @type {any} */ one) => [one.text, one.color]));
     const rows = state.objects.map((/** @type {any} */ one) => {
       const facts = `${grouped(one.count)} · ${evidence(one.reliability)} evidence`;
       const small = (
@@ -458,6 +473,7 @@ export class Panel {
       return h(
         "li",
         { "data-id": one.id },
+        h("span.swatch", { style: `background: ${cssColor((!state.by_hand && colors.get(one.text)) || BY_HAND)}` }),
         h(
           "button.main",
           {
@@ -550,6 +566,7 @@ export class Panel {
             `button.main${i > step ? ".undone" : ""}`,
             {
               type: "button",
+              "data-tip": "Go to this step.",
               "data-key": `step-${i}`,
               "aria-current": i === step ? "step" : null,
               onclick: (/** @type {Event} */ event) =>

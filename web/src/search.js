@@ -1,5 +1,5 @@
 /** Search box with examples and answers. */
-import { $, cssColor, fill, fixed, grouped, h } from "./dom.js";
+import { $, BY_HAND, cssColor, fill, fixed, grouped, h } from "./dom.js";
 import { icon } from "./icons.js";
 
 export class Search {
@@ -23,6 +23,7 @@ export class Search {
       this.cancel();
       $("prompts").blur();
     });
+    Object.assign($("prompts").dataset, { tip: "Type what to look for.", keys: "/" });
     Object.assign($("ask").dataset, {
       tip: "Search. Separate several prompts by commas. Put a prompt that contains a comma in double quotes.",
       keys: "Enter",
@@ -56,7 +57,7 @@ export class Search {
   showExamples(shown) {
     const { examples, saved_prompts: saved } = this.run;
     const pill = (/** @type {string} */ text) =>
-      h("button.pill", { type: "button", onclick: () => this.ask(text) }, text);
+      h("button.pill", { type: "button", "data-tip": `Ask ${text}.`, onclick: () => this.ask(text) }, text);
     const pills = [
       ...(saved.length > 0 ? [h("span.soft.small", {}, "Saved:"), pill(saved.join(", "))] : []),
       ...(examples.length > 0 ? [h("span.soft.small", {}, "Try:"), ...examples.slice(0, 4).map(pill)] : []),
@@ -85,7 +86,7 @@ export class Search {
           h(
             "span.chip",
             {},
-            h("span.swatch", { style: "background: rgb(255 191 26)" }),
+            h("span.swatch", { style: `background: ${cssColor(BY_HAND)}` }),
             h("span", {}, "Selected by hand"),
           ),
         ),
