@@ -14,6 +14,7 @@ from normlift_ns.options import RasterizeMode
 
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
+_OF_3DGUT = ("with_ut", "with_eval3d")
 _ADVICE = "Copy it from the training run again, or move the splat to a separate folder."
 
 
@@ -46,10 +47,8 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     if config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
         return None  # another program wrote the file
     texts = {name: config_string(root, name) for name in ("camera_model", "model_type", "test_every")}
-    flags = {
-        name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", "with_ut", "with_eval3d")
-    }
-    of_3dgut = next((name for name in ("with_ut", "with_eval3d") if flags[name] is True), None)
+    flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", *_OF_3DGUT)}
+    of_3dgut = next((name for name in _OF_3DGUT if flags[name] is True), None)
     _check_primitive(path, texts["camera_model"], texts["model_type"], of_3dgut)
     test_every = texts["test_every"]
     if test_every is not None and not (test_every.isdecimal() and 0 < int(test_every) < 10**9):

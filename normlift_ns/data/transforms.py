@@ -404,7 +404,8 @@ def _is_fisheye(entries: TransformsEntries, frame: FrameEntry, path: Path) -> bo
     if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE", *FISHEYE_MODELS):
         raise InputError(
             f"{path}: the camera_model of {frame.file_path} is {model}, expected one of "
-            f"{', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))}. Undistort the images, and give their new cameras in the same world."
+            f"{', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))}. Undistort the images, and give their new cameras in "
+            "the same world."
         )
     return model in FISHEYE_MODELS
 
