@@ -353,7 +353,7 @@ class ImageViews(SplitViews):
 
 _MIN_MAGNIFICATION = 0.2
 """Minimum ratio of the focal lengths of the undistorted and the original image of a fisheye camera."""
-_SAMPLES = 64
+_SAMPLES = 256
 """Number of rows and of columns of pixels from which `kept_share` is estimated."""
 
 

@@ -145,6 +145,7 @@ def test_fisheye_cameras_are_stored_for_nerfstudio(tmp_path: Path) -> None:
     for lens in (LENS, zero):
         path = transforms(tmp_path, lens, {"camera_model": "OPENCV_FISHEYE"})
         frames = read_transforms(path).frames
+        (tmp_path / "again.json").unlink(missing_ok=True)
         write_transforms(tmp_path / "again.json", frames, ())
         again = read_transforms(tmp_path / "again.json").frames
         assert json.loads((tmp_path / "again.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
