@@ -1,6 +1,7 @@
 """Fisheye images of camera files: a float64 projection of Kannala and Brandt is the reference."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,19 @@ import pytest
 import torch
 from PIL import Image
 
+import normlift_ns as nl
 from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import Frame, Intrinsics, check_frames
-from normlift_ns.data.images import ImageViews, kept_share, label_undistortion
+from normlift_ns.data.images import ImageViews, kept_share, label_undistortion, undistort_labels
+from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.transforms import read_transforms, write_transforms
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
+from normlift_ns.evidence_collection import observe_views
 from normlift_ns.options import SplatOptions
 from normlift_ns.segmentation.regions import LabelFiles
-from tests.data.scene_files import write_colmap
+from tests.data.scene_files import ply_columns, random_splat, saved_run, write_colmap, write_ply
 
 LENS = Intrinsics(150.0, 152.0, 104.0, 77.0, 200, 160, k1=0.03, k2=-0.01, k3=0.004, k4=-0.001, fisheye=True)
 MODELS = {
@@ -156,3 +162,31 @@ def test_fisheye_cameras_are_stored_for_nerfstudio(tmp_path: Path) -> None:
     mixed = [frames[0], Frame(tmp_path / "b.png", "b.png", np.eye(4)[:3], zero._replace(fisheye=False))]
     with pytest.raises(InputError, match=r"images/a\.png has a fisheye .*b\.png has a perspective"):
         check_frames(mixed, path)
+
+
+def test_a_splat_is_opened_with_fisheye_images(tmp_path: Path) -> None:
+    """The views of its stored run are the same; label maps of the original images are undistorted for the lift."""
+    said, labels = [], np.arange(160)[:, None] // 20 + np.zeros((1, 200), int)
+    for folder in ("images", "maps"):
+        (tmp_path / folder).mkdir()
+    frames = [Frame(tmp_path / f"{i}.png", f"images/{i}.png", np.eye(4)[:3], LENS) for i in range(3)]
+    for i in range(3):
+        Image.effect_noise((200, 160), 90).convert("RGB").save(tmp_path / "images" / f"{i}.png")
+        np.save(tmp_path / "maps" / f"{i}.npy", labels + 1)
+    write_colmap(tmp_path, frames, "OPENCV_FISHEYE")
+    splat = write_ply(tmp_path / "a.ply", ply_columns(random_splat(50)))
+    scene = nl.open_splat(splat, nl.SplatOptions(colmap=tmp_path, gsplat_normalize=False), say=said.append)
+    assert any(f"{kept_share(LENS):.0%}" in text for text in said)
+    again = open_saved_splat(saved_run(tmp_path / "run", scene))
+    for first, second in zip(scene.train, again.train):
+        assert torch.equal(first.camera.K, second.camera.K)
+        assert torch.equal(first.image, second.image)
+    source = RegionFeatures(LabelFiles(tmp_path / "maps"), ColorEncoder())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for downscale in (1, 2):
+            block = observe_views(scene, [1], source, render_settings=None, downscale=downscale)
+            undistorted = undistort_labels(labels[None], LENS)[0]
+            step = block.labels[0][:, 100 // downscale].numpy()
+            assert np.abs(step - undistorted[downscale // 2 :: downscale, 100]).max() <= downscale - 1
+            assert np.abs(undistorted[:, 100] - labels[:, 100]).max() == 1  # the map is not that of the file
