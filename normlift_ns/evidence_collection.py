@@ -23,6 +23,7 @@ from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
+from normlift_ns.data.images import label_undistortion
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
@@ -236,7 +237,8 @@ def observe_views(
         ValueError, FileNotFoundError: as in `FeatureSource.view` and `check_undistorted`; also if an image, a mask or
             a label map differs in size from its camera.
     """
-    source, waiting = downscaled_source(source, downscale), deque[View]()
+    source = undistorting_source(downscaled_source(source, downscale), label_undistortion(scene.train))
+    waiting = deque[View]()
 
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
@@ -267,11 +269,20 @@ def observe_views(
 
 def downscaled_source(source: Any, divisor: int) -> Any:
     """Return a feature source that also accepts label maps in the image size before downscaling."""
-    if isinstance(source, LabelFiles | PrecomputedFeatures) and source.divisor != divisor:
-        return replace(source, divisor=divisor)
+    return _replace_in_source(source, LabelFiles | PrecomputedFeatures, divisor=divisor)
+
+
+def undistorting_source(source: Any, undistort: Callable[[str, Any], Any] | None) -> Any:
+    """Return a feature source that undistorts its label maps; see `label_undistortion`."""
+    return source if undistort is None else _replace_in_source(source, LabelFiles, undistort=undistort)
+
+
+def _replace_in_source(source: Any, kinds: Any, **fields: Any) -> Any:
+    if isinstance(source, kinds) and any(getattr(source, name) != value for name, value in fields.items()):
+        return replace(source, **fields)
     for name in {RegionFeatures: ("regions",), CachedRegions: ("inner",)}.get(type(source), ()):
         part = getattr(source, name)
-        if (other := downscaled_source(part, divisor)) is not part:
+        if (other := _replace_in_source(part, kinds, **fields)) is not part:
             return replace(source, **{name: other})
     return source
 
@@ -384,7 +395,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
     maps = maps.inner if isinstance(maps, CachedRegions) else maps
-    if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
+    if original_size is None or not isinstance(maps, LabelFiles | LangSplat) or getattr(maps, "undistort", None):
         return
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]

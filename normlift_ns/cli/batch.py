@@ -121,6 +121,10 @@ def _capture_key(command: NormLift) -> str:
     features, label maps and weights, it includes only the paths.
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
+    if options["splat"].pop("primitive") is not None or command.splat.world_transform is None:
+        options["new"] = [command.splat.primitive, command.splat.world_transform]
+    elif command.splat.world_transform == "auto":
+        options["splat"]["world_transform"] = None  # as in version 0.2, whose batches stay valid
     files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
     if command.load_config is not None:
         step = "*" if command.load_step is None else f"{command.load_step:09d}"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from normlift_ns.data.frames import PERSPECTIVE_MODELS, Frame, Intrinsics, find_images, find_masks
+from normlift_ns.data.frames import FISHEYE_MODELS, PERSPECTIVE_MODELS, Frame, Intrinsics, find_images, find_masks
 from normlift_ns.data.transforms import CameraFile, relative_name
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import read_file
@@ -30,8 +30,13 @@ CAMERA_MODELS = {
     "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
 }
 """Names of the parameters of COLMAP's camera models. The models are in the order of their IDs in binary files."""
-_SIMPLE_IF_ZERO = {"FULL_OPENCV": ("k4", "k5", "k6"), "FOV": ("omega",)}
-"""Camera models that equal one of `PERSPECTIVE_MODELS` if the given parameters are zero."""
+_MODELS = (*PERSPECTIVE_MODELS, *FISHEYE_MODELS)
+_SIMPLE_IF_ZERO = {
+    "FULL_OPENCV": ("k4", "k5", "k6"),
+    "FOV": ("omega",),
+    "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1"),
+}
+"""Camera models that equal one of `_MODELS` if the given parameters are zero."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
@@ -176,23 +181,24 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
     """Return the intrinsics of a camera.
 
-    The models FULL_OPENCV and FOV are supported only if they equal a simpler model.
+    The models FULL_OPENCV, FOV and THIN_PRISM_FISHEYE are supported only if they equal a simpler model.
 
     Raises:
         ValueError: `normlift_ns` cannot undistort images of this camera model.
     """
     parameters: dict[str, Any] = {}
-    if camera.model in (*PERSPECTIVE_MODELS, *_SIMPLE_IF_ZERO):
+    if camera.model in (*_MODELS, *_SIMPLE_IF_ZERO):
         parameters = camera.named_parameters()
     extra = {name: parameters.pop(name) for name in _SIMPLE_IF_ZERO.get(camera.model, ())}
     if len(parameters) == 0 or any(extra.values()):
         numbers = "".join(f", {name} = {value:g}" for name, value in extra.items())
         raise InputError(
             f"{model}: camera {camera.camera_id} has the model {camera.model}{numbers}, expected one of "
-            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, keep the splat, and give the new folder with "
+            f"{', '.join(_MODELS)}. Undistort the images, keep the splat, and give the new folder with "
             f"--colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
         )
-    return Intrinsics(width=camera.width, height=camera.height, **parameters)
+    lens = Intrinsics(width=camera.width, height=camera.height, **parameters)
+    return lens.as_fisheye() if "FISHEYE" in camera.model else lens
 
 
 def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:

@@ -127,6 +127,10 @@ GIVE_IMAGES = "give the folder of the images with --images"
 """Advice on missing images if the options do not contain their folder."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """Perspective camera models that `Intrinsics` can represent, by their names in COLMAP and nerfstudio."""
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
+_SMALLEST = 1e-12
+"""Distortion that moves no pixel. nerfstudio takes fisheye cameras whose distortion is zero for pinholes."""
 
 
 class Intrinsics(NamedTuple):
@@ -158,6 +162,10 @@ class Intrinsics(NamedTuple):
     def is_distorted(self) -> bool:
         """True if a distortion parameter is not zero."""
         return any(self[6:12])
+
+    def as_fisheye(self) -> Intrinsics:
+        """Return the intrinsics of a fisheye camera, with a distortion that is not zero."""
+        return self._replace(k1=self.k1 if self.is_distorted else _SMALLEST, fisheye=True)
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the intrinsics of the same image at another size in pixels."""
@@ -197,7 +205,7 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
 
     Raises:
         ValueError: There are no cameras, a name occurs twice, or a pose is not rigid. A number is not finite, or a
-            focal length or size is not positive.
+            focal length or size is not positive. Some cameras are fisheye cameras, and others are not.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")
@@ -223,6 +231,18 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     duplicates = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if duplicates:
         raise InputError(f"{source} lists {duplicates[0]} more than once. Remove all but one of its entries.")
+    check_lens_types(frames, source)
+
+
+def check_lens_types(frames: Sequence[Frame], source: Path) -> None:
+    """Raise InputError if some frames have fisheye cameras and others do not, which a nerfstudio run cannot store."""
+    first = {frame.intrinsics.fisheye: frame.name for frame in reversed(frames)}
+    if len(first) > 1:
+        raise InputError(
+            f"{source}: {first[True]} has a fisheye camera, but {first[False]} has a perspective camera. Expected one "
+            "type for all images. Undistort the fisheye images, for example with colmap image_undistorter, and give "
+            "the new cameras with the same poses."
+        )
 
 
 def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *, allow_copies: bool) -> list[Path]:

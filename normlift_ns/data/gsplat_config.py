@@ -17,6 +17,7 @@ _NAMES = ("cfg.yml", "cfg.json")
 """Names of the file; that of simple_trainer_2dgs.py ends with .json, which is YAML too."""
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
+_OF_3DGUT = ("with_ut", "with_eval3d")
 _ADVICE = "Copy it from the training run again, or move the splat to a separate folder."
 
 
@@ -53,8 +54,9 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     if config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
         return None  # another program wrote the file
     texts = {name: config_string(root, name) for name in ("camera_model", "model_type", "test_every")}
-    flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", "with_ut")}
-    _check_primitive(path, texts["camera_model"], texts["model_type"], is_3dgut=flags["with_ut"] is True)
+    flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", *_OF_3DGUT)}
+    of_3dgut = next((name for name in _OF_3DGUT if flags[name] is True), None)
+    _check_primitive(path, texts["camera_model"], texts["model_type"], of_3dgut)
     test_every = texts["test_every"]
     if test_every is not None and not (test_every.isdecimal() and 0 < int(test_every) < 10**9):
         raise InputError(f"{path} has test_every {test_every[:40]!r}, expected a whole number above 0. {_ADVICE}")
@@ -90,11 +92,11 @@ def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
     return None if text is None else text == "true"
 
 
-def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, *, is_3dgut: bool) -> None:
-    if is_3dgut:
-        problem = "with_ut true (3DGUT), whose Gaussians are drawn in another way"
+def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, of_3dgut: str | None) -> None:
+    if of_3dgut is not None:
+        problem = f"{of_3dgut} true (3DGUT), which renders Gaussians in another way"
     elif model_type not in (None, "3dgs", "2dgs"):
-        problem = f"model_type {model_type[:40]}, whose Gaussians are drawn in another way"
+        problem = f"model_type {model_type[:40]}, which renders Gaussians in another way"
     elif camera_model not in (None, "pinhole"):
         problem = f"camera_model {camera_model[:40]}"
     else:

@@ -22,7 +22,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View, Views, camera_summary, cameras_differ
 from normlift_ns.data.alignment import Alignment
 from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
-from normlift_ns.data.frames import Frame, check_frames
+from normlift_ns.data.frames import Frame, check_frames, check_lens_types
 from normlift_ns.data.images import ImageViews
 from normlift_ns.data.nerfstudio.load import NerfstudioScene, load_nerfstudio_scene
 from normlift_ns.data.splat import SplatParameters
@@ -220,11 +220,13 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
     """Return the scene with additional training views. Their cameras must be in the world of the scene.
 
     Raises:
-        FileNotFoundError, ValueError: An image is missing or cannot be read.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or it has a fisheye camera and the images
+            of a `SplatScene` do not, or the other way round.
     """
     views = ImageViews(frames, scene.background)
     remarks = (*scene.remarks, *views.check_files())
     if isinstance(scene, SplatScene):
+        check_lens_types([*scene.train.frames, *frames], scene.checkpoint_path)
         train = sorted([*scene.train.frames, *frames], key=lambda frame: frame.file)
         return replace(scene, train=ImageViews(train, scene.background), remarks=remarks, alignment=None)
     return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, extra_frames=tuple(frames))

@@ -15,7 +15,7 @@ from normlift_ns.core.device import choose_device
 from normlift_ns.data.cameras import adjust_poses, read_camera_file
 from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
-from normlift_ns.data.images import held_out_names
+from normlift_ns.data.images import held_out_names, kept_share
 from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, SplatParameters, flatten_splat, validate_splat
 from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
@@ -332,6 +332,12 @@ def _assumptions(
     else:
         texts.append(f"All {len(frames)} images are lifted; to hold out some, give --test-every or --eval-images.")
     texts += cameras.remarks
+    lens = frames[0].intrinsics
+    if lens.fisheye:
+        texts.append(
+            f"Fisheye images are undistorted as in ns-train, which keeps {kept_share(lens):.0%} of the pixels of "
+            f"{frames[0].name}. Masks and label maps are undistorted too: give those of the original images."
+        )
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 
 from normlift_ns.data.frames import (
+    FISHEYE_MODELS,
     GIVE_IMAGES,
     PERSPECTIVE_MODELS,
     Frame,
@@ -348,7 +349,8 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
     given = [(e, s) for e, s in ((entries, "."), (frame, ".frames[].")) if _given(e, *_DISTORTION_VALUES)]
     for entry, start in given:
         label = ", ".join(f"{start}{name}" for name, _ in _given(entry, *_DISTORTION_VALUES))
-        values = zip(("k1", "k2", "k3", "p1", "p2"), _distortion(entry, f"{path}: {frame.file_path}"))
+        distortion = _distortion(entry, f"{path}: {frame.file_path}", is_fisheye=lens.fisheye)
+        values = zip(("k1", "k2", "k3", "p1", "p2", "k4"), distortion)
         readings += [(name, label, value, _SAME) for name, value in values]
     for name, label, value, allowed in readings:
         first = found.setdefault(name, (label, value))
@@ -378,8 +380,12 @@ def _readings(
             yield name, f"{start}{name}", value
 
 
-def _check_model(entries: TransformsEntries, frame: FrameEntry, path: Path) -> None:
-    """Raise InputError if a frame has two camera models, or a model that cannot be undistorted."""
+def _is_fisheye(entries: TransformsEntries, frame: FrameEntry, path: Path) -> bool:
+    """Return True for a fisheye camera.
+
+    Raises:
+        ValueError: The frame has two camera models, or a model that cannot be undistorted.
+    """
     models = [item.camera_model for item in (entries, frame) if item.camera_model is not None]
     if len(set(models)) > 1:
         raise InputError(
@@ -387,12 +393,21 @@ def _check_model(entries: TransformsEntries, frame: FrameEntry, path: Path) -> N
             f"{models[1]}. Remove the model that the splat was not trained with: jq 'del(.frames[].camera_model)' "
             f"{path.name} > new.json, or jq 'del(.camera_model)' {path.name} > new.json"
         )
-    model = "OPENCV_FISHEYE" if entries.value(frame, "is_fisheye") else [*models, "OPENCV"][0].upper()
-    if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE"):
+    is_fisheye = bool(entries.value(frame, "is_fisheye"))
+    model = [*models, "OPENCV_FISHEYE" if is_fisheye else "OPENCV"][0].upper()
+    if is_fisheye and model not in FISHEYE_MODELS:
+        raise InputError(
+            f"{path} can be read in two ways: is_fisheye is true for {frame.file_path}, but its camera_model is "
+            f"{model}. nerfstudio reads the camera_model. Set it to OPENCV_FISHEYE, or remove is_fisheye: "
+            f"jq 'del(.is_fisheye, .frames[].is_fisheye)' {path.name} > new.json"
+        )
+    if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE", *FISHEYE_MODELS):
         raise InputError(
             f"{path}: the camera_model of {frame.file_path} is {model}, expected one of "
-            f"{', '.join(PERSPECTIVE_MODELS)}. Undistort the images, and give their new cameras in the same world."
+            f"{', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))}. Undistort the images, and give their new cameras in "
+            "the same world."
         )
+    return model in FISHEYE_MODELS
 
 
 def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:
@@ -403,7 +418,7 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
             view, differ.
     """
     value, source = partial(entries.value, frame), f"{path}: {frame.file_path}"
-    _check_model(entries, frame, path)
+    is_fisheye = _is_fisheye(entries, frame, path)
     size = (value("w"), value("h"))
     width, height = read_image_header(file).size if None in size else size
     angles = value("camera_angle_x"), value("camera_angle_y")
@@ -422,8 +437,9 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
         height / 2 if cy is None else cy,
         int(width),
         int(height),
-        *_distortion(entries if is_shared else frame, source),
+        *_distortion(entries if is_shared else frame, source, is_fisheye=is_fisheye),
     )
+    lens = lens.as_fisheye() if is_fisheye else lens
     _check_readings(entries, frame, lens, path)
     return lens
 
@@ -433,20 +449,29 @@ def _focal(focal: float | None, angle: float | None, side: float) -> float | Non
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 
-def _distortion(entry: CameraEntry, source: str) -> tuple[float, float, float, float, float]:
-    """Return the distortion parameters k1, k2, k3, p1 and p2; raise InputError if there are others."""
+def _distortion(
+    entry: CameraEntry, source: str, *, is_fisheye: bool
+) -> tuple[float, float, float, float, float, float]:
+    """Return the distortion parameters k1, k2, k3, p1, p2 and k4.
+
+    Raises:
+        ValueError: A parameter is not zero that the camera type does not have: k4 of perspective cameras, p1 and p2 of
+            fisheye cameras, and further ones.
+    """
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
     if entry.distortion_params is not None:
         values = [*entry.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values
-    others = [(name, number) for name, number in (("k4", k4), *_given(entry, "k5", "k6")) if number != 0]
+    unsupported = (("p1", p1), ("p2", p2)) if is_fisheye else (("k4", k4),)
+    others = [(name, number) for name, number in (*unsupported, *_given(entry, "k5", "k6")) if number != 0]
     if others:
         name, number = others[0]
         raise InputError(
-            f"{source} has the distortion {name} = {number:g}, but only k1, k2, k3, p1 and p2 are supported. "
+            f"{source} has the distortion {name} = {number:g}, but only k1, k2, k3"
+            f"{' and k4' if is_fisheye else ', p1 and p2'} are supported. "
             "Undistort the images, and give their new cameras in the same world."
         )
-    return k1, k2, k3, p1, p2
+    return k1, k2, k3, p1, p2, k4
 
 
 def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarray, "4 4"]:
@@ -467,10 +492,11 @@ def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarr
 def write_transforms(path: Path, frames: Sequence[Frame], held_out: Sequence[Frame]) -> None:
     """Write frames to a transforms.json for the data parser nerfstudio-data.
 
-    The data parser sorts frames by file, and reads numbers as float32.
+    The data parser sorts frames by file, and reads numbers as float32. It reads one camera model for all frames.
     """
     splits = {"train_filenames": frames, "val_filenames": held_out, "test_filenames": held_out}
-    content: dict[str, Any] = {"camera_model": "OPENCV"}
+    is_fisheye = any(frame.intrinsics.fisheye for frame in (*frames, *held_out))
+    content: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV"}
     if len(held_out) > 0:
         content |= {name: [str(frame.file) for frame in split] for name, split in splits.items()}
     content["frames"] = [_entry(frame) for frame in sorted((*frames, *held_out), key=lambda frame: frame.file)]
@@ -480,7 +506,8 @@ def write_transforms(path: Path, frames: Sequence[Frame], held_out: Sequence[Fra
 def _entry(frame: Frame) -> dict[str, Any]:
     camera = frame.intrinsics
     pose = torch.from_numpy(np.concatenate([frame.pose, [[0.0, 0.0, 0.0, 1.0]]])).float().tolist()
-    numbers = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2"), camera))
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2", *(("k4",) if camera.fisheye else ()))
+    numbers = dict(zip(names, camera))
     mask = {} if frame.mask is None else {"mask_path": str(frame.mask)}
     return {"file_path": str(frame.file), **mask, **numbers, "transform_matrix": pose}
 

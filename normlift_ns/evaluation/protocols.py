@@ -21,6 +21,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.metrics import NO_CLASS, class_scores, classify, confusion
 from normlift_ns.core.scene import Scene, Views
+from normlift_ns.data.images import label_undistortion
 from normlift_ns.encoders.text_files import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import Evaluation, MaskOptions, PromptText, read_document
@@ -251,7 +252,8 @@ def mask_truth(
     Raises:
         FileNotFoundError, ValueError: if masks or names are missing or damaged. The message names the file.
     """
-    masks = LabelFiles(folder, description="instance mask", flag="--labels")
+    undistort = label_undistortion(scene.train, scene.held_out)
+    masks = LabelFiles(folder, undistort=undistort, description="instance mask", flag="--labels")
     images = [*scene.train.names, *scene.held_out.names]
     check_files_distinct(
         ((name, masks.path(name)) for name in images), masks.description, "in folders named like those of the images"

@@ -6,7 +6,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -157,6 +157,10 @@ class LabelFiles(RegionDefaults):
     """True to resize maps of another size by nearest-neighbor interpolation, False to raise an error."""
     divisor: int = 1
     """Factor by which images were downscaled (`lift_downscale`). Maps of full-size images are downscaled to match."""
+    undistort: Callable[[str, np.ndarray], np.ndarray] | None = None
+    """Function of an image name and its maps [levels, H, W] that undistorts maps of original, distorted images.
+
+    If None, the maps show the undistorted images."""
     description: str = "label map"
     """Description of a file in messages."""
     flag: str = "--regions-dir"
@@ -173,7 +177,8 @@ class LabelFiles(RegionDefaults):
 
     @property
     def identity(self) -> dict[str, Any]:
-        return {"kind": "files", "background": self.background, "resample": self.resample}
+        identity = {"kind": "files", "background": self.background, "resample": self.resample}
+        return identity if self.undistort is None else {**identity, "undistort": True}
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -242,7 +247,7 @@ class LabelFiles(RegionDefaults):
         return path, width, height
 
     def values(self, name: str) -> np.ndarray:
-        """Read the label maps of an image, [levels, H, W], with their stored integer type.
+        """Read the label maps of an image, [levels, H, W], with their stored integer type unless `undistort` is given.
 
         Raises:
             FileNotFoundError: If the label map does not exist.
@@ -271,7 +276,8 @@ class LabelFiles(RegionDefaults):
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
-        return maps.reshape(-1, *maps.shape[-2:])
+        maps = maps.reshape(-1, *maps.shape[-2:])
+        return maps if self.undistort is None else self.undistort(name, maps)
 
 
 def is_downscaled(before: Sequence[int], after: Sequence[int], divisor: int) -> bool:

@@ -264,8 +264,9 @@ class Controller(ABC):
                 prompts, query = build_query(space.field, prompts, self._encode, **settings)
 
         def ask(state: State) -> State:
-            fixed = query is None or "threshold" in settings
-            return actions.ask(state, prompts, query if fixed else carry_threshold(state, query))
+            if query is None or "threshold" in settings:
+                return actions.ask(state, prompts, query)
+            return actions.ask(state, prompts, carry_threshold(state, query))
 
         self._show_result(token, ask, message)
 

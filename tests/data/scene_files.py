@@ -16,7 +16,16 @@ from normlift_ns.data.open_scene import SplatScene, save_splat, splatfacto_check
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import decompose_similarity
 
-NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+NUMBERS = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+}
+NUMBERS |= {"SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10}
 
 
 def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> SplatParameters:
@@ -113,7 +122,11 @@ def camera_parameters(model: str, c: Intrinsics) -> list[float]:
         "SIMPLE_RADIAL": [c.fx, c.cx, c.cy, c.k1],
         "RADIAL": [c.fx, c.cx, c.cy, c.k1, c.k2],
         "OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2],
-        "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, 0.01, 0.0, 0.0, 0.0],
+        "FULL_OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, 0.01, 0.0, 0.0],
+        "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.k3, c.k4],
+        "SIMPLE_RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1],
+        "RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1, c.k2],
+        "THIN_PRISM_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, 0.0, 0.0, c.k3, c.k4, 0.0, 0.0],
     }[model]
 
 

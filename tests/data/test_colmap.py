@@ -116,7 +116,7 @@ def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
     for line, message in (
         ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"FULL_OPENCV, k4 = 0, k5 = 0\.1"),
         ("FOV 640 480 500 501 320 240 0.5", r"FOV, omega = 0\.5"),
-        ("OPENCV_FISHEYE 640 480 500 501 320 240 0 0 0 0", "OPENCV_FISHEYE, "),
+        ("THIN_PRISM_FISHEYE 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"THIN_PRISM_FISHEYE, .*sx1 = 0\.1"),
     ):
         (folder / "cameras.txt").write_text(f"1 {line}\n")
         with pytest.raises(InputError, match=f"{message}.*colmap image_undistorter .*--input_path") as caught:
@@ -126,8 +126,8 @@ def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
 
 def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:
     for binary in (False, True):
-        folder = find_colmap_model(write_colmap(tmp_path / str(binary), frames(), "OPENCV_FISHEYE", binary=binary))
-        with pytest.raises(InputError, match=r"OPENCV_FISHEYE, .* SIMPLE_PINHOLE, PINHOLE"):
+        folder = find_colmap_model(write_colmap(tmp_path / str(binary), frames(), "FULL_OPENCV", binary=binary))
+        with pytest.raises(InputError, match=r"FULL_OPENCV, .* SIMPLE_PINHOLE, PINHOLE"):
             read_cameras(folder)
     folder = find_colmap_model(write_colmap(tmp_path, frames()))
     for name, start, count, message in (

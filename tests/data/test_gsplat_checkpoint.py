@@ -130,7 +130,8 @@ def test_settings_of_the_training_are_read(tmp_path: Path) -> None:
 def test_other_primitives_and_damaged_settings_are_refused(tmp_path: Path) -> None:
     path = write_gsplat(tmp_path / "ckpt_29999_rank0.pt", random_splat())
     for old, new, message in (
-        ("with_ut: false", "with_ut: true", "3DGUT"),
+        ("with_ut: false", "with_ut: true", r"with_ut true \(3DGUT\)"),
+        ("with_ut: false", "with_eval3d: true", r"with_eval3d true \(3DGUT\)"),
         ("camera_model: pinhole", "camera_model: fisheye", "camera_model fisheye"),
         ("camera_model: pinhole", "camera_model: ortho", "camera_model ortho"),
         ("ckpt: null", "model_type: 2dgs-inria", "model_type 2dgs-inria"),

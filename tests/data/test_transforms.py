@@ -144,13 +144,14 @@ def test_paths_of_another_machine(tmp_path: Path, start: str) -> None:
 
 def test_other_content_is_refused(tmp_path: Path) -> None:
     for content, frame, message in (
-        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE, .* OPENCV"),
+        ({**INTRINSICS, "camera_model": "EQUIRECTANGULAR"}, {}, "EQUIRECTANGULAR, .* OPENCV"),
+        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE", "p1": 0.1}, {}, "p1 = 0.1, .* k3 and k4"),
         ({"w": 40, "h": 30}, {}, "fl_x nor camera_angle_x"),
         ({**INTRINSICS, "k4": 0.1}, {}, "k4 = 0.1"),
         ({**INTRINSICS, "w": 40.5}, {}, "whole number"),
         ({**INTRINSICS, "w": 0}, {}, "w is 0, .*whole number"),
         ({**INTRINSICS, "h": 10**30}, {}, "whole number"),
-        ({**INTRINSICS, "is_fisheye": True}, {}, "OPENCV_FISHEYE"),
+        ({**INTRINSICS, "is_fisheye": True, "camera_model": "OPENCV"}, {}, "is_fisheye .* OPENCV_FISHEYE"),
         ({"camera_angle_x": 0, "w": 40, "h": 30}, {}, "camera_angle is 0.* 0 and pi"),
         ({**INTRINSICS, "applied_scale": 0}, {}, "applied_scale is 0"),
         ({**INTRINSICS, "applied_transform": [[0, 0, 0, 0]] * 3}, {}, "applied_transform"),
