@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -14,8 +15,10 @@ from torch.nn import functional
 
 from normlift_ns.data.reduced_views import ReducedView
 
-_SIDES, _ROUNDS = (50, 100, 200), 2
-"""Longer sides of the images in pixels, from the coarsest search to the finest, and refinements on each of them."""
+_SIDES = (50, 100, 200)
+"""Longer sides of the images in pixels, from the coarsest search to the finest."""
+_HALVINGS, _MAX_MOVES = 2, 8
+"""Halvings of the step on images of each size, and largest number of moves by a step."""
 _MIN_GAIN = 1.0
 """Gain in dB that counts. A focal length that is 2 % off costs about 15 dB on a sharp scene, so 1 dB is well beyond
 chance."""
@@ -152,10 +155,14 @@ def _fit(levels: Sequence[Sequence[_Pair]], search: _Search) -> Lens:
     best = max(product(*search.values), key=lambda values: _mean(levels[0], search.make(*values)))
     step = search.step
     for level in levels:
-        for _ in range(_ROUNDS):
+        psnr = cache(lambda values, level=level: _mean(level, search.make(*values)))
+        for _ in range(_HALVINGS):
             step /= 2
-            around = product(*((value - step, value, value + step) for value in best))
-            best = max(around, key=lambda values: _mean(level, search.make(*values)))
+            for _ in range(_MAX_MOVES):
+                center = best
+                best = max([center, *product(*((value - step, value, value + step) for value in center))], key=psnr)
+                if best == center:
+                    break
     return search.make(*best)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -32,10 +33,11 @@ _SCALES = 1.12 ** np.arange(-61, 62)
 """Uniform scales that are tried, 0.001 to 1000."""
 _SHRINKING = (0.04, 0.02, 0.01)
 """Steps of the logarithm of a scale, in which points refine it."""
-_GAUSS_NEWTON = ((50, 0.02), (100, 0.01), (400, 0.003), (400, 0.003))
-"""Longer side of the renders that refine a scale, and the change of its logarithm for their derivative."""
-_MAX_STEP, _MIN_START = 0.05, 2.0
-"""Largest step of that logarithm, and distance in dB from the mean color of an image that a first render needs."""
+_PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
+"""Longer side of the renders that refine a scale further, and their distance in its logarithm; largest number of moves
+by this distance."""
+_MIN_START = 2.0
+"""Distance in dB from the mean color of an image that a first render needs."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
@@ -147,7 +149,7 @@ class _Search:
 
     def _is_near(self, candidate: CandidateWorld) -> bool:
         """Return whether a small render beats the mean color of an image."""
-        small = self._farthest(candidate).reduced(_GAUSS_NEWTON[1][0])
+        small = self._farthest(candidate).reduced(_PARABOLAS[0][0])
         return small.psnr(self._render(small, candidate)) >= small.psnr(small.mean_color()) + _MIN_START
 
     def _farthest(self, candidate: CandidateWorld) -> ReducedView:
@@ -166,24 +168,34 @@ class _Search:
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
         """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
 
-        Points refine it to a few percent, and the Gauss-Newton method on renders of one view beyond that.
+        Points refine it to a few percent, and then parabolas through the mean squared errors of renders of one view.
         """
         for step in _SHRINKING:
             near = [log - step, log, log + step]
             log = near[int(self.agreement([candidate.scaled(float(np.exp(value))) for value in near]).argmax())]
         if not self._is_near(candidate.scaled(float(np.exp(log)))):
             return None
-        view = self._farthest(candidate)
-        for side, change in _GAUSS_NEWTON:
-            small = view.reduced(side)
-            first, second = (
-                self._render(small, candidate.scaled(float(np.exp(value)))).float() for value in (log, log + change)
-            )
-            slope, rest = (second - first) / change, small.view.image.float() - first
-            if small.view.mask is not None:
-                slope, rest = slope[small.view.mask], rest[small.view.mask]
-            log += float(((slope * rest).sum() / slope.square().sum().clamp(min=1e-6)).clamp(-_MAX_STEP, _MAX_STEP))
+        for side, step in _PARABOLAS:
+            log = self._lowest(candidate, self._farthest(candidate).reduced(side), log, step)
         return log
+
+    def _lowest(self, candidate: CandidateWorld, small: ReducedView, log: float, step: float) -> float:
+        """Return the minimum of the mean squared error over the logarithm of a scale, by a parabola through a grid."""
+
+        @cache
+        def error(place: int) -> float:
+            world = candidate.scaled(float(np.exp(log + place * step)))
+            return 10 ** (-small.psnr(self._render(small, world)) / 10)
+
+        place = 0
+        for _ in range(_MAX_MOVES):
+            lowest = min((place, place - 1, place + 1), key=error)
+            if lowest == place:
+                break
+            place = lowest
+        left, here, right = (error(place + offset) for offset in (-1, 0, 1))
+        bend = max(left - 2 * here + right, abs(left - right))  # the vertex is half a step away at most
+        return log + step * (place + ((left - right) / (2 * bend) if bend > 0 else 0.0))
 
 
 def _rounded(scale: float) -> float:

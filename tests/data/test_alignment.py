@@ -76,31 +76,36 @@ def moved(pixels: float):
 
 
 def distorted(k1: float):
-    """Images of a lens with this distortion, by OpenCV."""
+    """Images of a lens with this distortion."""
 
     def change(view: View) -> View:
-        K, (height, width) = view.camera.K.double().numpy(), view.image.shape[:2]
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=2).reshape(-1, 1, 2)
-        u, v = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0, 0]), P=K).reshape(height, width, 2).T - 0.5
-        image = cv2.remap(view.image.numpy(), u.T.astype(np.float32), v.T.astype(np.float32), cv2.INTER_LINEAR)
-        return view._replace(image=torch.from_numpy(image))
+        (fx, _, cx), (_, fy, cy), _ = view.camera.K.tolist()
+        height, width = view.image.shape[:2]
+        y, x = np.mgrid[:height, :width] + 0.5
+        x, y = x0, y0 = (x - cx) / fx, (y - cy) / fy
+        for _ in range(50):
+            stretch = 1 + k1 * (x * x + y * y)
+            x, y = x0 / stretch, y0 / stretch
+        u, v = (value.astype(np.float32) for value in (fx * x + cx - 0.5, fy * y + cy - 0.5))
+        return view._replace(image=torch.from_numpy(cv2.remap(view.image.numpy(), u, v, cv2.INTER_LINEAR)))
 
     return change
 
 
 @pytest.mark.parametrize(
-    ("change", "cause"),
+    ("change", "pattern", "value"),
     [
-        (focal(1.02), r"Focal lengths that are (2|1\.9)% shorter"),
-        (focal(0.98), r"Focal lengths that are 2(\.1)?% longer"),
-        (focal(1.25), "Focal lengths that are 20% shorter"),
-        (moved(8), r"(8\.0|7\.9|8\.1) pixels left"),
-        (distorted(-0.2), r"k1 that is lower by 0\.(2|19|21) "),
-        (noisy, "24 dB or more is usual"),
+        (focal(1.02), "Focal lengths that are (.*)% shorter", 1.96),
+        (focal(0.98), "Focal lengths that are (.*)% longer", 2.04),
+        (focal(1.25), "Focal lengths that are (.*)% shorter", 20),
+        (moved(8), "principal point that lies (.*) pixels left", 8),
+        (distorted(0.1), "k1 that is higher by (.*) fits", 0.1),
+        (noisy, "([0-9]*) dB or more is usual", 24),
     ],
 )
-def test_the_cause_of_a_loss_is_named(scene, change, cause: str) -> None:
-    assert re.search(cause, warning_of(scene, change)), warning_of(scene, change)
+def test_the_cause_of_a_loss_is_named(scene, change, pattern: str, value: float) -> None:
+    found = re.search(pattern, warning_of(scene, change))
+    assert found is not None and float(found[1]) == pytest.approx(value, rel=0.1)
 
 
 def test_flat_gaussians_are_told_from_others(scene) -> None:
@@ -123,7 +128,7 @@ def test_a_render_must_beat_the_mean_color_by_three_decibels() -> None:
     for psnr, refused in ((28.9, True), (29.1, False)):
         warning = alignment_warning(match(psnr), trained_cameras=True)  # the cameras of the training are believed
         assert (warning is not None) is refused
-        with pytest.raises(InputError, match=r"28\.9 dB, 2\.9 dB more") if refused else nullcontext():
+        with pytest.raises(InputError, match=r"2\.9 dB more than the mean color") if refused else nullcontext():
             assert alignment_warning(match(psnr), trained_cameras=False) is None
 
 
