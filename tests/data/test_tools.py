@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import Frame, Intrinsics
-from normlift_ns.data.open_splat import _read
+from normlift_ns.data.open_splat import _read, open_splat
 from normlift_ns.data.quantization import normalize_quats
 from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.transforms import write_transforms
+from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
-from tests.data.scene_files import ply_columns, random_splat
+from tests.data.scene_files import ply_columns, random_splat, write_colmap
 
 CENTER, DC, NORMAL = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("nx", "ny", "nz")
 SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
@@ -202,3 +204,46 @@ def test_transforms_of_ns_process_data(program: str, frames: list[Frame], tmp_pa
     (tmp_path / "transforms.json").write_text(json.dumps(content, indent=4))
     found = read_camera_file(SplatOptions(transforms=tmp_path / "transforms.json")).frames
     same_cameras(found, [replace(frame, intrinsics=frame.intrinsics._replace(**lens)) for frame in frames])
+
+
+CFG_ARGS = (
+    "Namespace(sh_degree=3, source_path='C:\\\\garden', model_path='./output/4d2e', images='images', depths='', "
+    "resolution=-1, white_background=True, train_test_exp=False, data_device='cuda', eval=True)"
+)
+
+
+def test_settings_of_inrias_trainer_are_used(frames: list[Frame], tmp_path: Path) -> None:
+    folder = tmp_path / "output" / "point_cloud" / "iteration_30000"
+    folder.mkdir(parents=True)
+    splat = random_splat(40, 3)
+    _, comments, names = PROGRAMS["Inria"]
+    path = write_plain_ply(folder / "point_cloud.ply", splat, comments, names)
+    config = tmp_path / "output" / "cfg_args"
+    write_colmap(tmp_path, frames, "PINHOLE")
+    write_transforms(tmp_path / "transforms.json", frames, [])
+    colmap = SplatOptions(colmap=tmp_path)
+    transforms = SplatOptions(transforms=tmp_path / "transforms.json")
+    plain = open_splat(path, colmap)
+    assert (plain.background_name, len(plain.held_out)) == ("black", 0)
+    config.write_text(CFG_ARGS)
+    first = sorted(NAMES)[0]
+    for options, background, held_out in (
+        (colmap, "white", [first]),
+        (replace(colmap, background="black", test_every=2), "black", sorted(NAMES)[::2]),
+        (transforms, "white", []),
+    ):
+        scene = open_splat(path, options)
+        assert scene.background_name == background
+        assert [Path(name).name for name in scene.held_out.names] == held_out
+    config.write_text(CFG_ARGS.replace("True", "False"))
+    assert len(open_splat(path, colmap).held_out) == 0
+    beside = write_plain_ply(tmp_path / "scene.ply", splat, comments, names)
+    config.rename(tmp_path / "cfg_args").write_text(CFG_ARGS)
+    assert open_splat(beside, colmap).background_name == "white"
+    for text in (CFG_ARGS[:-1], CFG_ARGS.replace("True", "__import__('os')"), "Namespace(" * 5000, "Namespace(\0"):
+        (tmp_path / "cfg_args").write_text(text)
+        with pytest.raises(InputError, match="cfg_args is damaged"):
+            open_splat(beside, colmap)
+    for text in ("", "another program's", "[1, 2]"):
+        (tmp_path / "cfg_args").write_text(text)
+        assert open_splat(beside, colmap).background_name == "black"
