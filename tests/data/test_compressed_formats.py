@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -323,6 +323,26 @@ def test_small_files_that_would_grow_are_refused_or_cost_little(tmp_path: Path) 
     table = b"".join(struct.pack("<QQ", len(stream), size) for stream, size in zip(streams, sizes))
     path.write_bytes(spz4[:32] + table + b"".join(streams))
     assert len(read_spz(path).splat) == 20
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_extensions_of_spz_are_named(tmp_path: Path, version: Literal[3, 4]) -> None:
+    splat, path = random_splat(20, 1), tmp_path / "a.spz"
+    plain = encode_spz(splat, version=version)
+    path.write_bytes(plain)
+    expected = read_spz(path)
+    record = struct.pack("<III", 0xADBE0003, 4, 6)  # the coordinate system RDF
+    content = bytearray(gzip.decompress(plain) if version == 3 else plain)
+    content[14] |= 2
+    if version == 3:
+        path.write_bytes(gzip.compress(bytes(content) + record))
+    else:
+        content[16:20] = struct.pack("<I", 32 + len(record))
+        path.write_bytes(bytes(content[:32]) + record + bytes(content[32:]))
+    found = read_spz(path)
+    for name, value in expected.splat.parameters.items():
+        assert torch.equal(found.splat.parameters[name], value)
+    assert [text for text in found.remarks if text not in expected.remarks and "--world-transform" in text] != []
 
 
 @pytest.mark.filterwarnings("ignore")
