@@ -583,8 +583,8 @@ class SplatOptions:
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
     """Interval n of held-out images: training left out every n-th image, starting with the first. gsplat's trainer uses
-    8, and so does Inria's with --eval. None: the value in the cfg.yml of gsplat's trainer, or else the held-out images
-    in transforms.json."""
+    8, and so does Inria's with --eval. None: as in the cfg.yml of gsplat's trainer or the cfg_args of Inria's, or else
+    the held-out images in transforms.json."""
     eval_images: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1, which is the default of ns-train."""
@@ -595,8 +595,9 @@ class SplatOptions:
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
     the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
     otherwise 3dgs."""
-    background: Background = "black"
-    """Background color behind the splat, and behind images with an alpha channel."""
+    background: Background | None = None
+    """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
+    Inria's trainer, else black."""
 
     def __post_init__(self) -> None:
         if isinstance(self.eval_images, str | float):

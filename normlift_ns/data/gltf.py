@@ -11,18 +11,22 @@ import json
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from normlift_ns.core.gaussians import SH_C0
+from normlift_ns.data.frames import WorldTransform
 from normlift_ns.data.quantization import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.data.splat_transforms import transform_splat
 from normlift_ns.data.spz import decode_spz
+from normlift_ns.data.transforms import decompose_similarity
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import MAX_TEXT_BYTES, open_regular, read_file
 from normlift_ns.options import RasterizeMode
@@ -32,6 +36,7 @@ _EXTENSION = "KHR_gaussian_splatting"
 _SPZ_EXTENSIONS = (f"{_EXTENSION}_compression_spz_2", f"{_EXTENSION}_compression_spz")
 _KNOWN = {_EXTENSION, *_SPZ_EXTENSIONS, "KHR_mesh_quantization"}
 """Extensions that a file may require."""
+_INSTANCING = "EXT_mesh_gpu_instancing"
 _SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -74,10 +79,15 @@ class _Mesh(msgspec.Struct, rename="camel"):
 
 
 class _Node(msgspec.Struct, rename="camel"):
-    matrix: list[float] | None = None
-    rotation: list[float] | None = None
-    scale: list[float] | None = None
-    translation: list[float] | None = None
+    mesh: int | None = None
+    children: list[int] = []
+    matrix: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)] | None = None
+    """Columns of a 4 x 4 matrix, which replaces rotation, scale and translation."""
+    rotation: tuple[float, float, float, float] = (0, 0, 0, 1)
+    """Quaternion (x, y, z, w)."""
+    scale: tuple[float, float, float] = (1, 1, 1)
+    translation: tuple[float, float, float] = (0, 0, 0)
+    extensions: dict[str, Any] = {}
 
 
 class _Document(msgspec.Struct, rename="camel"):
@@ -99,19 +109,19 @@ class _Gltf(NamedTuple):
 
 
 def read_gltf(path: Path) -> SplatFile:
-    """Read the splat of a glTF file in its own coordinates, without the transforms of nodes.
+    """Read the splat of a glTF file, with the transforms of its node and the parents of the node.
 
     The splat may be compressed as SPZ (KHR_gaussian_splatting_compression_spz_2).
 
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
         ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
-            setting, or has Gaussians that cannot be drawn.
+            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be drawn.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")
     gltf = _open_gltf(path)
-    mesh, primitive = _find_splat(gltf)
+    index, primitive = _find_splat(gltf)
     extension = primitive.extensions[_EXTENSION]
     for name, expected in _SETTINGS.items():
         found = extension.get(name, expected)
@@ -120,17 +130,56 @@ def read_gltf(path: Path) -> SplatFile:
                 f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export it with the "
                 "expected setting, or as a PLY file."
             )
-    moved = any(value is not None for node in gltf.document.nodes for value in msgspec.structs.astuple(node))
-    remarks = (f"The nodes of {path.name} have transforms, which are not applied to the splat.",) if moved else ()
     compressed = next((extension["extensions"][n] for n in _SPZ_EXTENSIONS if n in _nested(extension)), None)
     if compressed is not None:
         view = compressed.get("bufferView") if isinstance(compressed, dict) else None
-        file = decode_spz(bytes(_view_bytes(gltf, view)[1]), path)
-        return file._replace(remarks=(*file.remarks, *remarks))
-    splat = _read_attributes(gltf, primitive)
+        return _placed(gltf, index, decode_spz(bytes(_view_bytes(gltf, view)[1]), path))
+    splat, extras = _read_attributes(gltf, primitive), gltf.document.meshes[index].extras
     validate_splat(splat, path)
-    mode = mesh.extras.get("rasterize_mode") if isinstance(mesh.extras, dict) else None  # as written by `encode_glb`
-    return SplatFile(splat, mode if mode in get_args(RasterizeMode) else None, remarks=remarks)
+    mode = extras.get("rasterize_mode") if isinstance(extras, dict) else None  # as written by `encode_glb`
+    return _placed(gltf, index, SplatFile(splat, mode if mode in get_args(RasterizeMode) else None))
+
+
+def _placed(gltf: _Gltf, mesh: int, file: SplatFile) -> SplatFile:
+    """Apply the transforms of the nodes to the splat of a mesh."""
+    world = _world_transform(gltf, mesh)
+    if world.scale == 1 and np.array_equal(world.transform, np.eye(3, 4)):
+        return file
+    remark = f"The transforms of the nodes of {gltf.path.name} are applied to the splat (scale {world.scale:.6g})."
+    return file._replace(splat=transform_splat(file.splat, world), remarks=(*file.remarks, remark))
+
+
+def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
+    """Return the similarity from a mesh to its scene; raise InputError for several places and for other transforms."""
+    path, nodes, matrix = gltf.path, gltf.document.nodes, np.eye(4)
+    holders = [number for number, node in enumerate(nodes) if node.mesh == mesh]
+    if len(holders) > 1 or any(_INSTANCING in nodes[number].extensions for number in holders):
+        raise InputError(f"{path} places its splat several times, expected once. Export one of them, or a PLY file.")
+    parents = {child: number for number, node in enumerate(nodes) for child in node.children}
+    number = holders[0] if holders else None
+    for _ in nodes:
+        if number is not None:
+            with np.errstate(all="ignore"):  # numbers that are too large are reported below
+                matrix = _local_matrix(path, nodes[number]) @ matrix
+            number = parents.get(number)
+    if number is not None:
+        raise _damaged(path, "its nodes are their own parents")
+    try:
+        return decompose_similarity(matrix, f"The transform of the splat in {path}")
+    except InputError as error:
+        raise InputError(f"{error} Apply it in the program that wrote the file, or export a PLY file.") from error
+
+
+def _local_matrix(path: Path, node: _Node) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix from a node to its parent."""
+    if node.matrix is not None:
+        return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+    if not any(node.rotation):
+        raise _damaged(path, "the rotation of a node is zero")
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale
+    matrix[:3, 3] = node.translation
+    return matrix
 
 
 def _nested(extension: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -182,9 +231,10 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
     return chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
 
 
-def _find_splat(gltf: _Gltf) -> tuple[_Mesh, _Primitive]:
-    primitives = [(mesh, primitive) for mesh in gltf.document.meshes for primitive in mesh.primitives]
-    splats = [(mesh, primitive) for mesh, primitive in primitives if _EXTENSION in primitive.extensions]
+def _find_splat(gltf: _Gltf) -> tuple[int, _Primitive]:
+    """Return the only splat of a file and the index of its mesh."""
+    primitives = [(index, item) for index, mesh in enumerate(gltf.document.meshes) for item in mesh.primitives]
+    splats = [(index, primitive) for index, primitive in primitives if _EXTENSION in primitive.extensions]
     if len(splats) != 1:
         raise InputError(
             f"{gltf.path} has {len(splats)} splats ({_EXTENSION}) among its {len(primitives)} primitives, expected "

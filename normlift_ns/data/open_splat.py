@@ -16,6 +16,7 @@ from normlift_ns.data.cameras import adjust_poses, read_camera_file
 from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
 from normlift_ns.data.images import held_out_names, kept_share
+from normlift_ns.data.inria_config import TEST_EVERY, find_inria_config
 from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, SplatParameters, flatten_splat, validate_splat
 from normlift_ns.data.spz import GZIP_MAGIC, SPZ_MAGIC
@@ -24,7 +25,7 @@ from normlift_ns.data.world_search import find_world
 from normlift_ns.data.worlds import CandidateWorld, candidate_worlds
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
-from normlift_ns.options import Primitive, SplatOptions
+from normlift_ns.options import Background, Primitive, SplatOptions
 from normlift_ns.registry import Registry
 
 _MAX_STEP = 0.1
@@ -67,6 +68,7 @@ def open_splat(
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _with_primitive(_read(path), path, options)
+    file, background = _with_inria_config(file, path, options)
     _check_coordinates(
         file.splat, file.splat.means[:: len(file.splat) // 10_000 + 1].double().numpy(), str(path), options
     )
@@ -78,7 +80,7 @@ def open_splat(
         placed, world = candidate.place(cameras.frames), candidate.world
         if file.pose_adjust is not None:
             placed = adjust_poses(placed, held_out, file.pose_adjust, path)
-        train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), options.background)
+        train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), background)
         return SplatScene(
             file.splat,
             train,
@@ -101,7 +103,7 @@ def open_splat(
                 **({"primitive": "2dgs", "clip_planes": file.clip_planes} if file.primitive == "2dgs" else {}),
             },
             options.rasterize_mode or file.rasterize_mode or "classic",
-            options.background,
+            background,
             train.check_files(),
         )
 
@@ -142,7 +144,7 @@ def _check_coordinates(
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
-    """Return the names of the held-out images according to the options, or else to cfg.yml or the camera file."""
+    """Return the names of the held-out images according to the options, or else to the trainer or the camera file."""
     held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.eval_images) > 0:
         test_every = options.test_every
@@ -223,6 +225,17 @@ def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
         clip_planes=config.clip_planes,
         remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
     )
+
+
+def _with_inria_config(file: SplatFile, path: Path, options: SplatOptions) -> tuple[SplatFile, Background]:
+    """Add the settings in the cfg_args of the training run to the contents of a file; return the background, too."""
+    config = find_inria_config(path)
+    if config is None:
+        return file, options.background or "black"
+    test_every = TEST_EVERY if config.has_test_images and options.colmap is not None else None
+    remarks = (*file.remarks, f"The settings of the training are those of {config.path}.")
+    file = file._replace(test_every=file.test_every or test_every, remarks=remarks)
+    return file, options.background or ("white" if config.white_background else "black")
 
 
 _CLIP_PLANES = (0.2, 1e10)

@@ -29,7 +29,8 @@ _HEADER = struct.Struct("<4sIIBBBB")
 """Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, number of streams."""
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
 """Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
-_ANTIALIASED = 1
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+"""Bits of the flags."""
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
 _SH_STEPS = (8, 16)
@@ -127,8 +128,13 @@ def decode_spz(data: bytes, path: Path) -> SplatFile:
         features_rest=_floats(rest, n, k, 3) / 128 - 1,
     )
     validate_splat(splat, path)
-    mode = "antialiased" if header.flags & _ANTIALIASED else None
-    return SplatFile(splat, mode, remarks=(spz_rounding(path.name, header.fractional_bits, header.version),))
+    remarks = [spz_rounding(path.name, header.fractional_bits, header.version)]
+    if header.flags & _HAS_EXTENSIONS:
+        remarks.append(
+            f"{path.name} has extensions, such as the name of its coordinate system, which are not applied. If the "
+            "cameras are in another system, give --world-transform."
+        )
+    return SplatFile(splat, "antialiased" if header.flags & _ANTIALIASED else None, remarks=tuple(remarks))
 
 
 def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:

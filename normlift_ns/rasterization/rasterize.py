@@ -9,7 +9,7 @@ from itertools import groupby, islice, zip_longest
 from typing import Any, NamedTuple, TypedDict, cast, get_args
 
 import torch
-from jaxtyping import Float, Int, Int64, UInt8
+from jaxtyping import Float, Float64, Int, Int64, UInt8
 from torch import Tensor
 from typing_extensions import Unpack
 
@@ -43,6 +43,25 @@ def view_colors(
     pose = camera.world_to_camera.to(means)
     center = -pose[:3, :3].T @ pose[:3, 3]
     return (_spherical_harmonics(degree, means - center, coefficients) + 0.5).clamp(min=0)
+
+
+def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
+    """Return the spherical harmonics of colors that rotate with their Gaussians.
+
+    The matrix of a rotation follows from the harmonics in many directions before and after it, by least squares.
+
+    Args:
+        coefficients: Spherical harmonics without the constant one, in gsplat's order.
+        rotation: Rotation of the Gaussians.
+    """
+    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415 (slow import)
+
+    size = coefficients.shape[1] + 1
+    directions = torch.randn(8 * size, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    before, after = (_eval_sh_bases_fast(size, points)[:, 1:] for points in (directions @ rotation, directions))
+    matrix = torch.linalg.lstsq(after, before).solution
+    return (matrix.to(coefficients) @ coefficients) if size > 1 else coefficients
 
 
 # Choice of a backend.
