@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.table import Table
@@ -121,10 +121,7 @@ def _capture_key(command: NormLift) -> str:
     features, label maps and weights, it includes only the paths.
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
-    if options["splat"].pop("primitive") is not None or command.splat.world_transform is None:
-        options["new"] = [command.splat.primitive, command.splat.world_transform]
-    elif command.splat.world_transform == "auto":
-        options["splat"]["world_transform"] = None  # as in version 0.2, whose batches stay valid
+    options["splat"] = _splat_options_of_0_2(options["splat"])
     files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
     if command.load_config is not None:
         step = "*" if command.load_step is None else f"{command.load_step:09d}"
@@ -133,6 +130,16 @@ def _capture_key(command: NormLift) -> str:
     sizes = [(file.name, file.stat().st_size) for file in files if file.is_file()]
     text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
     return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
+
+
+def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of splats with the values that version 0.2 wrote into keys, so that its batches stay valid."""
+    new = {name: value for name, value in values.items() if name == "primitive" and value is not None}
+    if values["world_transform"] is None:
+        new["search"] = False
+    world, background = values["world_transform"], values["background"] or "black"
+    old = {name: value for name, value in values.items() if name != "primitive"}
+    return {**old, "world_transform": None if world == "auto" else world, "background": background, **new}
 
 
 def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:
