@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from normlift_ns.core.gaussians import SH_C0
@@ -177,6 +176,8 @@ def _local_matrix(path: Path, node: _Node) -> Float[np.ndarray, "4 4"]:
     if not any(node.rotation):
         raise _damaged(path, "the rotation of a node is zero")
     matrix = np.eye(4)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow import)
+
     matrix[:3, :3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale
     matrix[:3, 3] = node.translation
     return matrix

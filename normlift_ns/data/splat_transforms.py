@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.frames import WorldTransform
 from normlift_ns.data.splat import SplatParameters
@@ -16,6 +15,8 @@ from normlift_ns.rasterization.rasterize import rotate_harmonics
 def transform_splat(splat: SplatParameters, world: WorldTransform) -> SplatParameters:
     """Return a splat that is rotated, translated and scaled together with its colors, computed in float64."""
     rotation, translation = (torch.from_numpy(part) for part in np.split(world.transform, [3], axis=1))
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow import)
+
     x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
     product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     return replace(
