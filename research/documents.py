@@ -70,7 +70,7 @@ def documents() -> Documents:
     names = (
         "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
         "overhead", "grid", "grid_real", "geometry", "segments", "planning_gpu",
-        "agreement",
+        "agreement", "worlds",
     )  # fmt: skip
     return {name: read(RESULTS / f"{name}.json") for name in names}
 

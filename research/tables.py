@@ -10,6 +10,7 @@ from research.hard_case import DOUBLE, QUANTITIES
 from research.numerics import CASES
 from research.segments_tables import segments, segments_objects
 from research.signals import STEP
+from research.worlds import FACTORS
 
 PREFIXES = {"tabletop": "tabletop.", "demo": "demo."}
 """Prefix of the keys of accuracy.json, by scene."""
@@ -55,6 +56,8 @@ def tables(found: Documents) -> dict[str, str]:
         "segments-objects": segments_objects(found["segments"]),
         "plans": plans(found["planning_gpu"]),
         "agreement": by_regions(found["agreement"]),
+        "worlds": worlds(found["worlds"]),
+        "focal": focal(found["worlds"]),
     }
 
 
@@ -241,6 +244,29 @@ def overhead(document: Document) -> str:
             costs = (f"{v[f'{key}_{one}']:.2f} ± {v[f'{key}_{one}_spread']:.2f} s" for one in ("before", "now"))
             rows.append((f"{what}, {kind} time", *costs, f"{v[f'{key}_change']:+.1%}"))
     return table(("command", "version 0.1", "now", "change"), rows)
+
+
+def worlds(document: Document) -> str:
+    """Margins of right and wrong worlds, and what the search found."""
+    v, rows = document.values, []
+    for name in (key.removesuffix(".right.margin") for key in v if key.endswith(".right.margin")):
+        found = [value for key, value in v.items() if key.startswith(f"{name}.") and key.endswith(".found")]
+        seconds = [v[key.replace(".found", ".seconds")] for key in v if key.startswith(f"{name}.") and ".found" in key]
+        margins = (f"{v[f'{name}.{world}.margin']:.1f}" for world in ("right", "wrong"))
+        taken = f"{v[f'{name}.random.taken']:.0f} of {v[f'{name}.random.rotations']:.0f}"
+        times = f"{min(seconds):.1f} to {max(seconds):.1f} s"
+        rows.append((name, *margins, f"{sum(found):.0f} of {len(found)}", times, taken))
+    header = ("margin, right world", "largest margin, wrong world", "worlds found", "time", "random rotations taken")
+    return table(("", *header), rows)
+
+
+def focal(document: Document) -> str:
+    """PSNR and margin with wrong focal lengths."""
+    v, rows = document.values, []
+    for name in (key.removesuffix(".right.margin") for key in v if key.endswith(".right.margin")):
+        keys = [f"{name}.focal{factor}" for factor in FACTORS]
+        rows.append((name, *(f"{v[f'{key}.psnr']:.1f} ({v[f'{key}.margin']:.1f})" for key in keys)))
+    return table(("", "right", *(f"{round(100 * factor - 100)} % longer" for factor in FACTORS[1:])), rows)
 
 
 def every_metric(document: Document, having: str = "") -> str:

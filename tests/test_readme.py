@@ -33,6 +33,7 @@ TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
 OTHERS = {
     "--app_opt",
     "--csv",
+    "--xml",
     "--white_background",
     "--eval",
     "--filter-value",
