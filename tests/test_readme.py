@@ -32,6 +32,9 @@ PAGE_NAMES = (*PAGE_NAMES, "honest_answers", "python", "../README")
 TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
 OTHERS = {
     "--app_opt",
+    "--auto-scale-poses",
+    "--center-method",
+    "--orientation-method",
     "--csv",
     "--xml",
     "--white_background",
