@@ -105,7 +105,7 @@ class Case:
             yield "ns_train", "ns-train", None, {"transforms": self.captured / "transforms.json"}
         points = self.splat.means[::20].numpy().astype(float)
         images = self.frames[0].file.parent
-        project = write_colmap(self.folder / "colmap", self.frames, points=points)
+        project = write_colmap(self.folder / "project", self.frames, points=points)
         world = gsplat_normalization(sorted(self.frames, key=lambda frame: frame.name), points)
         matrix = np.vstack([world.scale * world.transform, [0, 0, 0, 1]])
         for key, turn in {"gsplat": np.eye(3), "gsplat_half_z": TURNS["half_z"]}.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -38,6 +39,8 @@ _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
 by this distance."""
 _MIN_START = 2.0
 """Distance in dB from the mean color of an image that a first render needs."""
+_TURN, _TURNED_SIDE = math.radians(1), 200
+"""Angle of the turns that must fit worse than a world that is taken, and longer side of their renders in pixels."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
@@ -231,6 +234,37 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
     return _Points(positions, colors, scene.background, small)
 
 
+def _is_best_nearby(scene: SplatScene, device: str) -> bool:
+    """Return whether the images fit worse if the world turns by one degree, in both directions about each axis.
+
+    A world that is only near the right one can reach the usual PSNR, but then one of the turns improves the fit.
+    """
+    gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
+    views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]
+    center = scene.gaussians.means[scene.gaussians.drawable].median(dim=0).values.double()
+
+    def psnr(turn: Float[Tensor, "4 4"]) -> float:
+        total = 0.0
+        for small in views:
+            camera = small.view.camera
+            turned = replace(camera, world_to_camera=camera.world_to_camera @ turn.to(camera.world_to_camera))
+            moved = small._replace(view=small.view._replace(camera=turned))
+            total += small.psnr(moved.render(scene, gaussians, settings))
+        return total
+
+    here = psnr(torch.eye(4, dtype=torch.float64))
+    for axis in range(3):
+        for angle in (-_TURN, _TURN):
+            turn = torch.eye(4, dtype=torch.float64)
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn[i, i] = turn[j, j] = math.cos(angle)
+            turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
+            turn[:3, 3] = center - turn[:3, :3] @ center
+            if psnr(turn) > here:
+                return False
+    return True
+
+
 def find_world(
     candidates: Sequence[CandidateWorld],
     scene_in: Callable[[CandidateWorld], SplatScene],
@@ -258,7 +292,7 @@ def find_world(
     def fitting(worlds: Sequence[CandidateWorld]) -> list[tuple[CandidateWorld, SplatScene, Alignment]]:
         scenes = [(world, scene_in(world)) for world in worlds]
         found = [(world, other, measure_alignment(other, device=device, explain=False)) for world, other in scenes]
-        return [item for item in found if item[2].is_usual]
+        return [item for item in found if item[2].is_usual and _is_best_nearby(item[1], device)]
 
     search = _Search(scene, here, device)
     found = fitting(search.likely(candidates)) or fitting(search.likely_scales(candidates))
