@@ -288,6 +288,8 @@ def find_world(
     match = measure_alignment(scene, device=device, explain=False)
     if match.is_usual:
         return replace(scene, alignment=match)
+    if not bool(scene.gaussians.drawable.any()):
+        return scene
 
     def fitting(worlds: Sequence[CandidateWorld]) -> list[tuple[CandidateWorld, SplatScene, Alignment]]:
         scenes = [(world, scene_in(world)) for world in worlds]
