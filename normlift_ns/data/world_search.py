@@ -53,6 +53,8 @@ class _Points(NamedTuple):
     positions: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
     """RGB in 0..1, the same from all sides."""
+    background: Float[Tensor, " 3"]
+    """RGB in 0..1 of pixels without points."""
     views: list[View]
 
     def agreement(self, worlds: Sequence[_Motion]) -> Float[Tensor, " w"]:
@@ -82,17 +84,16 @@ class _Points(NamedTuple):
         image = view.image.permute(2, 0, 1)[None].float() / 255
         image = functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
         used = torch.ones_like(image[:, :1]) if view.mask is None else view.mask[None, None].float()
-        variance = _centered(image, used).square().sum()
-        weight = used * (drawn[:, 3:] > 0)
-        first = _centered(drawn[:, :3] / drawn[:, 3:].clamp(min=1e-6), weight)
-        covariance = (first * _centered(image, weight)).sum(dim=(1, 2, 3))
-        return covariance / (first.square().sum(dim=(1, 2, 3)) * variance).sqrt().clamp(min=1e-6)
+        empty = self.background[:, None, None]
+        drawn = torch.where(drawn[:, 3:] > 0, drawn[:, :3] / drawn[:, 3:].clamp(min=1e-6), empty)
+        first, second = _centered(drawn, used), _centered(image, used)
+        variances = first.square().sum(dim=(1, 2, 3)) * second.square().sum()
+        return (first * second).sum(dim=(1, 2, 3)) / variances.sqrt().clamp(min=1e-6)
 
 
-def _centered(image: Float[Tensor, "#b c h w"], weight: Float[Tensor, "#b 1 h w"]) -> Float[Tensor, "#b c h w"]:
-    """Return the difference from the mean color of the pixels of weight 1; 0 at those of weight 0."""
-    total = weight.sum(dim=(2, 3), keepdim=True).clamp(min=1)
-    return (image - (image * weight).sum(dim=(2, 3), keepdim=True) / total) * weight
+def _centered(image: Float[Tensor, "b c h w"], used: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """Return the difference from the mean color of the pixels with weight 1; 0 at those with weight 0."""
+    return (image - (image * used).sum(dim=(2, 3), keepdim=True) / used.sum().clamp(min=1)) * used
 
 
 class _Motion(NamedTuple):
@@ -143,12 +144,13 @@ class _Search:
         unscaled = [
             candidate for candidate in candidates if candidate.world.scale == 1 and not candidate.opencv_cameras
         ]
-        scaled = [candidate.scaled(float(scale)) for candidate in unscaled for scale in _SCALES]
-        grid = self.agreement(scaled).view(len(unscaled), len(_SCALES))
-        best, column = grid.max(dim=1)
-        logs = {i: self._refine(unscaled[i], float(np.log(_SCALES[column[i]]))) for i in _likely(best)}
-        found = [unscaled[i].scaled(_rounded(float(np.exp(log)))) for i, log in logs.items() if log is not None]
-        return [candidate for candidate in found if candidate.world.scale != 1]
+        scaled = [(world, float(scale)) for world in unscaled for scale in _SCALES]
+        grid = self.agreement([world.scaled(scale) for world, scale in scaled]).view(len(unscaled), len(_SCALES))
+        is_peak = grid == functional.max_pool1d(grid, 5, stride=1, padding=2)
+        likely = [scaled[i] for i in _likely(grid.where(is_peak, -1.0).flatten())]
+        logs = [(world, self._refine(world, float(np.log(scale)))) for world, scale in likely]
+        found = [world.scaled(_rounded(float(np.exp(log)))) for world, log in logs if log is not None]
+        return [world for world in found if world.world.scale != 1]
 
     def _is_near(self, candidate: CandidateWorld) -> bool:
         """Return whether a small render beats the mean color of an image."""
@@ -228,7 +230,39 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
     axes = rotation_matrices(gaussians.quats[rows])
     colors = (0.5 + _SH_C0 * scene.splat.features_dc[rows]).clamp(0, 1)
     small = [view.reduced(_SIDE).view for view in views]
-    return _Points(gaussians.means[rows] + (axes @ offsets[:, :, None])[:, :, 0], colors, small)
+    positions = gaussians.means[rows] + (axes @ offsets[:, :, None])[:, :, 0]
+    return _Points(positions, colors, scene.background, small)
+
+
+def _is_best_nearby(scene: SplatScene, device: str) -> bool:
+    """Return whether the images fit worse if the world turns by one degree, in both directions about each axis.
+
+    A world that is only near the right one can reach the usual PSNR, but then one of the turns improves the fit.
+    """
+    gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
+    views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]
+    center = scene.gaussians.means[scene.gaussians.drawable].median(dim=0).values.double()
+
+    def psnr(turn: Float[Tensor, "4 4"]) -> float:
+        total = 0.0
+        for small in views:
+            camera = small.view.camera
+            turned = replace(camera, world_to_camera=camera.world_to_camera @ turn.to(camera.world_to_camera))
+            moved = small._replace(view=small.view._replace(camera=turned))
+            total += small.psnr(moved.render(scene, gaussians, settings))
+        return total
+
+    here = psnr(torch.eye(4, dtype=torch.float64))
+    for axis in range(3):
+        for angle in (-_TURN, _TURN):
+            turn = torch.eye(4, dtype=torch.float64)
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn[i, i] = turn[j, j] = math.cos(angle)
+            turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
+            turn[:3, 3] = center - turn[:3, :3] @ center
+            if psnr(turn) > here:
+                return False
+    return True
 
 
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
@@ -285,6 +319,8 @@ def find_world(
     match = measure_alignment(scene, device=device, explain=False)
     if match.is_usual:
         return replace(scene, alignment=match)
+    if not bool(scene.gaussians.drawable.any()):
+        return scene
 
     def fitting(worlds: Sequence[CandidateWorld]) -> list[tuple[CandidateWorld, SplatScene, Alignment]]:
         scenes = [(world, scene_in(world)) for world in worlds]

@@ -30,7 +30,7 @@ TURNS = {
     "from z up to y up": QUARTER,
     "after an exchange of x and y": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
     "and a scale of 2.5": 2.5 * np.eye(3),
-    "and a scale of 0.0137": 0.0137 * np.eye(3),
+    "and a scale of 0.23": 0.23 * np.eye(3),
     "from y up to z up and a scale of 100": 100 * QUARTER.T,
 }
 
@@ -179,7 +179,7 @@ def test_a_repeated_lift_takes_its_evidence_from_the_cache(splat, transforms, tm
         ("fox", "after half a turn about z"),
         ("castle", "from z up to y up"),
         ("tabletop", "and a scale of 2.5"),
-        ("castle", "and a scale of 0.0137"),
+        ("castle", "and a scale of 0.23"),
     ],
 )
 def test_worlds_of_real_captures_are_found(name: str, turn: str, tmp_path: Path) -> None:
