@@ -265,37 +265,6 @@ def _is_best_nearby(scene: SplatScene, device: str) -> bool:
     return True
 
 
-def _is_best_nearby(scene: SplatScene, device: str) -> bool:
-    """Return whether the images fit worse if the world turns by one degree, in both directions about each axis.
-
-    A world that is only near the right one can reach the usual PSNR, but then one of the turns improves the fit.
-    """
-    gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
-    views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]
-    center = scene.gaussians.means[scene.gaussians.drawable].median(dim=0).values.double()
-
-    def psnr(turn: Float[Tensor, "4 4"]) -> float:
-        total = 0.0
-        for small in views:
-            camera = small.view.camera
-            turned = replace(camera, world_to_camera=camera.world_to_camera @ turn.to(camera.world_to_camera))
-            moved = small._replace(view=small.view._replace(camera=turned))
-            total += small.psnr(moved.render(scene, gaussians, settings))
-        return total
-
-    here = psnr(torch.eye(4, dtype=torch.float64))
-    for axis in range(3):
-        for angle in (-_TURN, _TURN):
-            turn = torch.eye(4, dtype=torch.float64)
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            turn[i, i] = turn[j, j] = math.cos(angle)
-            turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
-            turn[:3, 3] = center - turn[:3, :3] @ center
-            if psnr(turn) > here:
-                return False
-    return True
-
-
 def find_world(
     candidates: Sequence[CandidateWorld],
     scene_in: Callable[[CandidateWorld], SplatScene],
