@@ -593,8 +593,8 @@ class SplatOptions:
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
-    otherwise 3dgs."""
+    gsplat's trainer wrote a cfg.yml or cfg.json for 2D Gaussians, the PLY file has two scales, or the file name
+    contains 2dgs; otherwise 3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
     Inria's trainer, else black."""
@@ -733,7 +733,7 @@ class LiftOptions(CheckedOptions):
     """Reuse cached 2D features and evidence of earlier lifts if their inputs are the same."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state. Configs of version 0.1 name `storage` `form` and have no consensus."""
+        """Restore the state. Configs of version 0.1 have the name `form` for `storage`, and no consensus."""
         options = {"storage" if name == "form" else name: value for name, value in state.items()}
         vars(self).update({"consensus": False, **options})
 

@@ -8,7 +8,7 @@ and all pairs of neighbors across their border::
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
-a surface; it keeps parts apart that touch at few pairs only. Initially, every Gaussian is a part. Each part joins the
+a surface; it separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
 part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
 so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
 Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
@@ -203,8 +203,8 @@ def _targets(
 ) -> Int64[np.ndarray, " n"]:
     """Return the part that each part joins, which is the larger part with the largest affinity, or itself.
 
-    Only the chosen borders count. Ties go to the larger part, then to the part with the smaller index. Of two equally
-    large parts, the part with the smaller index counts as larger.
+    Only the borders in the mask `chosen` count. Ties go to the larger part, then to the part with the smaller index. Of
+    two equally large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
     target = np.concatenate([borders.second[chosen], borders.first[chosen]])

@@ -70,7 +70,7 @@ def _hub(
     user: str, megabytes: float, license_name: str, data: str, repository: str,
     local: str, find: Callable[[], Path | None], download: Callable[[], Path],
 ) -> Weights:  # fmt: skip
-    """Return weights of the hub.
+    """Return the entry for weights on the Hugging Face Hub.
 
     Args:
         local: Required files of the repository, and the option that takes a local copy of them.

@@ -371,7 +371,7 @@ others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `M
 def _inner_products(
     shares: SparseRows, visible: SparseRows, labeled: SparseRows, view: Int64[Tensor, " s"], views: int
 ) -> Iterator[_Block]:
-    """Yield the sums for all regions, block by block."""
+    """Yield the sums of `_Block` for all regions, one block at a time."""
     order = shares.column.argsort(stable=True)
     row, weight = shares.row_index()[order].int(), shares.weight[order]
     by_region = SparseRows(row_offsets(shares.column, len(view)), row, weight)  # the transpose

@@ -171,7 +171,7 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
-        """Return the null level of every Gaussian as one column, or no column without a null vocabulary."""
+        """Return the null level of every Gaussian as one column; no columns if there is no null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]

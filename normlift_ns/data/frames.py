@@ -97,7 +97,7 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
 
 
 def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tuple[str, ...]:
-    """Return warnings in whole sentences about images that image viewers display in another way than training."""
+    """Return warnings in whole sentences about images that image viewers and training display differently."""
     kinds = (
         (
             [header.rotated for header in headers],
@@ -130,7 +130,7 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion that moves no pixel. nerfstudio takes fisheye cameras whose distortion is zero for pinholes."""
+"""Distortion that moves no pixel. nerfstudio treats fisheye cameras without distortion as pinhole cameras."""
 
 
 class Intrinsics(NamedTuple):

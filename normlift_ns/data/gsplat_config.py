@@ -102,6 +102,6 @@ def _check_primitive(path: Path, camera_model: str | None, model_type: str | Non
     else:
         return
     raise InputError(
-        f"{path} says that the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
+        f"According to {path}, the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
         "Train it again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
     )

@@ -27,8 +27,8 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
 
     Args:
         names: Sorted names of all images.
-        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, or Inria's with
-            --eval.
+        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, and in Inria's
+            with --eval.
         eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
             below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:

@@ -220,8 +220,8 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
     """Return the scene with additional training views. Their cameras must be in the world of the scene.
 
     Raises:
-        FileNotFoundError, ValueError: An image is missing or cannot be read, or it has a fisheye camera and the images
-            of a `SplatScene` do not, or the other way round.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or only one of it and the images of a
+            `SplatScene` has a fisheye camera.
     """
     views = ImageViews(frames, scene.background)
     remarks = (*scene.remarks, *views.check_files())

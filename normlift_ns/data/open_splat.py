@@ -243,7 +243,7 @@ _CLIP_PLANES = (0.2, 1e10)
 
 
 def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
-    """Return a file whose primitive is known: that of the options, the files or the file name, in this order.
+    """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
         ValueError: if options and files contradict each other.

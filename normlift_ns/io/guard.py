@@ -140,7 +140,7 @@ def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callabl
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
-    """Yield the kind, folder and pattern of entries of each run and data set that contains a folder."""
+    """Yield each run and data set that contains `folder`, as its kind, its path and a pattern of its entries."""
     for parent in (folder, *map(str, Path(folder).parents)):
         for kind, markers, names in _OWNERS:
             if all(os.path.exists(os.path.join(parent, marker)) for marker in markers):

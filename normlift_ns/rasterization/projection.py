@@ -202,7 +202,7 @@ _LEAST_EXTENT = 1e-4
 def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
     """Project the Gaussians of 2D Gaussian Splatting, drop invisible ones, and sort by depth (equal depths by index).
 
-    Computed in float64: the extent in the image is a difference of large numbers.
+    The computation uses float64, because the extent in the image is a difference of large numbers.
 
     Args:
         world: Gaussians.

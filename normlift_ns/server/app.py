@@ -166,7 +166,7 @@ def _limited(receive: Receive) -> Receive:
 
 
 def _accepts_gzip(header: str) -> bool:
-    """Return True if a header Accept-Encoding names gzip, and not with the weight 0.
+    """Return True if an Accept-Encoding header lists gzip with a weight above 0.
 
     >>> [_accepts_gzip(one) for one in ("br, gzip;q=0.8", "GZIP", "gzip;q=0", "gzip; q=0.0", "br", "")]
     [True, True, False, False, False, False]

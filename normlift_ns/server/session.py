@@ -460,7 +460,7 @@ class PageSession:
             await self._ask_line(seq, threshold=link.threshold)
 
     async def _follow(self, greeting: Greeting, seq: int) -> Link | None:
-        """Apply clicks, camera and color mode from the link in the page's URL, unless the page opened it before."""
+        """Apply clicks, camera and color mode from the link in the page's URL, unless the page has already used it."""
         memory, link = self._memory, None
         try:
             link = read_link(greeting.link) if greeting.link != memory.link else None

@@ -82,7 +82,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    If `question` uses the suggested threshold, it keeps it unless the user chose the previous threshold.
+    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose that one.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -279,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
+    """Add Gaussians to the selection. Prompts no longer select if the selection was grown or shrunk."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -288,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
+    """Remove Gaussians from the selection. Prompts no longer select if the selection was grown or shrunk."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)

@@ -125,7 +125,7 @@ class ConfigPaths:
 
 
 def read_config_paths(path: Path) -> ConfigPaths:
-    """Read names and paths from the YAML of a config.yml, without the construction of the config.
+    """Read names and paths from the YAML of a config.yml, without constructing the config.
 
     Raises:
         FileNotFoundError, OSError, ValueError: The errors of `compose_config`.
@@ -453,7 +453,7 @@ def check_config_values(config: Any, path: Path, say: Callable[[str], None] = la
             part, _, field = name.rpartition(".")
             owner: Any = attrgetter(part)(config)
             setattr(owner, field, next(item.default for item in fields(owner) if item.name == field))
-            say(f"{path}: {name} is {_format(value)}, which is ignored, because it does not affect a lift.")
+            say(f"{path}: {name} is {_format(value)}. This value is ignored, because it does not affect a lift.")
             continue
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     pipeline: Any = config.pipeline
