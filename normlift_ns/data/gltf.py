@@ -261,7 +261,7 @@ def _read_attributes(gltf: _Gltf, primitive: _Primitive) -> SplatParameters:
     degree = max((d for d in range(1, _MAX_DEGREE + 1) if _harmonic(d, 0) in primitive.attributes), default=0)
     rest = [read(_harmonic(d, i), 3) for d in range(1, degree + 1) for i in range(2 * d + 1)]
     if any(len(x) != len(scales) for x in rest):
-        raise _damaged(gltf.path, f"its spherical harmonics and its scales differ in the number of rows ({len(scales)} scales)")
+        raise _damaged(gltf.path, "its spherical harmonics and scales differ in their number of rows")
     parameters = {
         "means": read("POSITION", 3),
         "quats": read(f"{_EXTENSION}:ROTATION", 4).roll(1, dims=1),

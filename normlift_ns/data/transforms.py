@@ -360,8 +360,8 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         name, first, second = differ[0]
         kept, others = (", ".join(dict.fromkeys(item[i][0] for item in differ)) for i in (1, 2))  # type: ignore[index]
         raise InputError(
-            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} in {first[0]}, which "
-            f"nerfstudio reads, and {second[1]:g} in {second[0]}, which programs such as instant-ngp and Brush read. "
+            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} from {first[0]}, which "
+            f"nerfstudio reads, and {second[1]:g} from {second[0]}, which programs such as instant-ngp and Brush read. "
             f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
         )

@@ -403,7 +403,9 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
             if file.relative_to(new).as_posix() in replaced or (keep_new and os.path.lexists(file)):
                 continue
             if os.path.lexists(file):
-                raise InputError(f"{source / name} is not a file of the old lift, but the new one writes it; move it elsewhere")
+                raise InputError(
+                    f"{source / name} is not a file of the old lift, but the new one writes it; move it elsewhere"
+                )
             try:
                 os.link(source / name, file, follow_symlinks=False)
             except OSError:
