@@ -41,7 +41,6 @@ from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
 from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.segmentation.sam import SamMasks
 
 _UNLISTED_SHARE = 0.1
 """Maximum fraction of an image's weight in regions that are not listed."""
@@ -398,10 +397,10 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        """Return the feature source of the lift. It loads no network, and reads results from the cache only."""
+        """Return the feature source of the lift. Encoders and SAM only read the cache; they load no network."""
 
         def is_quick(part: Any) -> bool:
-            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))
+            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or hasattr(part, "checkpoint"))
 
         return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
 

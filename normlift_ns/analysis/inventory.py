@@ -36,7 +36,7 @@ from normlift_ns.options import OBJECT_MIN_GAUSSIANS
 
 MAX_OBJECTS = 20
 """Maximum number of objects in an inventory."""
-MIN_SHARE = 0.001
+MIN_EVIDENCE = 0.001
 """Minimum evidence of an object, as a fraction of the evidence of all images."""
 _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
@@ -119,7 +119,7 @@ def find_inventory(
     weight = (evidence.rows.row_sums() + evidence.unlabeled.row_sums()).numpy()
     size, total = np.bincount(part), np.bincount(part, weight)
     order = np.argsort(-total, kind="stable")
-    large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_SHARE * weight.sum()) & (total[order] > 0)
+    large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_EVIDENCE * weight.sum()) & (total[order] > 0)
     listed = order[large][:MAX_OBJECTS]
     number = np.zeros(len(size), np.int32)
     number[listed] = np.arange(1, len(listed) + 1)

@@ -215,3 +215,7 @@ def _show(found: dict[str, Path | None]) -> None:
 def entrypoint() -> None:
     """Run ns-normlift-weights, and return to the caller if it succeeds."""
     run_command(NormLiftWeights)
+
+
+if __name__ == "__main__":
+    entrypoint()
