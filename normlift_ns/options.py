@@ -593,8 +593,8 @@ class SplatOptions:
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    gsplat's trainer wrote a cfg.yml or cfg.json for 2D Gaussians, the PLY file has two scales, or the file name
-    contains 2dgs; otherwise 3dgs."""
+    gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs; otherwise
+    3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
     Inria's trainer, else black."""

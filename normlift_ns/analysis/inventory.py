@@ -1,14 +1,14 @@
 """Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
 Each image in which two neighboring Gaussians have a region gives this pair a count. The count is 1 if both have the
-same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)), with the usual
-disagreement of the views, s = 1 - median ||f_j||. The affinity of two parts is the mean of the counts over all images
-and all pairs of neighbors across their border::
+same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median
+||f_j|| is the usual disagreement of the views. The affinity of two parts is the mean of the counts over all images and
+all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
-a surface; it separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
+a surface. It separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
 part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
 so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
 Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
@@ -255,7 +255,7 @@ def best_words(
         directions: unit directions of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
         vectors: one unit row per word, names first.
-        by_chance: number of pairs that may exceed the limit by chance; inf: accept every best name.
+        by_chance: number of pairs that may exceed the limit by chance; inf accepts every best name.
         count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T

@@ -254,8 +254,8 @@ class SplitViews:
         """Check the headers of all images, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. For
-                nerfstudio runs, also if an image or a mask has the wrong size. The message gives the path.
+            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. In
+                nerfstudio runs, images and masks must also have the right size. The message gives the path.
         """
         headers = [read_image_header(file) for file in self.files]
         for index, header in enumerate(headers):

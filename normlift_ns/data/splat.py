@@ -292,7 +292,7 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file whose header is changed to a form that plyfile reads, without changing its length.
+    """PLY file with a header of the same length that plyfile can read.
 
     Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
     comments.

@@ -245,7 +245,7 @@ class WarmServer:
         """Call `work` in a thread, and return its result.
 
         Args:
-            slow: use the threads for slow work; False: use those for queries.
+            slow: True to use the threads for slow work, False to use those for queries.
         """
         limiter = self.limits.slow if slow else self.limits.asking
         result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)

@@ -279,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. Prompts no longer select if the selection was grown or shrunk."""
+    """Add Gaussians to the selection. After growing or shrinking, it no longer depends on prompts."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -288,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. Prompts no longer select if the selection was grown or shrunk."""
+    """Remove Gaussians from the selection. After growing or shrinking, it no longer depends on prompts."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)

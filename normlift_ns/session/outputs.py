@@ -27,7 +27,7 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
 
     Args:
         folder: folder of the field.
-        replaces: delete the prompts that the run already stores; False: keep them.
+        replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
         ValueError: there is no query or no folder, or as in `merge_queries`.
     """
