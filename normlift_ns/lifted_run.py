@@ -483,7 +483,7 @@ class LiftedRun:
         """Return an answer, finding or mask as a mask [N] of Gaussians.
 
         Raises:
-            ValueError: `part` has another type or length.
+            ValueError: `part` has the wrong type or length.
         """
         mask = part.mask if isinstance(part, Answer | Finding) else None
         if mask is None:

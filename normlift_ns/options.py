@@ -189,7 +189,7 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
     """Return the renamed flags of an options dataclass and its groups, as a dictionary from old to new flags.
 
     Args:
-        prefix: Prefix of the flags. With another prefix than "--", the flags of `RefineConfig` have no old names.
+        prefix: Prefix of the flags. With a prefix other than "--", the flags of `RefineConfig` have no old names.
     """
     names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
     flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
@@ -377,7 +377,7 @@ def check_path(name: str, value: object) -> Path:
         name: Name of the option, for messages.
         value: The string or path.
     Raises:
-        InputError: The value has another type, or contains NUL or a character that the file system cannot encode.
+        InputError: The value has the wrong type, or contains NUL or a character that the file system cannot encode.
         PathError: A name is too long, the path leads through a file, or its links form a loop.
 
     >>> check_path("data", "fox").name

@@ -171,7 +171,7 @@ class NormLiftWeights(CheckedOptions):
         """Fetch the requested weights, or print the table.
 
         Raises:
-            InputError: A name is unknown, or an index serves another file than expected.
+            InputError: A name is unknown, or an index serves an unexpected file.
             FileNotFoundError: Weights cannot be downloaded.
         """
         for name in self.get:

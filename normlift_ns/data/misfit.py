@@ -1,4 +1,4 @@
-"""Causes of a poor alignment: another focal length, principal point, distortion or primitive that fits the images."""
+"""Causes of a poor alignment: a different focal length, principal point, distortion or primitive fits the images."""
 
 from __future__ import annotations
 

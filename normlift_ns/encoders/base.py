@@ -382,7 +382,7 @@ class PatchFeatures:
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the image is invalid, or the weight file is damaged or of another architecture.
+            ValueError: If the image is invalid, or the weight file is damaged or of a different architecture.
             MemoryError: If the image does not fit into the memory of the device.
         """
         check_image(image, name)

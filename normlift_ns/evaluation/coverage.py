@@ -321,8 +321,8 @@ def model_of_lift(
 ) -> ReliabilityModel:
     """Return the evidence of a lift.
 
-    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used another
-    resolution and several levels of regions.
+    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used a
+    different resolution and several levels of regions.
 
     Args:
         lifted: weights of the lifted views, [N, views].

@@ -300,7 +300,7 @@ def atomic_files(
         own: Skip the checks of inputs and kinds, for files of runs and caches that this package wrote itself.
     Raises:
         FileExistsError: A path exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind. No file has changed.
+        ValueError: The errors of `refuse_inputs`, or an existing file is of a different kind. No file has changed.
         NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
 
     >>> import tempfile
@@ -556,7 +556,7 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
         flags: Flags for choosing another path, quoted in the error message.
     Raises:
         FileExistsError: One of the paths exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind than its suffix.
+        ValueError: The errors of `refuse_inputs`, or the content of an existing file does not match its suffix.
     """
     refuse_inputs(paths, instead=flags)
     for folder in {path.parent for path in paths}:

@@ -323,7 +323,7 @@ def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: 
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
-    """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
+    """Return the answer to a query with the same embeddings but a different threshold or minimum reliability.
 
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
     """

@@ -114,7 +114,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     """Load the transformers model of a folder with its weights, in float32 on the CPU.
 
     Raises:
-        ValueError: If weights are missing or have other shapes, or if the config does not describe the network.
+        ValueError: If weights are missing or have the wrong shapes, or if the config does not describe the network.
         Exception: If the libraries that read the folder find other damage.
     """
     transformers = import_transformers()

@@ -400,7 +400,7 @@ class PageSession:
         row = None if value.object is None else self._object(value.object)
         mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
         if not bool(mask.any()):
-            raise InputError("Nothing is selected. Select Gaussians to export first.")
+            raise InputError("Nothing is selected. First select the Gaussians to export.")
 
         async def work() -> None:
             try:

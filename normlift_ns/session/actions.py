@@ -128,7 +128,7 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
-    """Apply a query with the same prompts but another rule or other features. Clicked selections are kept."""
+    """Apply a query with the same prompts but a different rule or different features. Clicked selections are kept."""
     return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
@@ -330,7 +330,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to hide first.")
+        raise InputError("Nothing is selected. First select the Gaussians to hide.")
     hidden = chosen if state.hidden is None else state.hidden | chosen
     return replace(state, hidden=hidden, action=f"Hide {int(chosen.sum()):,}")
 
@@ -345,7 +345,7 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to isolate first.")
+        raise InputError("Nothing is selected. First select the Gaussians to isolate.")
     return replace(state, hidden=~chosen, action=f"Only {int(chosen.sum()):,}")
 
 

@@ -62,7 +62,7 @@ def selection_bytes(
         ValueError: the mask has no Gaussian that a renderer draws, or the exporter does not exist.
     """
     if not bool(mask.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to export first.")
+        raise InputError("Nothing is selected. First select the Gaussians to export.")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / safe_file_name(name)
         if kind == "masks":
