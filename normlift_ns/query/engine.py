@@ -212,7 +212,7 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        A prompt that selects one or more Gaussians is a weak match or found.
+        The verdict on a prompt that selects Gaussians is weak match or found.
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict

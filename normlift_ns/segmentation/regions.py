@@ -232,7 +232,7 @@ class LabelFiles(RegionDefaults):
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
                     f"{name} is {width}x{height}{downscaled}. Make {self.description}s of the size of the image, which "
-                    "undistortion can crop, or resize them with --regions-resample True"
+                    "undistortion may have cropped, or resize them with --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
