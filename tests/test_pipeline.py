@@ -133,8 +133,8 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
     """Also where another size of the same image is: half of 25 x 19 is half of 24 x 18, but for the distortion."""
     for height, width, what in (
         (HEIGHT + 1, WIDTH + 1, "the size of the original image"),
-        (HEIGHT // 2, WIDTH // 2, "another size"),
-        (2 * HEIGHT + 2, 2 * WIDTH + 2, "another size"),
+        (HEIGHT // 2, WIDTH // 2, "a different size"),
+        (2 * HEIGHT + 2, 2 * WIDTH + 2, "a different size"),
     ):
         for kind in ("langsplat", "files"):
             refused, stretched = (

@@ -539,3 +539,7 @@ class NormLiftBatch(CheckedOptions):
 def entrypoint() -> None:
     """Run ns-normlift-batch, and return to the caller if it succeeds."""
     run_command(NormLiftBatch)
+
+
+if __name__ == "__main__":
+    entrypoint()

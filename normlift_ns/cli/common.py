@@ -519,7 +519,9 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
         if is_dataclass(hint):
             add_help_texts(hint, nested=True)
             text, name = first_paragraph(hint), "" if nested else None
-        options.__annotations__[field.name] = Annotated[hint, tyro.conf.arg(name=name, help=" ".join(text.split()))]
+        default = "(default: none)" if field.default == () else None
+        conf = tyro.conf.arg(name=name, help=" ".join(text.split()), help_behavior_hint=default)
+        options.__annotations__[field.name] = Annotated[hint, conf]
     return options
 
 

@@ -70,7 +70,7 @@ def _hub(
     user: str, megabytes: float, license_name: str, data: str, repository: str,
     local: str, find: Callable[[], Path | None], download: Callable[[], Path],
 ) -> Weights:  # fmt: skip
-    """Return weights of the hub.
+    """Return the entry for weights on the Hugging Face Hub.
 
     Args:
         local: Required files of the repository, and the option that takes a local copy of them.
@@ -171,7 +171,7 @@ class NormLiftWeights(CheckedOptions):
         """Fetch the requested weights, or print the table.
 
         Raises:
-            InputError: A name is unknown, or an index serves another file than expected.
+            InputError: A name is unknown, or an index serves an unexpected file.
             FileNotFoundError: Weights cannot be downloaded.
         """
         for name in self.get:
@@ -215,3 +215,7 @@ def _show(found: dict[str, Path | None]) -> None:
 def entrypoint() -> None:
     """Run ns-normlift-weights, and return to the caller if it succeeds."""
     run_command(NormLiftWeights)
+
+
+if __name__ == "__main__":
+    entrypoint()

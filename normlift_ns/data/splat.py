@@ -182,7 +182,7 @@ _FLATNESS = math.log(1e-3)
 
 
 def flatten_splat(splat: SplatParameters) -> SplatParameters:
-    """Return 2D Gaussians as thin 3D ones, for viewers and files that have no others."""
+    """Return 2D Gaussians as thin 3D ones, for viewers and file formats that support only 3D Gaussians."""
     in_plane = splat.scales[:, :2]
     return replace(splat, scales=torch.cat([in_plane, in_plane.amin(dim=1, keepdim=True) + _FLATNESS], dim=1))
 
@@ -292,7 +292,7 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file whose header is changed to a form that plyfile reads, without a change of its length.
+    """PLY file with a header of the same length that plyfile can read.
 
     Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
     comments.

@@ -212,7 +212,7 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        A prompt that selects one or more Gaussians is a weak match or found.
+        The verdict on a prompt that selects Gaussians is weak match or found.
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
@@ -323,7 +323,7 @@ def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: 
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
-    """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
+    """Return the answer to a query with the same embeddings but a different threshold or minimum reliability.
 
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
     """
