@@ -119,16 +119,16 @@ WEIGHTS: dict[str, Weights] = {
         "--encoder open_clip",
         600,
         "MIT",
-        "LAION-2B: links to images of the web, each under terms of its own; LAION recommends it for research",
+        "LAION-2B: links to web images, each under its own terms; LAION recommends it for research",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
         "open_clip_model.safetensors or open_clip_pytorch_model.bin, for --encoder-pretrained FILE",
         _find_open_clip,
         lambda: open_clip.find_open_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED)[0],
     ),
-    "siglip": _family("siglip", 813, "Apache-2.0", "WebLI: images of the web, not published"),
-    "siglip2": _family("siglip2", 1500, "Apache-2.0", "WebLI: images of the web, not published"),
+    "siglip": _family("siglip", 813, "Apache-2.0", "WebLI: web images, not published"),
+    "siglip2": _family("siglip2", 1500, "Apache-2.0", "WebLI: web images, not published"),
     "metaclip2": _family(
-        "metaclip2", 7400, "CC BY-NC 4.0: non-commercial", "pairs selected from Common Crawl: images of the web"
+        "metaclip2", 7400, "CC BY-NC 4.0: non-commercial", "pairs selected from Common Crawl: web images"
     ),
     "imagenet": _package(IMAGENET, "Apache-2.0", _IMAGENET_TERMS),
     "sam": _sam(

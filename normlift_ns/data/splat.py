@@ -358,8 +358,8 @@ def check_ply_header(path: Path) -> None:
     lines = header.replace(b"\r", b"\n").split(b"\n")
     if header.startswith(b"ply") and (end == b"" or max(map(len, lines)) > _MAX_LINE_BYTES):
         raise InputError(
-            f"{path} is truncated or damaged: its header has no end_header in the first {_MAX_HEADER_BYTES:,} bytes, "
-            f"or a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
+            f"{path} is truncated or damaged: its header does not end within {_MAX_HEADER_BYTES:,} bytes, or it has "
+            f"a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
         )
     lines = [line.split() for line in lines]
     starts = [i for i, words in enumerate(lines) if words[:1] == [b"element"]]

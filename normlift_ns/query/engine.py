@@ -219,7 +219,7 @@ class Finding:
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it ignores no words except articles."""
+        """Words of the prompt that the encoder uses; None if it ignores at most articles."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))

@@ -239,8 +239,8 @@ class _Grid(NamedTuple):
     def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
         """Return the first position of rows, and the position after their last pixel.
 
-        If a row has at least `least` pixels, components that contain a whole row are large. Only rows with edges and
-        the rows above and below them are returned in this case, otherwise all rows.
+        If a row has at least `least` pixels, components that contain a whole row are large. The result then has only
+        rows with edges and the rows above and below them. Otherwise, it has all rows.
         """
         near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True
