@@ -67,12 +67,11 @@ def check_same(outputs: Sequence[Path]) -> None:
         assert [name for name in first if found[name] != first[name]] == []
 
 
-def test_two_and_three_processes_write_the_files_of_one(trained, alone, tmp_path):
-    for count in (2, 3):
-        done = lifted(*words(trained, tmp_path / str(count), count))
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.count("ns-normlift-query") == 1  # one process speaks
-    check_same([alone, *(tmp_path / str(count) for count in (2, 3))])
+def test_three_processes_write_the_files_of_one(trained, alone, tmp_path):
+    done = lifted(*words(trained, tmp_path / "three", 3))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("ns-normlift-query") == 1  # one process speaks
+    check_same([alone, tmp_path / "three"])
     assert list(tmp_path.glob("**/team-*")) == []
 
 
