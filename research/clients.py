@@ -104,16 +104,17 @@ def add_clients(report: Report, config: Path) -> None:
         settled, end = asyncio.run(ask_all(server, run, log))
         wall = time.perf_counter() - start
         share = (time.process_time() - own) / (wall * len(os.sched_getaffinity(0)))
-        busy = (server.worked() - worked) / (wall * len(os.sched_getaffinity(0)))
+        used = server.worked() - worked
     for error in sorted(set(log.errors)):
         print(f"{log.errors.count(error)} times: {error}")
     report.add("answers", len(log.seconds), f"answers to {CLIENTS} clients in {wall:.1f} s")
     report.add("errors", len(log.errors), "errors")
     for name, percent in (("median", 50), ("p99", 99), ("most", 100)):
         report.add(f"answer_{name}_s", np.percentile(log.seconds, percent), "s")
+    report.add("server_s_per_answer", used / len(log.seconds), "s of processor time of the server per answer")
     report.add("received_bytes_per_s", log.received / wall, "bytes of relevancies and masks per s")
     report.add("clients_share", share, "share of all processor time that the clients take")
-    report.add("server_share", busy, "share of all processor time that the server takes")
+    report.add("server_share", used / (wall * len(os.sched_getaffinity(0))), "share of all processor time that the server takes")
     report.add("resident_settled_bytes", settled, f"bytes of memory of the server after {SETTLED:.0f} s")
     report.add("resident_growth_bytes", end - settled, "bytes of memory more at the end")
 
