@@ -72,7 +72,6 @@ class Greeting(msgspec.Struct, frozen=True):
     """Random text stored in the browser tab; it identifies the session after a reload."""
     link: Annotated[str, msgspec.Meta(max_length=MAX_LINK_LENGTH)] = ""
     """Query string of the page's URL, with or without the question mark."""
-    webgl: bool = True
     access: Annotated[str, msgspec.Meta(max_length=200)] = ""
     """Access token for writing; see `app.ServerOptions`."""
 
