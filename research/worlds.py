@@ -56,6 +56,7 @@ TURNS = {
     "exchange": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
     "scale_2.5": 2.5 * np.eye(3),
     "scale_0.23": 0.23 * np.eye(3),
+    "scale_0.0137": 0.0137 * np.eye(3),
     "z_up_to_y_up_scale_100": 100 * _QUARTER,
 }
 _CONTRAST, _NOISE = 0.1, 2.0
