@@ -28,6 +28,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from PIL import Image
@@ -211,6 +212,11 @@ def summarize(name: str, rows: Rows) -> Rows:
     ]
 
 
+def _limit_threads(count: int) -> None:
+    torch.set_num_threads(count)
+    numba.set_num_threads(count)
+
+
 @cache
 def _case(name: str) -> Case:
     """Return the case of a capture, one in every process, with compiled kernels."""
@@ -249,7 +255,7 @@ def main() -> None:
     rotations, step = (4, 8) if args.quick else (ROTATIONS, 1)
     report, found = Report(args.name), dict[str, list[Any]]()
     threads = max(1, len(os.sched_getaffinity(0)) // args.processes)
-    with ProcessPoolExecutor(args.processes, get_context("spawn"), torch.set_num_threads, (threads,)) as pool:
+    with ProcessPoolExecutor(args.processes, get_context("spawn"), _limit_threads, (threads,)) as pool:
         for name in args.captures:
             count = len(TURNS) + (3 if name == "pale" else 4)
             parts = [None, *range(0, count, step), *(range(i, i + 2) for i in range(0, rotations, 2))]

@@ -200,7 +200,7 @@ def test_pixels_that_the_image_does_not_show_have_no_region_and_no_color(tmp_pat
         assert torch.equal(block.labels[0] == MASKED, ~mask)
         labels = block.labels[0][mask]
         assert set(labels.unique().tolist()) - {-1} <= set(range(len(block.features[0])))
-        assert (labels == -1).float().mean() < 0.02 * (downscale - 1)
+        assert (labels == -1).float().mean() <= 0.02 * (downscale - 1)
         assert (block.features[0] @ block.features[0].T).min() > 0.999  # no black is mixed into them
 
 
@@ -248,6 +248,7 @@ def test_a_splat_is_opened_with_fisheye_images(tmp_path: Path) -> None:
         for downscale in (1, 2):
             block = observe_views(scene, [1], source, render_settings=None, downscale=downscale)
             undistorted = undistort_labels(labels[None], LENS)[0]
-            step = block.labels[0][:, 100 // downscale].numpy()
-            assert np.abs(step - undistorted[downscale // 2 :: downscale, 100]).max() <= downscale - 1
-            assert np.abs(undistorted[:, 100] - labels[:, 100]).max() == 1  # the map is not that of the file
+            step, expected = block.labels[0][:, 100 // downscale].numpy(), undistorted[downscale // 2 :: downscale, 100]
+            assert np.abs(step - expected)[step >= 0].max() <= downscale - 1
+            assert (step >= 0).mean() > 0.9
+            assert (undistorted[:, 100] != labels[:, 100]).any()  # the map is not that of the file
