@@ -196,8 +196,13 @@ def _open_gltf(path: Path) -> _Gltf:
     text, binary = _glb_chunks(path) if is_glb else (read_file(path), b"")
     try:
         document = msgspec.json.decode(text, type=_Document)
-    except (msgspec.DecodeError, msgspec.ValidationError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"its JSON does not match the glTF schema ({error})") from error
+    except msgspec.ValidationError as error:
+        raise InputError(
+            f"{path} is JSON that does not match the schema of glTF ({error}). Expected a glTF file with a splat; "
+            "export one, or a PLY file."
+        ) from error
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise _damaged(path, f"its JSON cannot be read ({error})") from error
     if not str(document.asset.get("version", "")).startswith("2."):
         raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export glTF 2.0.")
     unknown = sorted(set(document.extensions_required) - _KNOWN)

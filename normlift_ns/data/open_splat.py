@@ -167,7 +167,16 @@ _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
 """Formats that are detected regardless of the suffix. The exception is splat, which has no characteristic bytes."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
+_JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
+"""Unsupported formats by the names of their files."""
 _BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
+_DOWNLOAD = "Download the file itself instead of the page that shows it."
+_STRANGERS = {
+    b"version https://git-lfs": ("a pointer of Git LFS", "Fetch the file that it stands for, with: git lfs pull"),
+    b"<!doctype html": ("an HTML page", _DOWNLOAD),
+    b"<html": ("an HTML page", _DOWNLOAD),
+}
+"""First bytes of files that downloads leave in the place of a splat, with their kind and advice."""
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
@@ -285,17 +294,24 @@ def _format(path: Path) -> str:
         return suffix
     suffix = suffix.lower()
     head = b""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, expected the file of a splat. Give a file in it.")
     if path.is_file():
         with open_regular(path) as file:
             head = file.read(_HEAD_BYTES)
+    for start, (kind, advice) in _STRANGERS.items():
+        if head.lstrip().lower().startswith(start):
+            raise InputError(f"{path} is {kind}, expected a splat. {advice}")
     if head.startswith(b"PK"):  # torch.save writes ZIP archives
+        if suffix in _UNREAD:
+            raise _unread(path, suffix.upper())
         _refuse_archive(path)
         return "pt"
     for start, name in _MAGIC.items():
         if head.startswith(start):
             return name
-    if suffix in _UNREAD or path.name == "meta.json":
-        raise _unread(path, suffix.upper() if suffix in _UNREAD else "SOG")
+    if suffix in _UNREAD or path.name in _JSON_FORMATS:
+        raise _unread(path, _JSON_FORMATS.get(path.name, suffix.upper()))
     if head.lstrip()[:1] == b"{":
         return "gltf"
     return suffix if suffix in _SNIFFED else "ply"

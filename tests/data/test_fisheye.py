@@ -33,6 +33,8 @@ MODELS = {
     "THIN_PRISM_FISHEYE": LENS,
     "RADIAL_FISHEYE": LENS._replace(fy=150.0, k3=0.0, k4=0.0),
     "SIMPLE_RADIAL_FISHEYE": LENS._replace(fy=150.0, k2=0.0, k3=0.0, k4=0.0),
+    "SIMPLE_FISHEYE": LENS._replace(fy=150.0, k1=1e-12, k2=0.0, k3=0.0, k4=0.0),
+    "FISHEYE": LENS._replace(k1=1e-12, k2=0.0, k3=0.0, k4=0.0),
 }
 POINTS = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.35], [0.5, 0.4], [-0.55, -0.42]])
 """Tangents x/z and y/z of points in front of the camera."""

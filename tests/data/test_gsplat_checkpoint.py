@@ -51,6 +51,7 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
     for content, message in (
         ({"step": 1, "pipeline": {}}, "config.yml with --load-config"),
         ([1, 2], "`splats`, found list"),
+        (((torch.zeros(3),), 30000), "found tuple.*Inria.*--load-ply"),
         ({"splats": {"means": torch.zeros(2, 3)}}, "quats, scales, opacities, sh0, shN"),
         ({"splats": {"means": _Payload()}}, "Python objects"),
     ):
