@@ -121,8 +121,8 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     assert float(angles(old.splat.quats, splat.quats).median()) < 0.02
 
     document, binary = _glb(encode_glb(splat, {}, {}))
-    document["buffers"][0]["uri"] = "scene.bin"
-    (tmp_path / "scene.bin").write_bytes(binary)
+    document["buffers"][0]["uri"] = "my%20scene.bin"
+    (tmp_path / "my scene.bin").write_bytes(binary)
     path = tmp_path / "scene.gltf"
     path.write_text(json.dumps(document))
     plain = _read(path).splat
