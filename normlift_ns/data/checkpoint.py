@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import codecs
-import operator
 import pickle
 import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -192,8 +191,7 @@ def validate_step(step: Any, path: Path) -> int:
     Raises:
         ValueError: The step is not a whole number in range, or differs from the step in the file name.
     """
-    with suppress(TypeError, ValueError):  # NumPy's integers, and tensors with one
-        step = step if isinstance(step, bool) else operator.index(step)
+    step = int(step) if isinstance(step, np.integer) else step
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
         raise InputError(
             f"{path}: its step is {str(step)[:40]} ({type(step).__name__}), expected a whole number from 0 to "
