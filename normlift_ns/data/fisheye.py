@@ -109,6 +109,7 @@ class _Sources(NamedTuple):
     """True at pixels that the original image shows."""
 
 
+@lru_cache(maxsize=2)  # full size, and that of --lift-downscale
 def _sources(lens: Intrinsics) -> _Sources:
     pinhole, size = fisheye_pinhole(lens), (lens.width, lens.height)
     fx, fy, cx, cy = lens[:4]
@@ -126,7 +127,7 @@ def _sources(lens: Intrinsics) -> _Sources:
 
 def filled_pixels(lens: Intrinsics) -> Bool[np.ndarray, "h w"]:
     """Return True at the pixels of the undistorted image that the original fisheye image shows."""
-    return _sources(lens).filled
+    return _sources(lens).filled.copy()
 
 
 def undistort_fisheye(image: UInt8[np.ndarray, "h w c"], lens: Intrinsics) -> UInt8[np.ndarray, "h w c"]:
