@@ -184,7 +184,7 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
 def voting_scalars(field: SemanticField) -> Scalars:
     """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is replaced by the value before the consensus, which R was computed from.
+    With consensus, ||f|| is the value before the consensus, from which R was computed.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False):
