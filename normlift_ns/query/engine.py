@@ -423,7 +423,7 @@ def relevancy_histogram(
 
 
 def _ascending(values: Float[np.ndarray, "..."]) -> Float64[np.ndarray, " n"]:
-    """Return the values in ascending order, in which counting and quantiles are quick."""
+    """Return the values in ascending order, so that counts and quantiles are fast."""
     return np.sort(values, axis=None).astype(np.float64)
 
 
