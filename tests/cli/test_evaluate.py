@@ -61,6 +61,7 @@ def stand_ins(path: Path, words: dict[str, str]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(studies, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
     flags = ("--study", "ablation", "sweeps", "signals", "timing", "baselines")
