@@ -17,11 +17,12 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.consensus import SAMPLING_SEED, Consensus, consensus, with_original_reliability
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
@@ -39,16 +40,17 @@ from normlift_ns.evidence_collection import (
     ViewObservations,
     sample_evenly,
 )
-from normlift_ns.options import (
-    LiftOptions,
-    RefineConfig,
-)
+from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
+CHANGED_COSINE = 0.98
+"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+_COMPARED = 2**14
+"""Number of directions to compare at a time."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
 
 
@@ -100,11 +102,12 @@ def lift_scene(
         step()
     copied = None
     if options.refine:
-        copied, vote_facts = vote_directions(means, lifted, own, options.vote, stages)
+        level = views.level if measures_gate(options, facts) else None
+        copied, options, vote_facts = vote_directions(means, lifted, own, options, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
         statistics = lift_statistics(collection, views, lifted.scalars.reliability, facts)
-        provenance = lift_provenance(collection, encoder, statistics)
+        provenance = lift_provenance(collection, options, encoder, statistics)
         field = SemanticField.build(
             lifted, means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
         )
@@ -239,40 +242,101 @@ def _describe(source: FeatureSource) -> str:
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
+def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
+    """Return whether the vote measures its gate: a posterior vote without --vote-tau, after a consensus that was on.
+
+    Args:
+        facts: `consensus_facts`, if the consensus is enabled.
+    """
+    agreement = facts["consensus"]["agreement"] if "consensus" in facts else []
+    changed = any(x > options.consensus_min_agreement for x in agreement)
+    return changed and options.vote.vote == "posterior" and options.vote.tau is None
+
+
+def with_gate(options: LiftOptions, cosines: Float64[Tensor, " q"] | None) -> tuple[LiftOptions, dict[str, Any]]:
+    """Resolve the gate of the vote, and return it for the manifest if it was measured.
+
+    Args:
+        cosines: cosines of all processes from `shared_region_cosines`, or None for the gate of the options.
+    """
+    gate = None if cosines is None else relative_gate(cosines)
+    if cosines is None or gate is None:
+        return replace(options, vote=replace(options.vote, **options.vote.numbers._asdict())), {}
+    tau, gamma = gate
+    gamma = gamma if options.vote.gamma is None else options.vote.gamma
+    facts = {"gate": {"tau": tau, "gamma": gamma, "pairs": len(cosines)}}
+    return replace(options, vote=replace(options.vote, tau=tau, gamma=gamma)), facts
+
+
 def vote_directions(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
     own: Float[Tensor, " n"],
-    config: RefineConfig,
+    options: LiftOptions,
     stages: StageTimer,
-) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
+    *,
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Int32[Tensor, " n"], LiftOptions, dict[str, Any]]:
     """Let neighboring Gaussians vote on their directions.
 
+    Args:
+        level: level of every region, to measure the gate (default: the gate of the options).
     Returns:
-        For every Gaussian, the index of the Gaussian whose direction it takes. Also the shares of Gaussians that
-        change their direction, and of those without support.
+        For every Gaussian, the index of the Gaussian whose direction it takes. Also the options with all numbers of the
+        vote, and the gate and the counts for the manifest.
     """
     reliability, n = lifted.scalars.reliability, len(means)
+    gaussians = torch.arange(n, device=means.device)
     with stages("neighbors", n):
-        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.report, "neighbors"))
+        neighbors = nearest_neighbors(means, options.vote.k, progress=partial(stages.report, "neighbors"))
     with stages("vote", n):
+        cosines = None
+        if level is not None:
+            cosines = shared_region_cosines(lifted, *sample_pairs(gaussians, neighbors.index, n), level)
+        options, facts = with_gate(options, cosines)
         progress = partial(stages.report, "vote")
-        copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress)
-        counts = count_votes(copied, torch.arange(n, device=means.device), neighbors, reliability)
-    return copied, vote_shares(counts, n)
+        copied = refine(
+            means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors, progress=progress
+        )
+        changed = count_changes(lifted, gaussians, copied.long(), options.vote)
+        counts = count_votes(copied, gaussians, changed, neighbors, reliability)
+    return copied, options, facts | vote_shares(counts, n)
+
+
+def count_changes(
+    lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[Tensor, " m"], config: RefineConfig
+) -> Int64[Tensor, ""]:
+    """Return the number of Gaussians whose direction changes by more than `CHANGED_COSINE`.
+
+    Args:
+        gaussians, source: rows of Gaussians in the lift, and of the Gaussians whose directions they take.
+        config: options of the vote. Its `same_cosine` may exclude smaller changes already.
+    """
+    copies = source != gaussians
+    if config.numbers.same_cosine <= CHANGED_COSINE:
+        return copies.sum()
+    count = torch.zeros((), dtype=torch.int64, device=source.device)
+    for i, j in zip(gaussians[copies].split(_COMPARED), source[copies].split(_COMPARED)):
+        cosine = (lifted.directions(i) * lifted.directions(j)).sum(dim=1)
+        count += (cosine < CHANGED_COSINE).sum()
+    return count
 
 
 def count_votes(
-    copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
-) -> Int64[Tensor, " 2"]:
-    """Return the number of Gaussians that changed their direction, and the number without support."""
-    return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
+    copied: Int32[Tensor, " m"],
+    gaussians: Int[Tensor, " m"],
+    changed: Int64[Tensor, ""],
+    neighbors: Neighbors,
+    reliability: Float[Tensor, " n"],
+) -> Int64[Tensor, " 3"]:
+    """Return the numbers of Gaussians that copied a direction, that changed theirs, and that have no support."""
+    return torch.stack([(copied != gaussians).sum(), changed, unsupported(neighbors, reliability).sum()])
 
 
-def vote_shares(counts: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
+def vote_shares(counts: Int64[Tensor, " 3"], n: int) -> dict[str, float]:
     """Return the counts from `count_votes` as shares of n Gaussians, for the manifest."""
-    changed, lost = counts.tolist()
-    return {"refined_share": changed / n, "unsupported_share": lost / n}
+    copied, changed, lost = (count / n for count in counts.tolist())
+    return {"refined_share": copied, "changed_share": changed, "unsupported_share": lost}
 
 
 def lift_statistics(
@@ -302,9 +366,13 @@ def lift_statistics(
 
 
 def lift_provenance(
-    collection: EvidenceCollection, encoder: Mapping[str, Any], statistics: Mapping[str, Any]
+    collection: EvidenceCollection, options: LiftOptions, encoder: Mapping[str, Any], statistics: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the metadata of a lift for the manifest."""
+    """Return the metadata of a lift for the manifest.
+
+    Args:
+        options: options with the gate that the vote used.
+    """
     scene, config = collection.scene, collection.config
     return {
         **scene.identity,
@@ -312,7 +380,7 @@ def lift_provenance(
         "cameras": camera_summary(scene.train.cameras),
         "cameras_held_out": camera_summary(scene.held_out.cameras),
         "features": collection.source.identity,
-        "options": asdict(collection.options),
+        "options": asdict(options),
         "views_lifted": [scene.train.names[index] for index in collection.views],
         "views_without_features": list(collection.missing),
         "gsplat_rules": config.gsplat_version,

@@ -286,7 +286,10 @@ def measure_core(
             lifted, own = pipeline.lift_features(observed, agreed, options)
         if options.refine:
             vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-            copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
+            voted = replace(options, vote=vote)
+            copied, _, _ = pipeline.vote_directions(
+                means, lifted, own, voted, stages, level=level if options.consensus else None
+            )
         with stages("store"):
             field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
         stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]

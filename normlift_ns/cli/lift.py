@@ -321,7 +321,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
         unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
-        refined = f"{statistics['refined_share']:.1%} of the Gaussians copied a neighbor's feature"
+        refined = f"{statistics['changed_share']:.1%} of the Gaussians changed their direction by more than 11 degrees"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, Int32
+from jaxtyping import Float, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns import api, pipeline
@@ -24,6 +24,7 @@ from normlift_ns.core.consensus import (
     sampled_consensus,
 )
 from normlift_ns.core.field import SemanticField, choose_form
+from normlift_ns.core.gate import sample_pairs, shared_region_cosines
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
@@ -39,7 +40,7 @@ from normlift_ns.distributed.communicator import (
 from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations, chunk_views
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import LiftOptions
 from normlift_ns.progress import StageTimer
 
 
@@ -78,11 +79,12 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
         step()
     copied = None
     if options.refine:
-        copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
+        level = views.level if pipeline.measures_gate(options, facts) else None
+        copied, options, vote_facts = vote_distributed(means, lifted, own, options, portion, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
         statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
-        provenance = pipeline.lift_provenance(collection, prepared.encoder, statistics)
+        provenance = pipeline.lift_provenance(collection, options, prepared.encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
             tolerance=options.tolerance, storage=options.storage, provenance=provenance,
@@ -156,22 +158,30 @@ def vote_distributed(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
     own: Float[Tensor, " m"],
-    config: RefineConfig,
+    options: LiftOptions,
     portion: Partition,
     stages: StageTimer,
-) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
+    *,
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Int32[Tensor, " m"], LiftOptions, dict[str, Any]]:
     """Run `vote_directions` in several processes.
 
     Returns:
-        The Gaussian whose direction each Gaussian of the partition takes, and statistics. The statistics are the
-        fractions of all Gaussians that change their direction and that have no support.
+        The Gaussian whose direction each Gaussian of the partition takes, the options with all numbers of the vote, and
+        the gate and the counts of all Gaussians for the manifest.
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):
         progress = partial(stages.report, "neighbors")
-        neighbors = nearest_neighbors(means, config.k, of=gaussians, progress=progress, team=team)
+        neighbors = nearest_neighbors(means, options.vote.k, of=gaussians, progress=progress, team=team)
     with stages("vote", len(gaussians)):
         halo = gather_halo(lifted, neighbors, portion)
+        cosines = None
+        if level is not None:
+            pairs = sample_pairs(gaussians, halo.neighbors.index, len(means))
+            cosines = team.all_gather(shared_region_cosines(halo.lifted, *pairs, level))
+        options, facts = pipeline.with_gate(options, cosines)
+        config = options.vote
         neighbors, reliability = halo.neighbors, portion.all_gather(lifted.scalars.reliability)[halo.gaussians]
         own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
         rows = refine_subset(
@@ -181,8 +191,10 @@ def vote_distributed(
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
-    return copied, pipeline.vote_shares(counts, len(means))
+        own_rows = torch.arange(len(gaussians), device=means.device)
+        changed = pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long(), config)
+        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, changed, neighbors, reliability))
+    return copied, options, facts | pipeline.vote_shares(counts, len(means))
 
 
 def build_field_distributed(
