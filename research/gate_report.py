@@ -101,7 +101,8 @@ def table(cells: Cells) -> dict[str, dict[str, float]]:
 def reliabilities(cells: Cells) -> dict[str, dict[str, float]]:
     """AUC, accuracy of the highest tenth in the worst cell, and the worst mean of a column against the paper's R."""
     found: dict[str, dict[str, float]] = {}
-    auc = {cell: {kind: [row["R"][kind]["auc"] for row in rows] for kind in rows[0]["R"]} for cell, rows in cells.items()}
+    kinds = next(iter(cells.values()))[0]["R"]
+    auc = {cell: {kind: [row["R"][kind]["auc"] for row in rows] for kind in kinds} for cell, rows in cells.items()}
     auc = {cell: x for cell, x in auc.items() if all(v is not None for values in x.values() for v in values)}
     columns = {f"{key} {label}": [c for c in auc if getattr(c, key) == label]
                for key in ("damage", "views") for label in dict.fromkeys(getattr(c, key) for c in auc)}  # fmt: skip
@@ -128,8 +129,10 @@ def main(arguments: argparse.Namespace) -> None:
         found = table(cells)
         order = sorted(found, key=lambda name: (-found[name]["targets"], -found[name]["damaged"]))
         print(f"\n{label}: {len(cells)} cells of masks")
-        keys = ["targets", "damaged", "edges", "worst all", "worst 6", "worst 3", "undamaged worst", "ratio clip",
-                "ratio orthogonal", "ratio real", "mended damaged", "changed", "mean all", "mean 6", "mean 3"]  # fmt: skip
+        keys = [
+            *("targets", "damaged", "edges", "worst all", "worst 6", "worst 3", "undamaged worst", "ratio clip"),
+            *("ratio orthogonal", "ratio real", "mended damaged", "changed", "mean all", "mean 6", "mean 3"),
+        ]
         print(" " * 34 + " ".join(f"{key.replace('undamaged', 'und')[:9]:>9}" for key in keys))
         for name in order:
             print(f"{name:34}" + " ".join(f"{found[name].get(key, math.nan):9.2f}" for key in keys))
