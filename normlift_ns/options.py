@@ -715,6 +715,9 @@ class LiftOptions(CheckedOptions):
     """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
     may be random. Larger values disable the consensus in more scenes. Use 0 if each mask shows one object, even
     roughly. Needs --consensus True."""
+    recognition: bool = True
+    """Report how well the lift recognizes regions of views that were left out: half of the views, then the other half.
+    This compares captures, encoders and settings without labels. It does not change the result and costs seconds."""
     refine: bool = True
     """Repair directions by a vote among neighboring Gaussians. Each Gaussian copies the direction that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)

@@ -20,10 +20,18 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.consensus import SAMPLING_SEED, Consensus, consensus, with_original_reliability
+from normlift_ns.core.consensus import (
+    SAMPLING_SEED,
+    Consensus,
+    consensus,
+    sample_gaussians,
+    with_original_reliability,
+)
+from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
@@ -59,7 +67,8 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Duration of each stage, in order: features, evidence, consensus (if enabled), lift, neighbors, vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus and recognition (if enabled), lift, neighbors,
+    vote, store."""
 
 
 def lift_scene(
@@ -96,6 +105,12 @@ def lift_scene(
             agreed = consensus(views.evidence, table, level=views.level, **consensus_options(options))
             step()
         table, facts = agreed.features, consensus_facts(options, agreed)
+    if options.recognition:
+        with stages("recognition") as step:
+            rows, regions = views.evidence.rows, views.evidence.num_regions
+            chosen, probability = sample_gaussians(rows, regions, options.consensus_sample)
+            facts |= recognition_facts(views, views.evidence.select_gaussians(chosen), probability, options)
+            step()
     with stages("lift") as step:
         lifted, own = lift_features(views, table, options)
         check_directions(count_directions(lifted), len(means), source)
@@ -176,6 +191,22 @@ def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
     """Return the manifest entry for the consensus."""
     facts = {"seed": SAMPLING_SEED, "gaussians": result.gaussians, "agreement": result.agreement}
     return {"consensus": {**consensus_options(options), **facts}}
+
+
+def recognition_facts(
+    views: ViewObservations, sampled: Evidence, probability: Float64[Tensor, " m"], options: LiftOptions
+) -> dict[str, Any]:
+    """Return the manifest entry for the recognition of regions in left-out views.
+
+    Args:
+        sampled: evidence of the Gaussians from `sample_gaussians`.
+        probability: sampling probability of each of its rows.
+    """
+    least = options.consensus_min_agreement if options.consensus else None
+    found = leave_views_out(
+        sampled, probability, views.features, level=views.level, power=options.consensus_power, least=least
+    )
+    return {"recognition": found.facts}
 
 
 def lift_features(

@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 from normlift_ns.core.consensus import Overlaps, apply_consensus, hash_to_unit, region_overlaps, total_view_weights
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import lift
-from normlift_ns.core.sparse import SparseRows, row_offsets
+from normlift_ns.core.sparse import CHUNK_ELEMENTS, SparseRows, row_offsets
 
 PARTNER_IOU = 0.3
 """Smallest J of a kept region that confirms a left-out one."""
@@ -92,8 +92,7 @@ def leave_views_out(
             clean[columns[left]] = apply_consensus(features[columns[left]], _among(found, left), power, -1.0)
             partner[columns] = _partners(found, kept, features[columns])
         columns = out[view].nonzero().squeeze(1)
-        u = _directions(sampled, (~out).nonzero().squeeze(1), table)
-        toward = _region_sums(sampled.rows, probability, columns, len(view), u)
+        toward = _lifted_regions(sampled, probability, (~out).nonzero().squeeze(1), columns, table)
         seen = (toward != 0).any(1) & (features[columns] != 0).any(1)
         recognized = _nearest_is_own(toward, features[columns], group[columns])
         confirmed = _nearest_is_own(partner[columns], features[columns], group[columns]) & seen
@@ -105,21 +104,22 @@ def leave_views_out(
     return LeftOut(int(recognized), int(confirmed), agreement / regions if regions > 0 else float("nan"))
 
 
-def _directions(sampled: Evidence, kept: Int64[Tensor, " k"], table: Tensor) -> Tensor:
-    """Return u of the sampled Gaussians from some views."""
-    part = sampled.select_views(kept.tolist())
-    return lift(part, table[sampled.columns_of(kept.tolist())]).directions().to(table.dtype)
-
-
-def _region_sums(
-    rows: SparseRows, probability: Tensor, columns: Int64[Tensor, " c"], size: int, u: Float[Tensor, "m d"]
+def _lifted_regions(
+    sampled: Evidence, probability: Tensor, kept: Int64[Tensor, " k"], columns: Int64[Tensor, " c"], table: Tensor
 ) -> Float[Tensor, "c d"]:
-    """Return sum_j E_js u_j of some regions, estimated from the sample."""
-    part = rows.select_columns(columns, size)
-    order = part.column.argsort(stable=True)
-    row = part.row_index()[order]
-    weight = (part.weight[order].double() / probability[row]).to(u.dtype)
-    return SparseRows(row_offsets(part.column, len(columns)), row.int(), weight).matmul(u)
+    """Return sum_j E_js u_j of some regions, with u from the kept views, estimated from the sample."""
+    views = kept.tolist()
+    lifted = lift(sampled.select_views(views), table[sampled.columns_of(views)])
+    rows = sampled.rows.select_columns(columns, sampled.num_regions)
+    sums = table.new_zeros(len(columns), table.shape[1])
+    for chunk in torch.arange(len(rows), device=table.device).split(max(1, CHUNK_ELEMENTS // table.shape[1])):
+        part = rows.select_rows(chunk)
+        order = part.column.argsort(stable=True)
+        row = part.row_index()[order]
+        weight = part.weight[order].double() / probability[chunk[row]]
+        by_region = SparseRows(row_offsets(part.column, len(columns)), row.int(), weight.to(table.dtype))
+        sums += by_region.matmul(lifted.directions(chunk).to(table.dtype))
+    return sums
 
 
 def _among(found: Overlaps, keep: Bool[Tensor, " s"]) -> Overlaps:

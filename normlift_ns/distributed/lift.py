@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns import api, pipeline
@@ -23,6 +23,7 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     sampled_consensus,
 )
+from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField, choose_form
 from normlift_ns.core.gate import sample_pairs, shared_region_cosines
 from normlift_ns.core.lift import Lifted
@@ -73,6 +74,12 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
             agreed = consensus_distributed(views, portion, **pipeline.consensus_options(options))
             step()
         table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
+    if options.recognition:
+        with stages("recognition") as step:
+            sampled, probability = gather_sample(views, portion, options.consensus_sample)
+            local = pipeline.recognition_facts(views, sampled, probability, options) if team.rank == 0 else None
+            facts |= team.broadcast_object(local)
+            step()
     with stages("lift") as step:
         lifted, own = pipeline.lift_features(views, table, options)
         pipeline.check_directions(team.all_reduce(pipeline.count_directions(lifted)), len(means), collection.source)
@@ -141,17 +148,26 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
     """
     team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
+    sampled, probability = gather_sample(views, portion, sample)
+    if team.rank > 0:
+        out = features.to(evidence.rows.weight.device, copy=True)
+        return Consensus(team.broadcast(out), team.broadcast_object(None), len(probability))
+    result = sampled_consensus(sampled, probability, features, level=level, **options)
+    return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
+
+
+def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> tuple[Evidence, Float64[Tensor, " m"]]:
+    """Return the evidence of the Gaussians that all processes sample, by index, and their sampling probabilities.
+
+    Args:
+        sample: Number of Gaussians of every region; see `consensus`.
+    """
+    team, evidence = portion.communicator, views.evidence
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
     sampled = evidence.select_gaussians(chosen)
     order = team.all_gather(portion.indices[chosen]).argsort()
     rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
-    probability = team.all_gather(probability)[order]
-    if team.rank > 0:
-        out = features.to(evidence.rows.weight.device, copy=True)
-        return Consensus(team.broadcast(out), team.broadcast_object(None), len(order))
-    sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
-    result = sampled_consensus(sampled, probability, features, level=level, **options)
-    return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
+    return replace(sampled, rows=rows, unlabeled=unlabeled), team.all_gather(probability)[order]
 
 
 def vote_distributed(
