@@ -107,9 +107,7 @@ def lift_scene(
         table, facts = agreed.features, consensus_facts(options, agreed)
     if options.recognition:
         with stages("recognition") as step:
-            rows, regions = views.evidence.rows, views.evidence.num_regions
-            chosen, probability = sample_gaussians(rows, regions, options.consensus_sample)
-            facts |= recognition_facts(views, views.evidence.select_gaussians(chosen), probability, options)
+            facts |= recognition_facts(views, options)
             step()
     with stages("lift") as step:
         lifted, own = lift_features(views, table, options)
@@ -194,18 +192,19 @@ def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
 
 
 def recognition_facts(
-    views: ViewObservations, sampled: Evidence, probability: Float64[Tensor, " m"], options: LiftOptions
+    views: ViewObservations, options: LiftOptions, sample: tuple[Evidence, Float64[Tensor, " m"]] | None = None
 ) -> dict[str, Any]:
     """Return the manifest entry for the recognition of regions in left-out views.
 
     Args:
-        sampled: evidence of the Gaussians from `sample_gaussians`.
-        probability: sampling probability of each of its rows.
+        sample: evidence and sampling probabilities of the Gaussians from `sample_gaussians` (default: sample them).
     """
+    if sample is None:
+        rows, size = views.evidence.rows, views.evidence.num_regions
+        chosen, probability = sample_gaussians(rows, size, options.consensus_sample)
+        sample = views.evidence.select_gaussians(chosen), probability
     least = options.consensus_min_agreement if options.consensus else None
-    found = leave_views_out(
-        sampled, probability, views.features, level=views.level, power=options.consensus_power, least=least
-    )
+    found = leave_views_out(*sample, views.features, level=views.level, power=options.consensus_power, least=least)
     return {"recognition": found.facts}
 
 

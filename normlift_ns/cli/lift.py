@@ -7,7 +7,7 @@ import shlex
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -319,6 +319,8 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         levels = (describe_consensus(agreement, consensus["least"], kind) for agreement in consensus["agreement"])
         table.add_row("consensus", "; ".join(levels))
     if "recognition" in statistics:
+        from normlift_ns.planning import describe_recognition  # noqa: PLC0415 (torch is loaded by now)
+
         table.add_row("left-out views", describe_recognition(statistics["recognition"]))
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
@@ -390,20 +392,6 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     if kind in ("superpixel", "grid", "patches"):
         return unchanged
     return f"{unchanged}; if they are rough masks of objects, try --consensus-min-agreement 0"
-
-
-def describe_recognition(facts: Mapping[str, Any]) -> str:
-    """Describe how well the lift recognizes regions in views that were left out, from the manifest.
-
-    >>> describe_recognition({"recognized": 812, "confirmed": 1024, "agreement": 0.71})
-    'recognized 812 of 1,024 regions in views that were left out; agreement 0.71'
-    >>> describe_recognition({"recognized": 0, "confirmed": 0, "agreement": None})
-    'no region was seen alike in other views'
-    """
-    if facts["confirmed"] == 0:
-        return "no region was seen alike in other views"
-    counts = f"recognized {facts['recognized']:,} of {facts['confirmed']:,} regions in views that were left out"
-    return f"{counts}; agreement {facts['agreement']:.2f}"
 
 
 def entrypoint() -> None:

@@ -76,8 +76,8 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
         table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
     if options.recognition:
         with stages("recognition") as step:
-            sampled, probability = gather_sample(views, portion, options.consensus_sample)
-            local = pipeline.recognition_facts(views, sampled, probability, options) if team.rank == 0 else None
+            sample = gather_sample(views, portion, options.consensus_sample)
+            local = pipeline.recognition_facts(views, options, sample) if team.rank == 0 else None
             facts |= team.broadcast_object(local)
             step()
     with stages("lift") as step:
