@@ -67,7 +67,7 @@ _OPTIONS_BY_RANGE = {
     _at_least(3, 10**5): ("views",),
     _at_least(2000, 10**8): ("num_gaussians",),
     OptionRange(0.0, 1.0, "in 0..1"): ("consensus_min_agreement", "min_reliability", "min_opacity", "purity"),
-    OptionRange(-1.0, 1.0, "in -1..1"): ("tau", "same_cosine"),
+    OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
     OptionRange(0.0, _MAX_FLOAT, "not negative"): (
         "delta",
         "prior",
@@ -98,7 +98,7 @@ def named_as_flags() -> Iterator[None]:
         _show_flags.reset(token)
 
 
-VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "same_cosine", "prior")}
+VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "prior")}
 """Command-line names of the fields of `RefineConfig`."""
 
 
@@ -612,12 +612,11 @@ class VoteParameters(NamedTuple):
     tau: float
     gamma: float
     delta: float
-    same_cosine: float
 
 
 VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
-    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0, same_cosine=0.98),
-    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0, same_cosine=1.0),
+    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
+    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
 }
 """Default parameters of each kind of vote. The help texts of `RefineConfig` repeat them."""
 
@@ -656,9 +655,6 @@ class RefineConfig(CheckedOptions):
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
-    same_cosine: float | None = None
-    """Cosine from which two directions count as the same, in -1..1. A Gaussian does not copy a direction that is the
-    same as its own. 1: copy it too. None: 0.98 for posterior, 1 for paper."""
     prior: float = 4.0
     """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
     overrule Gaussians with more views."""

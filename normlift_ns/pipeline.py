@@ -48,7 +48,7 @@ from normlift_ns.evidence_collection import (
     ViewObservations,
     sample_evenly,
 )
-from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
@@ -328,23 +328,18 @@ def vote_directions(
         copied = refine(
             means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors, progress=progress
         )
-        changed = count_changes(lifted, gaussians, copied.long(), options.vote)
+        changed = count_changes(lifted, gaussians, copied.long())
         counts = count_votes(copied, gaussians, changed, neighbors, reliability)
     return copied, options, facts | vote_shares(counts, n)
 
 
-def count_changes(
-    lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[Tensor, " m"], config: RefineConfig
-) -> Int64[Tensor, ""]:
+def count_changes(lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[Tensor, " m"]) -> Int64[Tensor, ""]:
     """Return the number of Gaussians whose direction changes by more than `CHANGED_COSINE`.
 
     Args:
         gaussians, source: rows of Gaussians in the lift, and of the Gaussians whose directions they take.
-        config: options of the vote. Its `same_cosine` may exclude smaller changes already.
     """
     copies = source != gaussians
-    if config.numbers.same_cosine <= CHANGED_COSINE:
-        return copies.sum()
     count = torch.zeros((), dtype=torch.int64, device=source.device)
     for i, j in zip(gaussians[copies].split(_COMPARED), source[copies].split(_COMPARED)):
         cosine = (lifted.directions(i) * lifted.directions(j)).sum(dim=1)

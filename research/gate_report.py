@@ -1,6 +1,6 @@
 """The decision of `research.gate`, from its rows.
 
-    python -m research.gate_report            prints tables; results/gate.json
+python -m research.gate_report            prints tables; results/gate.json
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def main(arguments: argparse.Namespace) -> None:
         for name in order:
             for key, x in found[name].items():
                 report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
-        for kind, x in reliabilities(cells).items():
+        judged = {cell: rows for cell, some in cells.items() if (rows := [row for row in some if "R" in row])}
+        for kind, x in (reliabilities(judged) if judged else {}).items():
             print(f"R {kind:12}", {key: round(v, 3) for key, v in x.items()})
             for key, v in x.items():
                 report.add(f"{label}.R {kind}.{key}", v, "AUC or accuracy")

@@ -50,11 +50,6 @@ def refine(
         posterior:  S_ij = R_j (own_i g_ij + P sum_{k in N} R_k d_ik g_jk / sum_{k in N} R_k d_ik)
         source_i = argmax_{j in N} S_ij   if that S_ij > S_ii + Delta,   else i               (equation 10)
 
-    With `same_cosine` below 1, i also keeps its direction if <u_source, u_i> >= same_cosine, since copying would change
-    next to nothing::
-
-        posterior:  same_cosine = 0.98        paper:  same_cosine = 1, off
-
     In the paper's vote, i is one of up to K + 1 voters, with a weight R_i <= 1 for any number of views. The posterior
     vote counts views instead. Its first term is the support of i itself for the direction u_j. Here, own_i =
     ||f_i|| N_eff_i is the effective number of views that agree on u_i. The second term is the support of the neighbors,
@@ -176,8 +171,6 @@ def refine_subset(
             vote_on_gpu(*arrays, own=evidence, prior=config.prior, width=decay, **numbers)
         else:
             _vote(inputs, voters, rows, row_of, source)
-        if config.numbers.same_cosine < 1:
-            _keep_same(voters, rows, row_of, source, config.numbers.same_cosine)
 
     size, done = _BLOCK[on_gpu] if callable(directions) else max(1, n), 0
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
@@ -238,16 +231,6 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
         best, choice = score[:, 1:].max(dim=1)
         wins = best > score[:, 0] + margin
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
-
-
-def _keep_same(voters: Tensor, directions: Tensor, row_of: Tensor, source: Tensor, same_cosine: float) -> None:
-    """Reset source[i] to i if the direction to copy has at least this cosine with that of i."""
-    changes = voters[source[voters] != voters]
-    step = max(1, _CHUNK_ELEMENTS[directions.is_cuda] // max(1, directions.shape[1]))
-    for i in changes.split(step):
-        u, v = (directions[row_of[x.long()].long()].float() for x in (i, source[i]))
-        same = i[(u * v).sum(dim=1) >= same_cosine]
-        source[same] = same.int()
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:

@@ -208,7 +208,7 @@ def vote_distributed(
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
         own_rows = torch.arange(len(gaussians), device=means.device)
-        changed = pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long(), config)
+        changed = pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long())
         counts = team.all_reduce(pipeline.count_votes(copied, gaussians, changed, neighbors, reliability))
     return copied, options, facts | pipeline.vote_shares(counts, len(means))
 

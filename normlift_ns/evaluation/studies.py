@@ -176,7 +176,7 @@ class Vote:
 def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
     """Return the vote of the lift from its manifest, with defaults for missing values."""
     options = manifest.get("options", {})
-    kind = {"vote": "paper", "same_cosine": 1.0} if "vote" in options else {}  # versions 0.1 and 0.2 have no others
+    kind = {"vote": "paper"} if "vote" in options else {}  # the only kind in version 0.1
     config = RefineConfig(**{**kind, **options.get("vote", {})})
     return Vote(config.vote, config, options.get("reliability_beta", BETA), {})
 

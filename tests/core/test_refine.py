@@ -77,8 +77,7 @@ def vote(means, u, r, config, own=None) -> list[int]:
     for i, score in enumerate(scores(means, u, r, config, own)):
         near = [j for j in score if j != i]
         best = max(near, key=lambda j: (score[j], -near.index(j)))
-        same = config.numbers.same_cosine < 1 and float(u[i] @ u[best]) >= config.numbers.same_cosine
-        source.append(best if score[best] > score[i] + Decimal(config.numbers.delta) and not same else i)
+        source.append(best if score[best] > score[i] + Decimal(config.numbers.delta) else i)
     return source
 
 
@@ -90,9 +89,8 @@ def vote(means, u, r, config, own=None) -> list[int]:
     tau=st.floats(0.2, 0.95),
     delta=st.floats(0, 0.5),
     prior=st.sampled_from([0.0, 0.5, 4.0, 30.0]),
-    same_cosine=st.sampled_from([0.5, 0.9, 1.0]),
 )
-def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior, same_cosine):
+def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior):
     for far in (False, True):
         means, u, r = scene(seed, n=25)
         if far:  # of all weights of some Gaussians nothing is left in the numbers of the machine
@@ -100,9 +98,7 @@ def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior, same_cosine):
             means[20:] += 40
         own = torch.where(r > 0, 8 * torch.rand(25, generator=generator(seed), dtype=torch.float64), 0.0)
         for kind in VOTE_DEFAULTS:
-            config = RefineConfig(
-                vote=kind, k=k, sigma_d=sigma_d, tau=tau, gamma=0.05, delta=delta, prior=prior, same_cosine=same_cosine
-            )
+            config = RefineConfig(vote=kind, k=k, sigma_d=sigma_d, tau=tau, gamma=0.05, delta=delta, prior=prior)
             assert refine(means, u, r, config, own=own).tolist() == vote(means, u, r, config, own)
 
 
@@ -134,7 +130,7 @@ def test_margins_are_compared_with_supports_in_their_own_units(seed, dtype, kind
     """Delta a little below and above what the best of each neighbourhood is ahead: it wins, and it does not."""
     means, u, r = scene(seed, n=30)
     means[::3] *= 4  # some far from everybody
-    own, config = 5 * r, RefineConfig(vote=kind, k=9, sigma_d=2.0, same_cosine=1.0)
+    own, config = 5 * r, RefineConfig(vote=kind, k=9, sigma_d=2.0)
     arrays, compared = [x.to(dtype) for x in (means, u, r)], 0
     for i, score in enumerate(scores(means, u, r, config, own)[:10]):
         ahead = float(max(score[j] for j in score if j != i) - score[i])
@@ -229,26 +225,23 @@ def test_defaults_are_those_of_the_kind_of_vote():
     """A number given counts for either kind."""
     assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTE_DEFAULTS["posterior"]._replace(tau=0.5)
     assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
-    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0, 0.98)
-    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0, 1.0) and RefineConfig().vote == "posterior"
+    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0)
+    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
 
 
 def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
-    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0, 1.0))
+    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0))
     manifest = {
         "options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "reliability_beta": 2.0}
     }
     own = recorded_vote(manifest)
-    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1, 1.0))
+    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1))
     assert recorded_vote({}).config == RefineConfig()
-    told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # the pipeline resolves gamma
-    numbers = {"k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5, "same_cosine": 0.98}
-    assert told == {"vote": "posterior", **numbers}
+    told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # gamma may still be measured
+    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5}
     assert recorded_vote({"options": {"vote": told}}).variant == "posterior"
-    old_vote = {"vote": "posterior", "k": 36, "sigma_d": 2.0, "tau": 0.9, "gamma": 0.05, "delta": 0.0, "prior": 4.0}
-    assert recorded_vote({"options": {"vote": old_vote}}).config.numbers.same_cosine == 1  # of version 0.2
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
 
