@@ -32,7 +32,7 @@ History. A first run had four seeds of most CLIP-like and isotropic cells, with 
 cosine .98 or more (`same`) lost 0.9 points, and larger values of every way to abstain lost more than they saved. In
 cells of 3 views with dropped masks the vote fills Gaussians whose things have no mask; `seen` was added after that.
 
-Reliabilities are measured with `--judge`, on the answers after the consensus: the area under the ROC curve of being
+Reliabilities are measured in the same run, on the answers after the consensus: the area under the ROC curve of being
 right, the accuracy in tenths by R and the mean R of each tenth. Four forms: R of the paper (`paper`), R of the paper
 with N of `core.independence` (`views`), its R with N_eff (`pairs`), and its R (`angular`). Rule: the better form has
 the larger mean AUC over the cells of masks of tabletop and plain room, and is nowhere worse than the paper's by more
@@ -222,7 +222,7 @@ def edge_of(site: Site, voters: Voters) -> Tensor:
 
 
 def observed_forms(site: Site, cell: Cell, seed: int, *, judge: bool = False) -> dict[str, Any]:
-    """Everything of one observation; with reliabilities and left-out views if asked for."""
+    """Everything of one observation; with left-out views if asked for."""
     observed = site.observed(cell, seed)
     words = site.looks if cell.statistic == "histogram" else site.words[cell.statistic]
     classes, voters = words.classes.to(observed.features.device), site.voters
@@ -275,8 +275,7 @@ def observed_forms(site: Site, cell: Cell, seed: int, *, judge: bool = False) ->
         "changed": changed,
     }
     values: dict[str, Any] = {key: [round(x, 4) for x in value] for key, value in values.items()}
-    if judge:
-        values["R"] = {key: ranked(x, right[1]) for key, x in reliabilities(site, observed, seen).items()}
+    values["R"] = {key: ranked(x, right[1]) for key, x in reliabilities(site, observed, seen).items()}
     return {"names": names, "B": agreement, "left_out": left_out, "gates": [gates[False], gates[True]],
             "edges": int(edge.sum()), "voters": len(truth), **values}  # fmt: skip
 
@@ -343,7 +342,7 @@ if __name__ == "__main__":
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--chunk", type=int, default=18, help="cells that a process takes at a time")
     parser.add_argument("--minutes", type=float, default=1e6, help="no observation begins later than this")
-    parser.add_argument("--judge", action="store_true", help="measure reliabilities and left-out views too")
+    parser.add_argument("--judge", action="store_true", help="measure the recognition of left-out views too")
     parser.add_argument("--statistics", nargs="+", help="cells of these statistics alone")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--rows", type=Path, default=RESULTS / "gate_rows.jsonl", help="finished observations")
