@@ -66,7 +66,13 @@ _OPTIONS_BY_RANGE = {
     _at_least(2): ("test_every",),
     _at_least(3, 10**5): ("views",),
     _at_least(2000, 10**8): ("num_gaussians",),
-    OptionRange(0.0, 1.0, "in 0..1"): ("consensus_min_agreement", "min_reliability", "min_opacity", "purity"),
+    OptionRange(0.0, 1.0, "in 0..1"): (
+        "consensus_min_agreement",
+        "min_labeled",
+        "min_reliability",
+        "min_opacity",
+        "purity",
+    ),
     OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
     OptionRange(0.0, _MAX_FLOAT, "not negative"): (
         "delta",
@@ -98,7 +104,7 @@ def named_as_flags() -> Iterator[None]:
         _show_flags.reset(token)
 
 
-VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "prior")}
+VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "min_labeled", "prior")}
 """Command-line names of the fields of `RefineConfig`."""
 
 
@@ -612,11 +618,12 @@ class VoteParameters(NamedTuple):
     tau: float
     gamma: float
     delta: float
+    min_labeled: float
 
 
 VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
-    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
-    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
+    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0, min_labeled=0.2),
+    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0, min_labeled=0.0),
 }
 """Default parameters of each kind of vote. The help texts of `RefineConfig` repeat them."""
 
@@ -655,6 +662,10 @@ class RefineConfig(CheckedOptions):
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
+    min_labeled: float | None = None
+    """Share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. Objects without a mask
+    then take no direction from their neighbors. Gaussians that no view shows may change. None: 0.2 for posterior, 0 for
+    paper."""
     prior: float = 4.0
     """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
     overrule Gaussians with more views."""

@@ -35,7 +35,7 @@ from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import clamp_k, refine, unsupported
+from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import check_unique_stems
@@ -326,11 +326,13 @@ def vote_directions(
         options, facts = with_gate(options, cosines)
         progress = partial(stages.report, "vote")
         copied = refine(
-            means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors, progress=progress
-        )
+            means, lifted.directions, reliability, options.vote,
+            own=own, labeled=labeled_share(lifted.evidence), neighbors=neighbors, progress=progress,
+        )  # fmt: skip
         changed = count_changes(lifted, gaussians, copied.long())
-        counts = count_votes(copied, gaussians, changed, neighbors, reliability)
-    return copied, options, facts | vote_shares(counts, n)
+        copied = copied if int(changed) > 0 else gaussians.int()  # a vote that changes nothing stores nothing
+        counts = count_votes(copied, gaussians, neighbors, reliability)
+    return copied, options, facts | vote_shares(counts, changed, n)
 
 
 def count_changes(lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[Tensor, " m"]) -> Int64[Tensor, ""]:
@@ -348,20 +350,16 @@ def count_changes(lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[
 
 
 def count_votes(
-    copied: Int32[Tensor, " m"],
-    gaussians: Int[Tensor, " m"],
-    changed: Int64[Tensor, ""],
-    neighbors: Neighbors,
-    reliability: Float[Tensor, " n"],
-) -> Int64[Tensor, " 3"]:
-    """Return the numbers of Gaussians that copied a direction, that changed theirs, and that have no support."""
-    return torch.stack([(copied != gaussians).sum(), changed, unsupported(neighbors, reliability).sum()])
+    copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
+) -> Int64[Tensor, " 2"]:
+    """Return the number of Gaussians that copied another direction, and the number without support."""
+    return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
 
 
-def vote_shares(counts: Int64[Tensor, " 3"], n: int) -> dict[str, float]:
-    """Return the counts from `count_votes` as shares of n Gaussians, for the manifest."""
-    copied, changed, lost = (count / n for count in counts.tolist())
-    return {"refined_share": copied, "changed_share": changed, "unsupported_share": lost}
+def vote_shares(counts: Int64[Tensor, " 2"], changed: Int64[Tensor, ""], n: int) -> dict[str, float]:
+    """Return the counts from `count_votes` and `count_changes` as shares of n Gaussians, for the manifest."""
+    copied, lost = counts.tolist()
+    return {"refined_share": copied / n, "changed_share": int(changed) / n, "unsupported_share": lost / n}
 
 
 def lift_statistics(

@@ -139,7 +139,7 @@ def main(arguments: argparse.Namespace) -> None:
         for name in order:
             for key, x in found[name].items():
                 report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
-        judged = {cell: rows for cell, some in cells.items() if (rows := [row for row in some if "R" in row])}
+        judged = {cell: kept for cell, some in cells.items() if (kept := [row for row in some if "R" in row])}
         for kind, x in (reliabilities(judged) if judged else {}).items():
             print(f"R {kind:12}", {key: round(v, 3) for key, v in x.items()})
             for key, v in x.items():

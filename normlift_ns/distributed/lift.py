@@ -29,7 +29,7 @@ from normlift_ns.core.gate import sample_pairs, shared_region_cosines
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
-from normlift_ns.core.refine import decay_width, refine_subset
+from normlift_ns.core.refine import decay_width, labeled_share, refine_subset
 from normlift_ns.distributed.communicator import (
     EvidenceShard,
     TorchCommunicator,
@@ -203,14 +203,16 @@ def vote_distributed(
         rows = refine_subset(
             portion.curve_rows, neighbors, halo.lifted.directions, reliability, config,
             own=None if config.vote == "paper" else own,
+            labeled=labeled_share(lifted.evidence),
             width=decay_width(team.all_gather(neighbors.spacing), config),
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
         own_rows = torch.arange(len(gaussians), device=means.device)
-        changed = pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long())
-        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, changed, neighbors, reliability))
-    return copied, options, facts | pipeline.vote_shares(counts, len(means))
+        changed = team.all_reduce(pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long()))
+        copied = copied if int(changed) > 0 else gaussians.int()
+        counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
+    return copied, options, facts | pipeline.vote_shares(counts, changed, len(means))
 
 
 def build_field_distributed(
