@@ -663,9 +663,9 @@ class RefineConfig(CheckedOptions):
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
     min_labeled: float | None = None
-    """Share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. Objects without a mask
-    then take no direction from their neighbors. Gaussians that no view shows may change. None: 0.2 for posterior, 0 for
-    paper."""
+    """Share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. With larger values,
+    objects without a mask take fewer directions from their neighbors. Gaussians that no view shows may always change.
+    None: 0.2 for posterior, 0 for paper."""
     prior: float = 4.0
     """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
     overrule Gaussians with more views."""
@@ -718,10 +718,10 @@ class LiftOptions(CheckedOptions):
     consensus_sample: int = 50
     """Maximum number of Gaussians that the consensus samples in each region, at least 1. Larger values are more exact
     and slower. Needs --consensus True."""
-    consensus_min_agreement: float = 0.4
+    consensus_min_agreement: float | None = None
     """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
-    may be random. Larger values disable the consensus in more scenes. Use 0 if each mask shows one object, even
-    roughly. Needs --consensus True."""
+    may be random. Larger values disable the consensus in more scenes. Use 0 if each region shows one object, even
+    roughly. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus True."""
     recognition: bool = True
     """Report how well the lift recognizes regions of views that were left out: half of the views, then the other half.
     This compares captures, encoders and settings without labels. It does not change the result and costs seconds."""

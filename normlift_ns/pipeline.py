@@ -21,6 +21,7 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.consensus import (
+    CHANCE_AGREEMENT,
     SAMPLING_SEED,
     Consensus,
     consensus,
@@ -57,6 +58,8 @@ _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
 CHANGED_COSINE = 0.98
 """Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+_OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
+"""Kinds of regions that are objects or parts of them."""
 _COMPARED = 2**14
 """Number of directions to compare at a time."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
@@ -151,6 +154,8 @@ def plan_collection(
     """
     gaussians, names = scene.gaussians.to(device), scene.train.names
     options = replace(options, vote=clamp_k(options.vote, len(gaussians))) if options.refine else options
+    if options.consensus:
+        options = replace(options, consensus_min_agreement=min_agreement(options, source))
     config = choose_raster_config(scene, gaussians, options)
     available = set(source.available(names))
     usable = [index for index, name in enumerate(names) if name in available]
@@ -179,9 +184,21 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
+def min_agreement(options: LiftOptions, source: FeatureSource | None = None) -> float:
+    """Return the agreement up to which the consensus leaves features unchanged.
+
+    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may not.
+    """
+    if options.consensus_min_agreement is not None:
+        return options.consensus_min_agreement
+    identity: Mapping[str, Any] = {} if source is None else source.identity
+    kind = identity.get("regions", identity).get("kind")
+    return 0.0 if kind in _OBJECT_REGIONS else CHANCE_AGREEMENT
+
+
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
     """Return the keyword arguments for `consensus`."""
-    least = options.consensus_min_agreement
+    least = min_agreement(options)
     return {"power": options.consensus_power, "sample": options.consensus_sample, "least": least}
 
 
@@ -203,7 +220,7 @@ def recognition_facts(
         rows, size = views.evidence.rows, views.evidence.num_regions
         chosen, probability = sample_gaussians(rows, size, options.consensus_sample)
         sample = views.evidence.select_gaussians(chosen), probability
-    least = options.consensus_min_agreement if options.consensus else None
+    least = min_agreement(options) if options.consensus else None
     found = leave_views_out(*sample, views.features, level=views.level, power=options.consensus_power, least=least)
     return {"recognition": found.facts}
 
@@ -279,7 +296,7 @@ def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
         facts: `consensus_facts`, if the consensus is enabled.
     """
     agreement = facts["consensus"]["agreement"] if "consensus" in facts else []
-    changed = any(x > options.consensus_min_agreement for x in agreement)
+    changed = any(x > min_agreement(options) for x in agreement)
     return changed and options.vote.vote == "posterior" and options.vote.tau is None
 
 

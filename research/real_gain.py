@@ -3,8 +3,8 @@
     python -m research.real_gain RUN/config.yml       a lifted run of the fox with `--regions edges --encoder imagenet
                                                      --storage evidence`, lifted while its consensus stayed off
 
-Pixels of six labeled images are pooled. A text's relevancy, a cosine, is rendered and compared with the masks. `fox head`
-is asked as "fox" and shows what a consensus costs a part. Prints one line for every way to refine.
+Pixels of six labeled images are pooled. A text's relevancy, a cosine, is rendered and compared with the masks.
+`fox head` is asked as "fox" and shows what a consensus costs a part. Prints one line for every way to refine.
 """
 
 from __future__ import annotations

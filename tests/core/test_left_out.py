@@ -35,7 +35,7 @@ def test_wrong_features_lower_the_agreement():
     clean = unit_rows(COUNT, 16, 0).repeat(VIEWS, 1)
     wrong = torch.rand(len(clean), generator=generator(3)) < 0.3
     damaged = torch.where(wrong[:, None], clean.roll(1, 0), clean)
-    assert judged(damaged, least=None).agreement < judged(clean, least=None).agreement - 0.1
+    assert judged(damaged, least=None).agreement < judged(clean, least=None).agreement - 0.05
     assert judged(damaged, least=None).confirmed < COUNT * VIEWS
 
 

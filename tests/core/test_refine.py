@@ -225,22 +225,27 @@ def test_defaults_are_those_of_the_kind_of_vote():
     """A number given counts for either kind."""
     assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTE_DEFAULTS["posterior"]._replace(tau=0.5)
     assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
-    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0)
-    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
+    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0, 0.2)
+    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0, 0.0) and RefineConfig().vote == "posterior"
 
 
 def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
-    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0))
+    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0, 0.0))
     manifest = {
         "options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "reliability_beta": 2.0}
     }
     own = recorded_vote(manifest)
-    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1))
+    assert (own.variant, own.config.vote, own.config.numbers) == (
+        "paper",
+        "paper",
+        VoteParameters(2.5, 0.9, 0.4, 0.1, 0.0),
+    )
     assert recorded_vote({}).config == RefineConfig()
     told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # gamma may still be measured
-    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5}
+    numbers = {"k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5, "min_labeled": 0.2}
+    assert told == {"vote": "posterior", **numbers}
     assert recorded_vote({"options": {"vote": told}}).variant == "posterior"
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
