@@ -447,6 +447,7 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
+ReliabilityKind = Literal["paper", "pairs", "angular"]
 """Weighting of a Gaussian's own evidence against that of its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
@@ -704,6 +705,9 @@ class LiftOptions(CheckedOptions):
     reliability_beta: float = 1.0
     """Strength of the prior in the reliability, in virtual views, >= 0. Larger values lower the reliability of
     Gaussians with few views."""
+    reliability: ReliabilityKind = "paper"
+    """Reliability R to store. paper: equation 8 of the paper. pairs: agreement of pairs of views, so that a Gaussian of
+    one view is not reliable. angular: the same, but views from nearby count less. The vote always uses the paper's."""
     unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""

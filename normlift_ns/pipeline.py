@@ -32,6 +32,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
@@ -122,6 +123,7 @@ def lift_scene(
         copied, options, vote_facts = vote_directions(means, lifted, own, options, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
+        lifted = with_stored_reliability(lifted, means, collection)
         statistics = lift_statistics(collection, views, lifted.scalars.reliability, facts)
         provenance = lift_provenance(collection, options, encoder, statistics)
         field = SemanticField.build(
@@ -243,6 +245,26 @@ def lift_features(
         own = torch.where(lifted.scalars.norm > 0, before.own_evidence, 0.0)
         lifted = replace(lifted, scalars=with_original_reliability(lifted.scalars, before))
     return lifted, own
+
+
+def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collection: EvidenceCollection) -> Lifted:
+    """Replace the paper's R by the kind of R to store.
+
+    Args:
+        lifted: lift with the paper's R of the features before the consensus.
+        means: centers of its Gaussians.
+    """
+    kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
+    if kind == "paper":
+        return lifted
+    views = scalars.n_eff.double()
+    norm = torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
+    if kind == "angular":
+        cameras = (collection.scene.train.cameras[index] for index in collection.views)
+        centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])
+        views = independent_views(lifted.evidence.view_weights(), means, centers.to(means.device))
+    value = pair_reliability(norm, views, beta).to(scalars.reliability)
+    return replace(lifted, scalars=replace(scalars, reliability=value))
 
 
 def count_directions(lifted: Lifted) -> Int64[Tensor, " 2"]:

@@ -62,7 +62,7 @@ from normlift_ns.core.consensus import (
     total_view_weights,
 )
 from normlift_ns.core.gate import relative_gate, shared_region_cosines
-from normlift_ns.core.independence import angular_reliability, independent_views
+from normlift_ns.core.independence import pair_reliability, independent_views
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import reliability
 from normlift_ns.core.metrics import classify
@@ -192,8 +192,8 @@ def reliabilities(site: Site, observed: Any, seen: Lifted) -> dict[str, Tensor]:
     return {
         "paper": scalars.reliability[own].double(),
         "views": reliability(norm, views, 1.0),
-        "pairs": angular_reliability(norm, n_eff, 1.0),
-        "angular": angular_reliability(norm, views, 1.0),
+        "pairs": pair_reliability(norm, n_eff, 1.0),
+        "angular": pair_reliability(norm, views, 1.0),
         "views alone": views,
     }
 

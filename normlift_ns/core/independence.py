@@ -1,14 +1,15 @@
-"""Number of independent views of every Gaussian, and a reliability that counts them.
+"""Reliabilities that count pairs of views, and views by how much they differ in direction.
 
 Features of one Gaussian in two views drift apart with the angle between the views, so views from nearby repeat each
 other's mistakes. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and w::
 
-    s_vw  = exp(-theta_vw / 21.7 degrees)
-    N_j   = W_j ** 2 / sum_vw W_jv W_jw s_vw                  N_eff if s_vw = 0 for v != w
-    R_j   = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
+    s_vw = exp(-theta_vw / 21.7 degrees)
+    N_j  = N_eff                                              pairs
+    N_j  = W_j ** 2 / sum_vw W_jv W_jw s_vw                   angular; it equals N_eff if s_vw = 0 for v != w
+    R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
 
-For N equal unit features per view, (N ||f|| ** 2 - 1) / (N - 1) is their mean cosine over pairs of views. One view has
-no pair, so a Gaussian of one view has R = r and not the R of views that agree.
+For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is their mean cosine over pairs of views.
+One view has no pair, so a Gaussian of one view has R = r, and not the R of views that agree.
 """
 
 from __future__ import annotations
@@ -62,15 +63,15 @@ def independent_views(
     return out
 
 
-def angular_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
+def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
     """Return R_j by the formula at the top of this module, or 0 without evidence.
 
     Args:
         norm: ||f_j||.
-        views: `independent_views`.
+        views: N_j, from `Scalars.n_eff` or `independent_views`.
         beta: prior strength, in views, >= 0.
 
-    >>> angular_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
+    >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
     tensor([0.0200, 0.5100, 0.0000])
     """
     agreed = (views * norm**2 - 1).clamp(min=0) + beta * LEAST_RELIABILITY

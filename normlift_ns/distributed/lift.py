@@ -90,6 +90,7 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
         copied, options, vote_facts = vote_distributed(means, lifted, own, options, portion, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
+        lifted = pipeline.with_stored_reliability(lifted, means[portion.indices], collection)
         statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
         provenance = pipeline.lift_provenance(collection, options, prepared.encoder, statistics)
         field = build_field_distributed(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from normlift_ns.core.independence import angular_reliability, independent_views
+from normlift_ns.core.independence import pair_reliability, independent_views
 from normlift_ns.core.sparse import SparseRows
 from tests.random_scenes import dense, generator, random_evidence
 
@@ -37,8 +37,8 @@ def test_cameras_at_one_place_are_one_view_and_opposite_ones_are_two():
 
 def test_one_view_is_never_more_reliable_than_two_that_agree():
     views = torch.tensor([1.0, 1.2, 2.0, 8.0])
-    found = angular_reliability(torch.tensor([1.0, 1.0, 1.0, 1.0]), views, 1.0)
+    found = pair_reliability(torch.tensor([1.0, 1.0, 1.0, 1.0]), views, 1.0)
     assert float(found[0]) == pytest.approx(0.02)  # the paper's R is 0.5
     assert bool((found.diff() > 0).all())
-    orthogonal = angular_reliability(torch.tensor([0.5**0.5]), torch.tensor([2.0]), 1.0)
+    orthogonal = pair_reliability(torch.tensor([0.5**0.5]), torch.tensor([2.0]), 1.0)
     assert float(orthogonal) == pytest.approx(0.01, abs=1e-6)
