@@ -62,7 +62,7 @@ from normlift_ns.core.consensus import (
     total_view_weights,
 )
 from normlift_ns.core.gate import relative_gate, shared_region_cosines
-from normlift_ns.core.independence import pair_reliability, independent_views
+from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import reliability
 from normlift_ns.core.metrics import classify

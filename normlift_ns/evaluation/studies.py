@@ -184,8 +184,8 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
 def voting_scalars(field: SemanticField) -> Scalars:
     """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is replaced by the value before the consensus, which the paper's R was computed from. Other kinds
-    of R do not give this value, and the vote then reads ||f|| and R as they are stored.
+    With consensus, ||f|| is replaced by the value before the consensus, which gave the paper's R. Other kinds of R do
+    not give this value, and the vote then reads ||f|| and R as they are stored.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False) or options.get("reliability", "paper") != "paper":
