@@ -103,6 +103,8 @@ class Form:
 
 KEYS = ("delta", "quorum", "margin", "low", "seen")
 TODAY = Form(0.9, 0.05)
+DEFAULT = Form(seen=0.2, forced=True)
+"""What the rule chose, for masks."""
 GATES = (TODAY, Form(0.98, 0.01), Form())
 FORMS = (
     *GATES,

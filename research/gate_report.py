@@ -12,13 +12,15 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from research.gate import TODAY
+from research.gate import DEFAULT, TODAY
 from research.report import RESULTS, Report
 from research.rows import read_rows
 from research.rule import CHOICE, CONFIRMATION, Cell
 
 Row = dict[str, Any]
 Cells = Mapping[Cell, Sequence[Row]]
+WRITTEN = ("consensus", "forced consensus", TODAY.name, "0.98 0.01", "relative", "relative seen 0.2", DEFAULT.name)
+"""Forms in the report; all are printed."""
 WORST = {"all": 0.7, "6": 2.0, "3": 2.5}
 """Largest loss of a cell, points."""
 
@@ -136,7 +138,7 @@ def main(arguments: argparse.Namespace) -> None:
         print(" " * 34 + " ".join(f"{key.replace('undamaged', 'und')[:9]:>9}" for key in keys))
         for name in order:
             print(f"{name:34}" + " ".join(f"{found[name].get(key, math.nan):9.2f}" for key in keys))
-        for name in order:
+        for name in WRITTEN:
             for key, x in found[name].items():
                 report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
         judged = {cell: kept for cell, some in cells.items() if (kept := [row for row in some if "R" in row])}
