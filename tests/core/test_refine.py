@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import InputError, RefineConfig, lift, nearest_neighbors, refine, refine_variant, unsupported
-from normlift_ns.core.refine import clamp_k
+from normlift_ns.core.refine import clamp_k, labeled_share
 from normlift_ns.evaluation.studies import Variant, recorded_vote
 from normlift_ns.options import VOTE_DEFAULTS, VoteParameters
 from tests.examples import examples
@@ -192,6 +192,20 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
         for delta in (0.0, 1e-30, 0.1):
             found = refine(*(x.to(dtype) for x in (means, u, r)), replace(config, delta=delta), own=own)[0]
             assert int(found) == (0 if kind == "paper" and delta > 0 else winner)
+
+
+def test_gaussians_outside_of_regions_keep_their_direction():
+    means, u, r = scene(4)
+    labeled, own = torch.rand(60, generator=generator(5), dtype=torch.float64), 5 * r
+    free = refine(means, u, r, RefineConfig(k=12), own=own)
+    held = refine(means, u, r, RefineConfig(k=12, min_labeled=0.5), own=own, labeled=labeled)
+    itself = torch.arange(60, dtype=torch.int32)
+    assert torch.equal(held, torch.where(labeled >= 0.5, free, itself)) and not torch.equal(held, free)
+    assert torch.equal(refine(means, u, r, RefineConfig(k=12, min_labeled=0.0), own=own, labeled=labeled), free)
+    evidence = random_evidence(40, [2, 3], 0, fill=0.3)
+    whole = evidence.rows.row_sums() + evidence.unlabeled.row_sums()
+    expected = torch.where(whole > 0, evidence.rows.row_sums() / whole, 1.0)
+    assert torch.equal(labeled_share(evidence), expected) and bool((whole == 0).any())
 
 
 def test_coincident_gaussians_copy_the_most_reliable():
