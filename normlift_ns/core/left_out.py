@@ -33,7 +33,7 @@ PARTNER_IOU = 0.3
 
 
 class LeftOut(NamedTuple):
-    """How well left-out views agree with the lift of the others."""
+    """Recognition of left-out views by the lift of the others."""
 
     recognized: int
     """Number of confirmed regions that the lift recognizes."""
