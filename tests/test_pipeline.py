@@ -330,7 +330,7 @@ def test_the_gate_is_measured_after_a_consensus_and_fixed_by_options(
     source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=nl.pipeline.refine)
     monkeypatch.setattr(nl.pipeline, "refine", watched)
 
-    def voted(**options: Any) -> tuple[dict[str, Any], nl.RefineConfig]:
+    def voted(**options: Any) -> tuple[Any, nl.RefineConfig]:
         given = nl.LiftOptions(**{"consensus": True, "vote": nl.RefineConfig(k=5), **options})
         field = lift_scene(scene(*THREE, count=300), source, given, tmp_path / "cache", encoder={}).field
         return field.manifest, watched.call_args.args[3]
