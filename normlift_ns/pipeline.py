@@ -25,6 +25,7 @@ from normlift_ns.core.consensus import (
     SAMPLING_SEED,
     Consensus,
     consensus,
+    hash_to_unit,
     sample_gaussians,
     with_original_reliability,
 )
@@ -61,8 +62,8 @@ CHANGED_COSINE = 0.98
 """Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
 _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of them."""
-_COMPARED = 2**14
-"""Number of directions to compare at a time."""
+_COMPARED = 20_000
+"""Approximate number of Gaussians whose directions are compared before and after the vote."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
 
 
@@ -368,24 +369,25 @@ def vote_directions(
             means, lifted.directions, reliability, options.vote,
             own=own, labeled=labeled_share(lifted.evidence), neighbors=neighbors, progress=progress,
         )  # fmt: skip
-        changed = count_changes(lifted, gaussians, copied.long())
-        copied = copied if int(changed) > 0 else gaussians.int()  # a vote that changes nothing stores nothing
+        changed = count_changes(lifted, copied.long(), gaussians, n)
+        copied = copied if int(changed[0]) > 0 else gaussians.int()  # a vote that changes nothing stores nothing
         counts = count_votes(copied, gaussians, neighbors, reliability)
     return copied, options, facts | vote_shares(counts, changed, n)
 
 
-def count_changes(lifted: Lifted, gaussians: Int64[Tensor, " m"], source: Int64[Tensor, " m"]) -> Int64[Tensor, ""]:
-    """Return the number of Gaussians whose direction changes by more than `CHANGED_COSINE`.
+def count_changes(
+    lifted: Lifted, source: Int64[Tensor, " m"], gaussians: Int64[Tensor, " m"], n: int
+) -> Int64[Tensor, " 2"]:
+    """Return the number of sampled Gaussians whose direction changes by more than `CHANGED_COSINE`, and of all sampled.
 
     Args:
-        gaussians, source: rows of Gaussians in the lift, and of the Gaussians whose directions they take.
+        source: rows in the lift of the Gaussians whose directions the first m Gaussians take.
+        gaussians: indices of the first m Gaussians among all n, which decide whether they are sampled.
     """
-    copies = source != gaussians
-    count = torch.zeros((), dtype=torch.int64, device=source.device)
-    for i, j in zip(gaussians[copies].split(_COMPARED), source[copies].split(_COMPARED)):
-        cosine = (lifted.directions(i) * lifted.directions(j)).sum(dim=1)
-        count += (cosine < CHANGED_COSINE).sum()
-    return count
+    row = (hash_to_unit(gaussians) < min(1.0, _COMPARED / max(1, n))).nonzero().squeeze(1)
+    copies = row[source[row] != row]
+    cosine = (lifted.directions(copies) * lifted.directions(source[copies])).sum(dim=1)
+    return torch.stack([(cosine < CHANGED_COSINE).sum(), row.new_tensor(len(row))])
 
 
 def count_votes(
@@ -395,10 +397,11 @@ def count_votes(
     return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
 
 
-def vote_shares(counts: Int64[Tensor, " 2"], changed: Int64[Tensor, ""], n: int) -> dict[str, float]:
+def vote_shares(counts: Int64[Tensor, " 2"], changed: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
     """Return the counts from `count_votes` and `count_changes` as shares of n Gaussians, for the manifest."""
-    copied, lost = counts.tolist()
-    return {"refined_share": copied / n, "changed_share": int(changed) / n, "unsupported_share": lost / n}
+    (copied, lost), (turned, sampled) = counts.tolist(), changed.tolist()
+    shares = {"refined_share": copied / n, "changed_share": turned / max(1, sampled)}
+    return {**shares, "unsupported_share": lost / n}
 
 
 def lift_statistics(

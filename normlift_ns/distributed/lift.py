@@ -209,9 +209,9 @@ def vote_distributed(
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
-        own_rows = torch.arange(len(gaussians), device=means.device)
-        changed = team.all_reduce(pipeline.count_changes(halo.lifted, own_rows, rows[: len(gaussians)].long()))
-        copied = copied if int(changed) > 0 else gaussians.int()
+        source = rows[: len(gaussians)].long()
+        changed = team.all_reduce(pipeline.count_changes(halo.lifted, source, gaussians, len(means)))
+        copied = copied if int(changed[0]) > 0 else gaussians.int()
         counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
     return copied, options, facts | pipeline.vote_shares(counts, changed, len(means))
 
