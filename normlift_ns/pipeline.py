@@ -14,6 +14,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -158,7 +159,7 @@ def plan_collection(
     gaussians, names = scene.gaussians.to(device), scene.train.names
     options = replace(options, vote=clamp_k(options.vote, len(gaussians))) if options.refine else options
     if options.consensus:
-        options = replace(options, consensus_min_agreement=min_agreement(options, source))
+        options = replace(options, consensus_min_agreement=min_agreement(options, source.identity))
     config = choose_raster_config(scene, gaussians, options)
     available = set(source.available(names))
     usable = [index for index, name in enumerate(names) if name in available]
@@ -187,15 +188,17 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
-def min_agreement(options: LiftOptions, source: FeatureSource | None = None) -> float:
+def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingProxyType({})) -> float:
     """Return the agreement up to which the consensus leaves features unchanged.
 
     Masks of objects agree by more than chance even if they are damaged. Cells of a partition may not.
+
+    Args:
+        features: identity of the source of 2D features, as in the manifest.
     """
     if options.consensus_min_agreement is not None:
         return options.consensus_min_agreement
-    identity: Mapping[str, Any] = {} if source is None else source.identity
-    kind = identity.get("regions", identity).get("kind")
+    kind = features.get("regions", features).get("kind")
     return 0.0 if kind in _OBJECT_REGIONS else CHANCE_AGREEMENT
 
 

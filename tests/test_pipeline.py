@@ -355,12 +355,10 @@ def test_the_gate_is_measured_after_a_consensus_and_fixed_by_options(
 
 
 def test_regions_that_are_objects_need_no_agreement(tmp_path: Path) -> None:
-    source = halves(tmp_path / "maps")
-    assert min_agreement(nl.LiftOptions(), source) == 0.4
+    assert min_agreement(nl.LiftOptions(), halves(tmp_path / "maps").identity) == 0.4
     for identity in ({"regions": {"kind": "edges"}}, {"kind": "langsplat"}):
-        source = MagicMock(identity=identity)
-        assert min_agreement(nl.LiftOptions(), source) == 0
-        assert min_agreement(nl.LiftOptions(consensus_min_agreement=0.3), source) == 0.3
+        assert min_agreement(nl.LiftOptions(), identity) == 0
+        assert min_agreement(nl.LiftOptions(consensus_min_agreement=0.3), identity) == 0.3
 
 
 def test_reliabilities_of_pairs_of_views_are_stored_and_leave_the_vote_alone(tmp_path: Path) -> None:
