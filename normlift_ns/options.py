@@ -195,7 +195,7 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
     """Return the renamed flags of an options dataclass and its groups, as a dictionary from old to new flags.
 
     Args:
-        prefix: Prefix of the flags. With another prefix than "--", the flags of `RefineConfig` have no old names.
+        prefix: Prefix of the flags. With a prefix other than "--", the flags of `RefineConfig` have no old names.
     """
     names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
     flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
@@ -383,7 +383,7 @@ def check_path(name: str, value: object) -> Path:
         name: Name of the option, for messages.
         value: The string or path.
     Raises:
-        InputError: The value has another type, or contains NUL or a character that the file system cannot encode.
+        InputError: The value has the wrong type, or contains NUL or a character that the file system cannot encode.
         PathError: A name is too long, the path leads through a file, or its links form a loop.
 
     >>> check_path("data", "fox").name
@@ -600,8 +600,8 @@ class SplatOptions:
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
-    otherwise 3dgs."""
+    gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs; otherwise
+    3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
     Inria's trainer, else black."""
@@ -752,7 +752,7 @@ class LiftOptions(CheckedOptions):
     """Reuse cached 2D features and evidence of earlier lifts if their inputs are the same."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state. Configs of version 0.1 name `storage` `form` and have no consensus."""
+        """Restore the state. Configs of version 0.1 have the name `form` for `storage`, and no consensus."""
         options = {"storage" if name == "form" else name: value for name, value in state.items()}
         vars(self).update({"consensus": False, **options})
 

@@ -94,7 +94,7 @@ def lift_scene(
         cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: device for rasterizing, lifting and voting.
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
-        export: folder to also write the 2D features to, as LangSplat files. If None, do not write them.
+        export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.

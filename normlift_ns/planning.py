@@ -170,7 +170,7 @@ class Plan:
 def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
     """Estimate the cost of a lift.
 
-    The devices share the views and the Gaussians. The steps before the views, loading and writing are not shared.
+    The devices share the work on views and Gaussians, but not the preparation, the loading of networks and the writing.
 
     Args:
         num_devices: number of processes that share the work, each with its own device; at least 1.

@@ -377,7 +377,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
-    'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
+    'regions overlap by chance (agreement 0.30, needs more than 0.40); features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
     'if they are rough masks of objects, try --consensus-min-agreement 0'
     """
@@ -387,7 +387,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         extent = "applied" if agreement >= least + AGREEMENT_RAMP else "applied in part"
         return f"agreement {agreement:.2f}, {extent}"
     unchanged = (
-        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}), features stay unchanged"
+        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}); features stay unchanged"
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged

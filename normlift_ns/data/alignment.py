@@ -118,7 +118,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
         problem = (
-            f"The splat does not show what its images show: renders from three of the cameras reach {match.psnr:.1f} "
+            f"The splat does not match its images: renders from three of the cameras reach {match.psnr:.1f} "
             f"dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )

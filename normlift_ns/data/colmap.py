@@ -126,8 +126,7 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
 
     Args:
         model: Folder of the reconstruction.
-        text_first: If both formats exist, read the text files, as nerfstudio does, instead of the binary files, as
-            COLMAP does.
+        text_first: True to prefer text files, as nerfstudio does; False to prefer binary files, as COLMAP does.
     Raises:
         FileNotFoundError: A file is missing.
         ValueError: A file is damaged, or contains duplicate IDs, invalid image sizes, poses that are not finite, no

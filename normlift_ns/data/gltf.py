@@ -149,11 +149,11 @@ def _placed(gltf: _Gltf, mesh: int, file: SplatFile) -> SplatFile:
 
 
 def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
-    """Return the similarity from a mesh to its scene; raise InputError for several places and for other transforms."""
+    """Return the similarity from a mesh to its scene; raise InputError for several instances or other transforms."""
     path, nodes, matrix = gltf.path, gltf.document.nodes, np.eye(4)
     holders = [number for number, node in enumerate(nodes) if node.mesh == mesh]
     if len(holders) > 1 or any(_INSTANCING in nodes[number].extensions for number in holders):
-        raise InputError(f"{path} places its splat several times, expected once. Export one of them, or a PLY file.")
+        raise InputError(f"{path} has several instances of its splat, expected one. Export one of them, or a PLY file.")
     parents = {child: number for number, node in enumerate(nodes) for child in node.children}
     number = holders[0] if holders else None
     for _ in nodes:
@@ -162,7 +162,7 @@ def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
                 matrix = _local_matrix(path, nodes[number]) @ matrix
             number = parents.get(number)
     if number is not None:
-        raise _damaged(path, "its nodes are their own parents")
+        raise _damaged(path, "a node is its own parent or ancestor")
     try:
         return decompose_similarity(matrix, f"The transform of the splat in {path}")
     except InputError as error:
@@ -261,7 +261,7 @@ def _read_attributes(gltf: _Gltf, primitive: _Primitive) -> SplatParameters:
     degree = max((d for d in range(1, _MAX_DEGREE + 1) if _harmonic(d, 0) in primitive.attributes), default=0)
     rest = [read(_harmonic(d, i), 3) for d in range(1, degree + 1) for i in range(2 * d + 1)]
     if any(len(x) != len(scales) for x in rest):
-        raise _damaged(gltf.path, f"its spherical harmonics do not have {len(scales)} rows, as its scales do")
+        raise _damaged(gltf.path, "its spherical harmonics and scales differ in their number of rows")
     parameters = {
         "means": read("POSITION", 3),
         "quats": read(f"{_EXTENSION}:ROTATION", 4).roll(1, dims=1),

@@ -27,8 +27,8 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
 
     Args:
         names: Sorted names of all images.
-        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, or Inria's with
-            --eval.
+        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, and in Inria's
+            with --eval.
         eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
             below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
@@ -254,8 +254,8 @@ class SplitViews:
         """Check the headers of all images, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. For
-                nerfstudio runs, also if an image or a mask has the wrong size. The message gives the path.
+            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. In
+                nerfstudio runs, images and masks must also have the right size. The message gives the path.
         """
         headers = [read_image_header(file) for file in self.files]
         for index, header in enumerate(headers):

@@ -134,12 +134,12 @@ def _check_coordinates(
         return
     x, y, z = (float(f"{value:.2g}") for value in center)
     matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
-    place = f" Cameras: printf '{matrix}' > offset.txt, and --world-transform offset.txt"
+    place = f" For the cameras, run printf '{matrix}' > offset.txt, and give --world-transform offset.txt."
     raise InputError(
         f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
         f"zone. The step of float32 is {step:.2g} there, too coarse for Gaussians {width:.2g} wide. Subtract the same "
-        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Splat: export it with this offset "
-        f"from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
+        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Export the splat with this "
+        f"offset from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
     )
 
 
@@ -243,7 +243,7 @@ _CLIP_PLANES = (0.2, 1e10)
 
 
 def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
-    """Return a file whose primitive is known: that of the options, the files or the file name, in this order.
+    """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
         ValueError: if options and files contradict each other.

@@ -182,7 +182,7 @@ _FLATNESS = math.log(1e-3)
 
 
 def flatten_splat(splat: SplatParameters) -> SplatParameters:
-    """Return 2D Gaussians as thin 3D ones, for viewers and files that have no others."""
+    """Return 2D Gaussians as thin 3D ones, for viewers and file formats that support only 3D Gaussians."""
     in_plane = splat.scales[:, :2]
     return replace(splat, scales=torch.cat([in_plane, in_plane.amin(dim=1, keepdim=True) + _FLATNESS], dim=1))
 
@@ -292,7 +292,7 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file whose header is changed to a form that plyfile reads, without a change of its length.
+    """PLY file with a header of the same length that plyfile can read.
 
     Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
     comments.
@@ -358,8 +358,8 @@ def check_ply_header(path: Path) -> None:
     lines = header.replace(b"\r", b"\n").split(b"\n")
     if header.startswith(b"ply") and (end == b"" or max(map(len, lines)) > _MAX_LINE_BYTES):
         raise InputError(
-            f"{path} is truncated or damaged: its header has no end_header in the first {_MAX_HEADER_BYTES:,} bytes, "
-            f"or a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
+            f"{path} is truncated or damaged: its header does not end within {_MAX_HEADER_BYTES:,} bytes, or it has "
+            f"a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
         )
     lines = [line.split() for line in lines]
     starts = [i for i, words in enumerate(lines) if words[:1] == [b"element"]]

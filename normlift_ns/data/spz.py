@@ -150,7 +150,7 @@ def _read_header(data: bytes, path: Path) -> _Header:
     if len(data) < _HEADER.size or not data.startswith(SPZ_MAGIC):
         raise InputError(
             f"{path} is not an SPZ file: it begins with {data[:4].hex() or 'nothing'}, expected {SPZ_MAGIC.hex()}. If "
-            "it is a compressed file of another kind, decompress it first, for example with gunzip."
+            "it is a compressed file of a different kind, decompress it first, for example with gunzip."
         )
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack_from(data)
     if not 2 <= version <= 4:

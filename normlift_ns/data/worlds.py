@@ -1,4 +1,4 @@
-"""Worlds that tools give splats, as maps from the world of the cameras."""
+"""Worlds in which tools place splats, as maps from the world of the cameras."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class CandidateWorld(NamedTuple):
         return np.vstack([self.world.scale * self.world.transform, [0, 0, 0, 1]])
 
     def scaled(self, scale: float) -> CandidateWorld:
-        """Return the world after another uniform scale about its origin."""
+        """Return the world, scaled uniformly about its origin."""
         world = self.world._replace(scale=self.world.scale * scale)
         return self._replace(name=f"{self.name} and a scale of {scale:g}", world=world)
 
@@ -72,8 +72,9 @@ def with_opengl_axes(frames: Sequence[Frame]) -> list[Frame]:
 def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[CandidateWorld]:
     """Return the worlds in which a splat may lie; the first is the one that the options and files state.
 
-    With `--world-transform auto`, further worlds follow. They are those of gsplat's trainer, ns-train and
-    `applied_transform`, with rotations between the axes of tools, and cameras with the axes of OpenCV.
+    With `--world-transform auto`, further worlds follow. They are the worlds of gsplat's trainer, ns-train and
+    `applied_transform`. Each is also tried with rotations between the axes of tools, and with cameras that have
+    OpenCV's axes.
 
     Raises:
         FileNotFoundError, ValueError: if the world that the options state cannot be read or computed.

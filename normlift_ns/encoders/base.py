@@ -288,8 +288,9 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
     Args:
         maps: Region of each pixel in each level, or -1 for none.
     Returns:
-        The cell of each pixel, with consecutive ids 0..C-1, or -1 if the pixel is unlabeled in all levels; and the
-        region of each cell in each level, or -1 for none. For one level with consecutive ids, cells equal regions.
+        The cell of each pixel, and the region of each cell in each level. Cells have consecutive ids 0..C-1. Pixels
+        that are unlabeled in all levels have the cell -1, and cells without a region in a level have -1. For one level
+        with consecutive ids, cells equal regions.
     """
     key = torch.zeros_like(maps[0], dtype=torch.int64)
     key_count = 1
@@ -381,7 +382,7 @@ class PatchFeatures:
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the image is invalid, or the weight file is damaged or of another architecture.
+            ValueError: If the image is invalid, or the weight file is damaged or of a different architecture.
             MemoryError: If the image does not fit into the memory of the device.
         """
         check_image(image, name)

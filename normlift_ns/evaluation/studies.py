@@ -184,7 +184,7 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
 def voting_scalars(field: SemanticField) -> Scalars:
     """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is replaced by the value before the consensus, which gave the paper's R. Other kinds of R do
+    With consensus, ||f|| is the value before the consensus, from which the paper's R was computed. Other kinds of R do
     not give this value, and the vote then reads ||f|| and R as they are stored.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})

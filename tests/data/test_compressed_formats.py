@@ -273,7 +273,7 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(scale=[1e300] * 3)), "not finite"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0])), "rotation of a node is zero"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(matrix=[1] * 12)), "nodes.*matrix"),
-        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(children=[0])), "their own parents"),
+        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(children=[0])), "its own parent"),
         ("a.glb", _with_glb(lambda d: d["nodes"].append({"mesh": 0})), "several times"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})), "several t"),
         ("a.glb", b"glTF" + bytes(8), "header does not match"),
