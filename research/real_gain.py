@@ -13,14 +13,16 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import torch
 from torch import Tensor
 
 import normlift_ns as nl
-from normlift_ns.core.consensus import consensus
+from normlift_ns.core.consensus import consensus, sample_gaussians
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
+from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.refine import labeled_share
 from normlift_ns.encoders.imagenet_network import ImageNetEncoder
@@ -35,8 +37,15 @@ TEXTS = {"fox": "fox", "fox head": "fox", "shield": "shield"}
 
 def refined(evidence: nl.Evidence, features: Tensor, means: Tensor, texts: Tensor) -> Iterator[tuple[str, Tensor]]:
     """Cosines [N, T] of every way to refine."""
+    start = perf_counter()
     seen = nl.lift(evidence, features)
+    lifted = perf_counter()
     agreed = consensus(evidence, features, least=0.0)
+    done = perf_counter()
+    chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, 50)
+    found = leave_views_out(evidence.select_gaussians(chosen), probability, features, least=0.0)
+    seconds = (lifted - start, done - lifted, perf_counter() - done)
+    print(f"lift {seconds[0]:.1f} s, consensus {seconds[1]:.1f} s, recognition {seconds[2]:.1f} s: {found}", flush=True)
     cleaned = nl.lift(evidence, agreed.features)
     own = torch.where(cleaned.scalars.norm > 0, seen.scalars.own_evidence, 0.0)
     near, labeled = nl.nearest_neighbors(means, 36), labeled_share(evidence)
