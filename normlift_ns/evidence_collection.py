@@ -23,7 +23,7 @@ from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
-from normlift_ns.data.images import label_undistortion
+from normlift_ns.data.images import filled_function, label_undistortion
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
@@ -238,6 +238,8 @@ def observe_views(
             a label map differs in size from its camera.
     """
     source = undistorting_source(downscaled_source(source, downscale), label_undistortion(scene.train))
+    if isinstance(source, RegionFeatures) and render_settings is None:
+        source = replace(source, filled=filled_function(scene.train))
     waiting = deque[View]()
 
     def images() -> Iterator[tuple[Tensor, str]]:

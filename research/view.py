@@ -307,5 +307,7 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         run = arguments.load_config or fox_run(Path(folder))
         add_view(found, run, arguments.prompts, picture=not arguments.no_picture)
-    found.add("million_bytes", million_bytes(), "bytes of 1,000,000 Gaussians of SH degree 3 (castle, see the function)")
+    found.add(
+        "million_bytes", million_bytes(), "bytes of 1,000,000 Gaussians of SH degree 3 (castle, see the function)"
+    )
     found.write(arguments.output)

@@ -85,6 +85,8 @@ class NormLiftCheck(NormLift):
         rows.append(Diagnostic("capture", "ok", count))
         rows += [Diagnostic("images", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
+        lifted = [opened.run_dir, *([self.load_config.parent] if self.load_config is not None else [])]
+        rows += _try(rows, "lifted run", lambda: planning.diagnose_recognition(lifted)) or []
         if self.check_alignment:
             compare = partial(planning.compare_cameras, opened, self.lift, device)
             compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(compare()))

@@ -318,10 +318,14 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         consensus = statistics["consensus"]
         levels = (describe_consensus(agreement, consensus["least"], kind) for agreement in consensus["agreement"])
         table.add_row("consensus", "; ".join(levels))
+    if "recognition" in statistics:
+        from normlift_ns.planning import describe_recognition  # noqa: PLC0415 (torch is loaded by now)
+
+        table.add_row("left-out views", describe_recognition(statistics["recognition"]))
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
         unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
-        refined = f"{statistics['refined_share']:.1%} of the Gaussians copied a neighbor's feature"
+        refined = f"{statistics['changed_share']:.1%} of the Gaussians changed their direction by more than 11 degrees"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}

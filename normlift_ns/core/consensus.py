@@ -224,7 +224,7 @@ def sample_gaussians(
     count = count_entries(rows)
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
     index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.indices
-    number = _hash_to_unit(index)
+    number = hash_to_unit(index)
     while True:
         probability = _largest_share(rows, share)
         chosen = (number < probability).nonzero().squeeze(1)
@@ -285,7 +285,7 @@ def region_overlaps(
     return Overlaps(SparseRows(row_offsets(row, size), column.int(), iou), inside, agreement)
 
 
-def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+def hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
     """Return a pseudo-random number in [0, 1) for every index, computed by the finalizer of MurmurHash3."""
     x = index + SAMPLING_SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):

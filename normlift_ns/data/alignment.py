@@ -145,4 +145,4 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
     """Return a mask of the Gaussians whose centers are inside the image and in front of the camera."""
     _, _, depth, inside = camera.project(means)
-    return inside & (depth > 0.01)
+    return inside & (depth > 0)

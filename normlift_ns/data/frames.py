@@ -127,7 +127,7 @@ GIVE_IMAGES = "give the folder of the images with --images"
 """Advice on missing images if the options do not contain their folder."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """Perspective camera models that `Intrinsics` can represent, by their names in COLMAP and nerfstudio."""
-FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
 """Distortion that moves no pixel. nerfstudio treats fisheye cameras without distortion as pinhole cameras."""

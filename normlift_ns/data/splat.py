@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
@@ -245,7 +245,11 @@ def read_ply(path: Path) -> SplatFile:
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count == 0:
-        raise InputError(f"{path} has no vertices, expected Gaussians. Give the PLY file of a trained splat.")
+        found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "nothing"
+        raise InputError(
+            f"{path} has no Gaussians: expected the element vertex, found {found}. Give the PLY file of a trained "
+            "splat."
+        )
     mode = _mode([*data.comments, *vertex.comments])
     if any(item.name == PACKED for item in vertex.properties):
         parameters, rounding = unpack_compressed_ply(data, path)
@@ -316,16 +320,27 @@ def _parse_ply(path: Path) -> PlyData:
     try:
         with _PlainHeader(path) as stream:
             return PlyData.read(stream, mmap="c")
+    except PlyHeaderParseError as error:
+        if file_kind(path) != ".ply":
+            raise _not_ply(path, error) from error
+        raise InputError(
+            f"{path} has a header that is damaged or not of PLY 1.0 ({' '.join(str(error).split())[:200]}). Copy it "
+            "again, or export it with another program."
+        ) from error
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
         if file_kind(path) == ".ply":
             raise InputError(
                 f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
                 "do not match its header. Copy it again."
             ) from error
-        raise InputError(
-            f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
-            "to convert other formats, run for example: splat-transform scene.sog scene.ply"
-        ) from error
+        raise _not_ply(path, error) from error
+
+
+def _not_ply(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
+        "to convert other formats, run for example: splat-transform scene.sog scene.ply"
+    )
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:

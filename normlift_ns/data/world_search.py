@@ -166,9 +166,10 @@ class _Search:
         """Render a view of the scene in a world."""
         camera = small.view.camera
         camera = replace(camera, world_to_camera=self._motion(candidate).move(camera.world_to_camera))
-        return small._replace(view=small.view._replace(camera=camera)).render(
-            self._scene, self._gaussians, RasterSettings()
-        )
+        identity = self._scene.identity
+        planes = candidate.clip_planes(identity.get("clip_planes"))
+        settings = RasterSettings.recorded({**identity, "clip_planes": planes})
+        return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
         """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.

@@ -20,6 +20,7 @@ from normlift_ns.data.splat import SplatFile
 from normlift_ns.data.transforms import CameraFile, decompose_similarity, gsplat_normalization, read_world_transform
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
+from normlift_ns.rasterization.settings import RasterSettings
 
 _MIN_POINTS = 4
 _SAME = 1e-3
@@ -48,6 +49,8 @@ class CandidateWorld(NamedTuple):
     """Map from the cameras' world to that of the splat."""
     opencv_cameras: bool = False
     """True if the camera file has poses with OpenCV's axes (y down, z forward), although its format has OpenGL's."""
+    scale_since_training: float = 1.0
+    """Uniform scale that the splat got after its training. It applies to the clip planes of the training too."""
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
@@ -56,8 +59,18 @@ class CandidateWorld(NamedTuple):
 
     def scaled(self, scale: float) -> CandidateWorld:
         """Return the world, scaled uniformly about its origin."""
-        world = self.world._replace(scale=self.world.scale * scale)
-        return self._replace(name=f"{self.name} and a scale of {scale:g}", world=world)
+        return self._replace(
+            name=f"{self.name} and a scale of {scale:g}",
+            world=self.world._replace(scale=self.world.scale * scale),
+            scale_since_training=self.scale_since_training * scale,
+        )
+
+    def clip_planes(self, planes: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Return the near and far plane of the training in units of this world; None: those of splatfacto."""
+        if self.scale_since_training == 1:
+            return planes
+        near, far = planes or (RasterSettings.near_plane, RasterSettings.far_plane)
+        return near * self.scale_since_training, far * self.scale_since_training
 
     def place(self, frames: Sequence[Frame]) -> list[Frame]:
         """Return the frames with poses in this world."""

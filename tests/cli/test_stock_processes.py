@@ -22,7 +22,7 @@ from tests.cli.conftest import run_entry, said
 from tests.data.scene_files import ply_columns, write_ply
 
 BIN = Path(sys.executable).parent
-ENVIRONMENT = os.environ | {"CUDA_VISIBLE_DEVICES": "", "TORCHDYNAMO_DISABLE": "1"}  # compiling takes most of the time
+ENVIRONMENT = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
 SCALARS = ["selection", "reliability_value", "n_eff", "relevancy_0", "relevancy_1"]
 NAMES = ["overlay", "segmentation", "reliability", *SCALARS]
 

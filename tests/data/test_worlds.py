@@ -137,6 +137,7 @@ def test_applied_transform_is_found_either_way(native, splat, transforms, tmp_pa
     assert ("before applied_transform" if inverse else "after another applied_transform") in said[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.extra) for seed in range(1, 10))])
 def test_other_rotations_are_not_taken(splat, transforms, tmp_path: Path, seed: int) -> None:
     matrix = square(Rotation.random(random_state=seed).as_matrix())
