@@ -114,7 +114,11 @@ def add_clients(report: Report, config: Path) -> None:
     report.add("server_s_per_answer", used / len(log.seconds), "s of processor time of the server per answer")
     report.add("received_bytes_per_s", log.received / wall, "bytes of relevancies and masks per s")
     report.add("clients_share", share, "share of all processor time that the clients take")
-    report.add("server_share", used / (wall * len(os.sched_getaffinity(0))), "share of all processor time that the server takes")
+    report.add(
+        "server_share",
+        used / (wall * len(os.sched_getaffinity(0))),
+        "share that the server takes",
+    )
     report.add("resident_settled_bytes", settled, f"bytes of memory of the server after {SETTLED:.0f} s")
     report.add("resident_growth_bytes", end - settled, "bytes of memory more at the end")
 
