@@ -212,14 +212,14 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        A prompt that selects one or more Gaussians is a weak match or found.
+        The verdict on a prompt that selects Gaussians is weak match or found.
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it ignores no words except articles."""
+        """Words of the prompt that the encoder uses; None if it ignores at most articles."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -323,7 +323,7 @@ def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: 
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
-    """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
+    """Return the answer to a query with the same embeddings but a different threshold or minimum reliability.
 
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
     """
@@ -423,7 +423,7 @@ def relevancy_histogram(
 
 
 def _ascending(values: Float[np.ndarray, "..."]) -> Float64[np.ndarray, " n"]:
-    """Return the values in ascending order, in which counting and quantiles are quick."""
+    """Return the values in ascending order, so that counts and quantiles are fast."""
     return np.sort(values, axis=None).astype(np.float64)
 
 
