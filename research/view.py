@@ -311,8 +311,6 @@ if __name__ == "__main__":
         run = arguments.load_config or fox_run(Path(folder))
         add_view(found, run, arguments.prompts, picture=not arguments.no_picture)
     for share in (0.5, 1.0):
-        unit = (
-            f"bytes of 1,000,000 Gaussians, SH degree 3; degrees 2, 3 have {share:g} times the values of degree 1"
-        )
+        unit = f"bytes of 1,000,000 Gaussians, SH degree 3; degrees 2, 3 have {share:g} times the values of degree 1"
         found.add(f"million_{share:g}_bytes", million_bytes(share), unit)
     found.write(arguments.output)

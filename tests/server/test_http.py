@@ -279,7 +279,7 @@ def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch)
         for first in (b"", request[:20], request + request[:20]):  # nothing, a part, a part after a whole one
             with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
                 line.sendall(first)
-                received = b"".join(iter(lambda: line.recv(4096), b""))  # noqa: B023 (used at once)
+                received = b"".join(iter(lambda: line.recv(4096), b""))
             assert received.count(b'{"runs":[]}') == (len(first) > len(request))
         with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
             for _ in range(2):  # a connection may rest between requests
