@@ -422,7 +422,7 @@ def relevancy_histogram(
     return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(values, median, top, positions))
 
 
-def _ascending(values: Float[np.ndarray, "..."]) -> Float64[np.ndarray, " n"]:
+def _ascending(values: Float[np.ndarray, ...]) -> Float64[np.ndarray, " n"]:
     """Return the values in ascending order, so that counts and quantiles are fast."""
     return np.sort(values, axis=None).astype(np.float64)
 
