@@ -143,7 +143,7 @@ def test_other_rotations_are_not_taken(splat, transforms, tmp_path: Path, seed: 
     matrix = square(Rotation.random(random_state=seed).as_matrix())
     scene, said = opened(tmp_path, in_world(splat, matrix), transforms)
     assert said == [] and scene.identity["source_world"]["name"] == "the world of its cameras"
-    with pytest.raises(nl.InputError, match="does not show what its images show"):
+    with pytest.raises(nl.InputError, match="does not match its images"):
         nl.lift_run(scene, output_dir=tmp_path / "out")
 
 
