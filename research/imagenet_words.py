@@ -1,14 +1,16 @@
 """Words for the 1,000 classes of ImageNet, from WordNet 3.0: python -m research.imagenet_words /usr/share/wordnet
 
 Writes normlift_ns/encoders/imagenet_words.json. The folder is that of Debian's package wordnet-base: index.noun,
-data.noun, noun.exc and cntlist.rev of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids. The ids of the
-classes, in the order of the network's outputs, are those of the table itself, so no other source is needed.
+data.noun, noun.exc and cntlist.rev of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids.
+The ids of the classes, in the order of the network's outputs, are those of the table itself, so no other source is
+needed.
 
 A class has the lemmas of its synset as names. A lemma after the first is left out if the annotated texts of WordNet use
-it ten times or more, but never for this synset: no one calls a promontory a head, or a lighter a light. A hypernym is a synset above one or more classes, and at most half of
-them: "artifact" and "object" tell nothing apart. A lemma of several hypernyms belongs to the one whose sense WordNet
-lists first, so that "cat" means the domestic cat rather than the lion or the whip. It also belongs to later senses that
-occur in WordNet's annotated texts and have the same parent, as both kinds of furniture that "table" means.
+it ten times or more, but never for this synset: no one calls a promontory a head, or a lighter a light. A hypernym is a
+synset above one or more classes, and at most half of them: "artifact" and "object" tell nothing apart. A lemma of
+several hypernyms belongs to the one whose sense WordNet lists first, so that "cat" means the domestic cat rather than
+the lion or the whip. It also belongs to later senses that occur in WordNet's annotated texts and have the same parent,
+as both kinds of furniture that "table" means.
 """
 
 from __future__ import annotations
