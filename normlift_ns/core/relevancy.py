@@ -20,6 +20,8 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 """torch.Tensor or numpy.ndarray."""
 TEMPERATURE = 10.0
 """Factor of the cosines inside LERF's softmax."""
+PROMPT_BLOCK = 32
+"""Number of prompts that are compared with all Gaussians at a time, which bounds the memory of a query."""
 TOP_QUANTILE = 0.999
 """Quantile over Gaussians that is the top relevancy of a prompt. Single outliers do not affect it."""
 _PRESENT = 0.62
@@ -152,9 +154,11 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
     >>> top_values(np.arange(2001.0)[:, None])
     [1998.0]
     """
-    if isinstance(values, np.ndarray):
-        return np.quantile(values, TOP_QUANTILE, axis=0).tolist()
     place = TOP_QUANTILE * (len(values) - 1)
+    if isinstance(values, np.ndarray):
+        index = [math.floor(place), math.ceil(place)]
+        low, high = np.partition(values.T, index, axis=1)[:, index].T.astype(np.float64)
+        return (low + (high - low) * (place - index[0])).tolist()
     largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile allows 16 million values
     low, high = largest[-1].double(), largest[max(len(largest) - 2, 0)].double()
     return (low + (high - low) * (place - math.floor(place))).tolist()

@@ -7,20 +7,29 @@ command line (`query.arrays.ArrayField`). This module does not need torch.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from normlift_ns.core.arguments import check_arguments
-from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy, top_values
+from normlift_ns.core.relevancy import (
+    PROMPT_BLOCK,
+    RELEVANCY_RULES,
+    TOP_QUANTILE,
+    gaussian_relevancy,
+    top_values,
+)
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.options import RelevancyRule
-from normlift_ns.query.presence import Verdict, judge
+from normlift_ns.query.presence import Verdict, compares_cosines, judge
 from normlift_ns.query.question import Query, as_numpy
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
 
@@ -32,6 +41,10 @@ if TYPE_CHECKING:
 
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
+_SUMMARIZED = ("reliability", "weight")
+"""Scalars per Gaussian of which an answer gives means."""
+_THREADS = min(8, os.cpu_count() or 1)
+"""Number of prompts that are summarized concurrently."""
 
 
 class QueryField(HasManifest, Protocol):
@@ -129,7 +142,16 @@ class Answer:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the numbers of every prompt as plain Python types."""
-        return [finding.to_json() for finding in self]
+        answer = self if len(self) < _THREADS else self._as_numpy()
+        with ThreadPoolExecutor(_THREADS) as pool:  # sorting, which takes most of the time, is threaded
+            return list(pool.map(Finding.to_json, answer))
+
+    def _as_numpy(self) -> Answer:
+        """Return the answer with the arrays of its prompts on the CPU, copied at once."""
+        arrays = {name: as_numpy(getattr(self, name)) for name in ("means", "relevancy", "valid", "selected")}
+        scalars = SimpleNamespace(**{name: as_numpy(getattr(self.field.scalars, name)) for name in _SUMMARIZED})
+        field: Any = SimpleNamespace(manifest=self.field.manifest, scalars=scalars)
+        return replace(self, field=field, **arrays)
 
 
 @check_arguments
@@ -306,20 +328,28 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
         vectors = np.concatenate([vectors, question.negative_embeddings])
     valid, cosine = field.valid(refined=question.refined), field.query(vectors, refined=question.refined)
     negative = field.null_levels(refined=question.refined) if question.rule == "contrast" else cosine[:, count:]
-    relevancy = gaussian_relevancy(cosine[:, :count], negative, valid, question.rule)
+    relevancy, verdicts = cosine[:, :count], []
+    for first in range(0, count, PROMPT_BLOCK):  # relevancies replace their cosines, which saves half of the memory
+        block = relevancy[:, first : first + PROMPT_BLOCK]
+        values = gaussian_relevancy(block, negative, valid, question.rule)
+        verdicts += _judge_all(field, question.rule, block, values, valid)
+        block[:] = values
     means = means if isinstance(means, np.ndarray) else means.detach()
-    verdicts = _judge_all(field, question.rule, cosine[:, :count][valid], relevancy[valid])
     selected = relevancy[:0] > 0
-    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, verdicts)
+    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, tuple(verdicts))
     return apply_threshold(unselected, question)
 
 
-def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: Any) -> tuple[Verdict | None, ...]:
-    """Return the verdict on every prompt, from cosines and relevancies [M, Q] of the Gaussians with a direction."""
-    if len(cosine) == 0:
-        return (None,) * cosine.shape[1]
-    name, manifest, tops = encoder_name(field), field.manifest, zip(top_values(cosine), top_values(relevancy))
-    return tuple(judge(manifest, name, rule, top_cosine=best, top=top) for best, top in tops)
+def _judge_all(
+    field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: Any, valid: Any
+) -> list[Verdict | None]:
+    """Return the verdict on every prompt, from cosines and relevancies [N, Q], of which only the valid rows count."""
+    if not bool(valid.any()):
+        return [None] * cosine.shape[1]
+    name, manifest = encoder_name(field), field.manifest
+    compared = cosine if compares_cosines(manifest, name) else relevancy
+    tops = top_values(compared.T[:, valid].T)
+    return [judge(manifest, name, rule, top_cosine=top, top=top) for top in tops]
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
@@ -410,15 +440,23 @@ def relevancy_histogram(
         threshold: relevancy above which a Gaussian is selected.
         positions: result of `suggested_range`.
     """
-    values = relevancy[valid].astype(np.float64)
+    values = np.sort(relevancy[valid]).astype(np.float64)
     if len(values) == 0:
         return None
-    low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
+    low, high = min(float(values[0]), threshold), max(float(values[-1]), threshold)
     if high - low < _EPSILON:
         low, high = low - _EPSILON / 2, high + _EPSILON / 2
-    counts, edges = np.histogram(values, HISTOGRAM_BINS, (low, high))
+    edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
+    counts = _counts(values, edges)
     median, top = _median_and_top(values)
-    return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(values, median, top, positions))
+    return Histogram(edges, counts, threshold, median, top, _suggest(values, median, top, positions))
+
+
+def _counts(values: np.ndarray, edges: np.ndarray) -> Int64[np.ndarray, " bins"]:
+    """Return the number of ascending values in every bin. As in `np.histogram`, the last bin includes its end."""
+    below = values.searchsorted(edges)
+    below[-1] = values.searchsorted(edges[-1], side="right")
+    return np.diff(below).astype(np.int64)
 
 
 def draw_histogram(
@@ -456,21 +494,19 @@ def suggest_threshold(
     >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), (0.4, 0.8)) < 1  # all alike: all are selected
     True
     """
-    values = relevancy[valid].astype(np.float64).ravel()
+    values = np.sort(relevancy.T[:, valid], axis=None)  # float32 sorts faster and takes half of the memory of float64
     return None if len(values) == 0 else _suggest(values, *_median_and_top(values), positions)
 
 
 def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[float, float]) -> float:
-    """Return the threshold at which the selection is most stable, for M >= 1 relevancies."""
+    """Return the threshold at which the selection is most stable, for M >= 1 ascending relevancies."""
     if top <= 0:
         return top  # if nothing is relevant, select nothing
-    rank = min(_SMALLEST_OBJECT, len(values) // 1000)
-    upper = float(np.partition(values, len(values) - 1 - rank)[len(values) - 1 - rank])
+    upper = float(values[len(values) - 1 - min(_SMALLEST_OBJECT, len(values) // 1000)])
     if upper - median < _EPSILON:
         return upper - _EPSILON
-    counts, edges = np.histogram(values, _STEPS, (median, upper))
-    higher = (values > upper).sum() + counts[::-1].cumsum()[::-1]
-    above = np.log([*higher, (values >= upper).sum()])  # log N at every edge
+    edges = np.linspace(median, upper, _STEPS + 1)
+    above = np.log(len(values) - values.searchsorted(edges))  # log N at every edge
     first, last = (round(_STEPS * position) for position in positions)
     reach = round(_STEPS * _STABLE_OVER)
     steps = np.arange(first, last + 1)
@@ -481,7 +517,16 @@ def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[flo
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:
-    """Return median and top; if the median is at the top, return the minimum instead of the median."""
-    median, top = np.quantile(values, (0.5, TOP_QUANTILE)).tolist()
-    least = float(values.min())
+    """Return median and top of ascending values; if the median is at the top, return the minimum instead of it."""
+    median, top = (_quantile(values, level) for level in (0.5, TOP_QUANTILE))
+    least = float(values[0])
     return (least if top - median < _AT_TOP * (top - least) else median), top
+
+
+def _quantile(values: np.ndarray, level: float) -> float:
+    """Return an interpolated quantile of ascending values, with the rounding of `np.quantile`."""
+    place = level * (len(values) - 1)
+    index = math.floor(place)
+    share, low = place - index, float(values[index])
+    step = float(values[min(index + 1, len(values) - 1)]) - low
+    return low + step * share if share < 0.5 else low + step - step * (1 - share)
