@@ -440,6 +440,7 @@ def save_overlays(
     folder: Path,
     *,
     settings: RasterSettings | None = None,
+    device: str = "cpu",
     overwrite: bool = False,
 ) -> list[Path]:
     """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
@@ -450,6 +451,7 @@ def save_overlays(
     Args:
         cameras: training cameras by file name prefix, as from `training_cameras`.
         settings: rasterizer settings (default: those of gsplat 1.4).
+        device: torch device that renders.
         overwrite: replace existing files.
     Returns:
         Paths of the files.
@@ -481,7 +483,7 @@ def save_overlays(
         paths = [save(rendered.name, q, figure) for q, figure in enumerate(figures)]
         return paths, [_outlined(*overlay, _panel_width(len(cameras))) for overlay in overlays]
 
-    drawn = list(prefetch_map(draw, _render_views(scene, answer, cameras, settings), _THREADS))
+    drawn = list(prefetch_map(draw, _render_views(scene, answer, cameras, settings, device), _THREADS))
     paths = [path for saved, _ in drawn for path in saved]
     if len(cameras) > 1:
         panels = ([panel[q] for _, panel in drawn] for q in range(len(ends)))
@@ -501,12 +503,13 @@ class _RenderedView(NamedTuple):
 
 
 def _render_views(
-    scene: Scene, answer: Answer, cameras: Mapping[str, Camera], settings: RasterSettings | None
+    scene: Scene, answer: Answer, cameras: Mapping[str, Camera], settings: RasterSettings | None, device: str
 ) -> Iterator[_RenderedView]:
     """Render the views, each with all prompts at once."""
-    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1)
+    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
+    gaussians = scene.gaussians.to(device)
     for name, camera in cameras.items():
-        rgb, image, alpha = render_with_image(scene, camera, values, settings=settings)
+        rgb, image, alpha = render_with_image(scene, camera, values, settings=settings, gaussians=gaussians)
         yield _RenderedView(name, rgb, pixel_relevancy(image, alpha).cpu(), alpha.cpu())
 
 
