@@ -476,14 +476,14 @@ def save_overlays(
             picture.save(draft, "PNG", compress_level=_ZLIB_LEVEL)
         return path
 
-    def draw(rendered: _RenderedView) -> tuple[list[Path], list[Image.Image]]:
-        image = _training_image(scene, rendered.name)
-        overlays = _overlays(display, rendered)
-        figures = [view_figure(sheet, header, rendered.name, image, *x) for header, x in zip(headers, overlays)]
-        paths = [save(rendered.name, q, figure) for q, figure in enumerate(figures)]
+    def draw(rendered: tuple[str, list[_Overlay]]) -> tuple[list[Path], list[Image.Image]]:
+        view, overlays = rendered
+        image = _training_image(scene, view)
+        figures = (view_figure(sheet, header, view, image, *x) for header, x in zip(headers, overlays))
+        paths = [save(view, q, figure) for q, figure in enumerate(figures)]
         return paths, [_outlined(*overlay, _panel_width(len(cameras))) for overlay in overlays]
 
-    drawn = list(prefetch_map(draw, _render_views(scene, answer, cameras, settings, device), _THREADS))
+    drawn = list(prefetch_map(draw, _render_overlays(scene, answer, display, cameras, settings, device), _THREADS))
     paths = [path for saved, _ in drawn for path in saved]
     if len(cameras) > 1:
         panels = ([panel[q] for _, panel in drawn] for q in range(len(ends)))
@@ -492,32 +492,31 @@ def save_overlays(
     return paths
 
 
-class _RenderedView(NamedTuple):
-    """Render of a view, on the CPU."""
+class _Overlay(NamedTuple):
+    """Overlay of one prompt, on the CPU."""
 
-    name: str
-    rgb: UInt8[Tensor, "h w 3"]
-    pixel: Float[Tensor, "h w 2q"]
-    """Relevancy of each prompt, and then the selected fraction of each prompt."""
-    alpha: Float[Tensor, "h w"]
+    image: UInt8[Tensor, "h w 3"]
+    selected: Bool[Tensor, "h w"]
+    """Mask of the selected pixels."""
 
 
-def _render_views(
-    scene: Scene, answer: Answer, cameras: Mapping[str, Camera], settings: RasterSettings | None, device: str
-) -> Iterator[_RenderedView]:
-    """Render the views, each with all prompts at once."""
+def _render_overlays(
+    scene: Scene,
+    answer: Answer,
+    display: Display,
+    cameras: Mapping[str, Camera],
+    settings: RasterSettings | None,
+    device: str,
+) -> Iterator[tuple[str, list[_Overlay]]]:
+    """Yield the name of every view with the overlays of all prompts, which are rendered at once."""
+    count, gaussians = len(answer.texts), scene.gaussians.to(device)
     values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
-    gaussians = scene.gaussians.to(device)
     for name, camera in cameras.items():
         rgb, image, alpha = render_with_image(scene, camera, values, settings=settings, gaussians=gaussians)
-        yield _RenderedView(name, rgb, pixel_relevancy(image, alpha).cpu(), alpha.cpu())
-
-
-def _overlays(display: Display, rendered: _RenderedView) -> list[tuple[UInt8[Tensor, "h w 3"], Bool[Tensor, "h w"]]]:
-    """Return, for each prompt, its relevancy map and the mask of the selected pixels."""
-    rgb, count = rendered.rgb.float() / 255, display.num_prompts
-    maps = (relevancy_map(display, rgb, rendered.pixel[:, :, q], rendered.alpha) for q in range(count))
-    return [((x * 255).round().to(torch.uint8), rendered.pixel[:, :, count + q] > 0.5) for q, x in enumerate(maps)]
+        rgb, pixel = rgb.to(device).float() / 255, pixel_relevancy(image, alpha)
+        maps = [relevancy_map(display, rgb, pixel[:, :, q], alpha) for q in range(count)]
+        images = ((x * 255).round().to(torch.uint8).cpu() for x in maps)
+        yield name, list(map(_Overlay, images, (pixel[:, :, count:] > 0.5).cpu().unbind(2)))
 
 
 def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
