@@ -144,7 +144,7 @@ class NormLift(CheckedOptions):
         print_plan(dry_run(self.request(say=common.info), self.num_devices, start_time))
 
     def _lift(self, team: TorchCommunicator | None) -> LiftedRun | None:
-        start_time = time.perf_counter()
+        start_time = common.command_start()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
         from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
@@ -298,7 +298,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
 
     Args:
         run: Lifted run.
-        before: Seconds of the stages before the lift, by name.
+        before: Seconds of the stages before the lift, by name. The first includes the start of the process.
         total: Seconds of the whole command.
     """
     manifest: dict[str, Any] = dict(run.field.manifest)
