@@ -27,6 +27,8 @@ from normlift_ns.query.engine import Answer, run_query
 from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
+_DIRECTION_BLOCK = 8 * PROMPT_BLOCK
+"""Number of prompts for which float16 directions are converted once. The conversion takes most of the time."""
 _BLOCK_ELEMENTS = 2**21
 """Number of elements to convert to float32 at a time, which fits into a processor's cache."""
 
@@ -72,14 +74,16 @@ class ArrayField(FieldArrays):
         if row[-1:].sum() < 0:
             return cosine.T
         products = self._evidence_products(vectors) if self.evidence is not None else self._direction_products(vectors)
+        size = PROMPT_BLOCK if self.evidence is not None else _DIRECTION_BLOCK
 
         def fill(first: int) -> None:
-            block = slice(first, first + PROMPT_BLOCK)
-            np.take(products(block).clip(-1, 1), taken, axis=1, out=cosine[block], mode="clip")
+            block = slice(first, first + size)
+            product = products(block)
+            np.take(product.clip(-1, 1, out=product), taken, axis=1, out=cosine[block], mode="clip")
             cosine[block, missing] = 0
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(fill, range(0, len(vectors), PROMPT_BLOCK)))
+            list(pool.map(fill, range(0, len(vectors), size)))
         return cosine.T
 
     def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
@@ -96,8 +100,16 @@ class ArrayField(FieldArrays):
         coordinates, basis = self.arrays["coordinates"], self.arrays.get("basis")
         projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
         step = max(1, _BLOCK_ELEMENTS // projected.shape[1])
-        parts = [coordinates[first : first + step] for first in range(0, len(coordinates), step)]
-        return lambda block: np.concatenate([part.astype(np.float32) @ projected[block].T for part in parts]).T
+
+        def products(block: slice) -> Float32[np.ndarray, "b m"]:
+            rows = projected[block]
+            product = np.empty((len(rows), len(coordinates)), np.float32)
+            for first in range(0, len(coordinates), step):
+                part = coordinates[first : first + step].astype(np.float32)
+                product[:, first : first + step] = rows @ part.T
+            return product
+
+        return products
 
 
 @dataclass(frozen=True, eq=False)
