@@ -197,14 +197,11 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
         found.setdefault(name, []).append(seconds)
         print(name, f"{seconds:.2f}", flush=True)
 
-    def lift(name: str, case: str, *flags: object, program: str = LIFT) -> Path:
-        given = (*source, "--timestamp", "run", *flags)
-        output = folders[name] / case
-        note(
-            f"{name}.{case.rstrip('0123456789')}_lift_s",
-            lifted(trained, folders[name], case, *given, checkout=checkouts[name], program=program)["wall"],
-        )
-        return next(output.glob("*/normlift/run/config.yml"))
+    def lift(name: str, case: str, output: str, *flags: object, program: str = LIFT) -> Path:
+        given = (*source, "--timestamp", "run", "--overwrite", True, *flags)
+        taken = lifted(trained, folders[name], output, *given, checkout=checkouts[name], program=program)
+        note(f"{name}.{case}_lift_s", taken["wall"])
+        return next((folders[name] / output).glob("*/normlift/run/config.yml"))
 
     def pictures(name: str, case: str, config: Path, *flags: object) -> None:
         given = ("--load-config", config, "--data", data, "--render-dir", folders[name] / case, "--overwrite", True)
@@ -219,11 +216,11 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
 
     gpu, configs = torch.cuda.is_available(), {}
     for name in ("before", "now"):
-        configs[name] = lift(name, "cold")
+        configs[name] = lift(name, "cold", "cold")
     for turn in range(repeats if gpu else 0):
         for name in checkouts:
-            lift(name, f"later{turn}")
-            lift(name, "cached")
+            lift(name, "later", f"later{turn}")
+            lift(name, "cached", "cold")
     for name in checkouts:
         views = json.loads((configs[name].parent / "normlift" / "manifest.json").read_text())["views_lifted"]
         all_views = ("--render-views", *(Path(view).stem for view in views))
@@ -236,8 +233,8 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
         prompts(name, "cuda", configs[name])
     if gpu:  # two cores of this machine; without a GPU, the lifts above are those
         for name in checkouts:
-            lift(name, "warm_cpu", "--device", "cpu", "--max-views", 2, program=TWO_CORES + LIFT)
-            lift(name, "cpu", "--device", "cpu", program=TWO_CORES + LIFT)
+            lift(name, "first_cpu", "some", "--device", "cpu", "--max-views", 2, program=TWO_CORES + LIFT)
+            lift(name, "cpu", "cpu", "--device", "cpu", program=TWO_CORES + LIFT)
     for name in slow:
         prompts(name, "cpu", configs[name])
     for name, values in found.items():
