@@ -83,23 +83,31 @@ class ColorEncoder(LazyTextEncoder):
         return _normalized(np.stack(rows)).astype(np.float32)
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        import torch  # noqa: PLC0415 (queries can do without torch)
-
-        region = labels.cpu().numpy().reshape(len(labels), -1)
-        lab, number = _unique_lab(image.numpy())
-        color, labeled = np.broadcast_to(number, region.shape), region >= 0
-        if not labeled.all():
-            region, color = region[labeled], color[labeled]
-        region, color = region.ravel(), color.ravel()
-        total = np.stack([np.bincount(region, channel[color]) for channel in lab.T], axis=1)
-        return torch.from_numpy(embed_colors(total / np.bincount(region)[:, None])).float()
+        return next(self.encode_each([(image, labels)]))
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        from normlift_ns.core.device import prefetch_map  # noqa: PLC0415 (queries can do without torch)
+        import torch  # noqa: PLC0415 (queries can do without torch)
 
-        return prefetch_map(lambda view: self.encode(*view), views, _THREADS)
+        from normlift_ns.core.device import prefetch_map  # noqa: PLC0415 (as above)
+
+        # Vectors are computed in one thread, because concurrent products round differently, and `_anchors` then fails.
+        means = prefetch_map(_mean_lab, views, _THREADS)
+        return (torch.from_numpy(embed_colors(mean)).float() for mean in means)
+
+
+def _mean_lab(view: tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]) -> Float64[np.ndarray, "r 3"]:
+    """Return the mean CIELAB color of every region."""
+    image, labels = view
+    region = labels.cpu().numpy().reshape(len(labels), -1)
+    lab, number = _unique_lab(image.numpy())
+    color, labeled = np.broadcast_to(number, region.shape), region >= 0
+    if not labeled.all():
+        region, color = region[labeled], color[labeled]
+    region, color = region.ravel(), color.ravel()
+    total = np.stack([np.bincount(region, channel[color]) for channel in lab.T], axis=1)
+    return total / np.bincount(region)[:, None]
 
 
 def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, "colors 3"], Int64[np.ndarray, " p"]]:
