@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from normlift_ns.cli import evaluate, lift
