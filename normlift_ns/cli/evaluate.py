@@ -133,7 +133,7 @@ class NormLiftEval(CheckedOptions):
                 )
         if self.compare == "paper" and self.protocol not in ("scannet", "lerf"):
             raise InputError(
-                f"--compare paper needs --protocol scannet or lerf, not {self.protocol}; give one of them, or leave it out"
+                f"--compare paper needs --protocol scannet or lerf, not {self.protocol}; give one, or leave it out"
             )
         runs = len(self.load_config)
         if self.protocol == "none":
