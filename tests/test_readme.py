@@ -47,7 +47,7 @@ OTHERS = {
 }
 OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--viewer"}
 OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
-OTHERS |= {"--keep-crs"}  # OpenSplat
+OTHERS |= {"--keep-crs", "--torch-backend"}  # OpenSplat, uv
 """Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""
 
 

@@ -47,8 +47,8 @@ _COMPILE = (
 
 @dataclass
 class Demo(CheckedOptions):
-    """Generate a room with a trained run, lift it with ns-normlift, search it for colors and for an object, and list its
-    objects. Two small networks find the objects. The demo downloads their weights (77 MB) once."""
+    """Generate a room with a trained run, lift it with ns-normlift, search it for colors and for an object, and list
+    its objects. Two small networks find the objects. The demo downloads their weights (77 MB) once."""
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""
