@@ -54,12 +54,12 @@ the [XKCD color survey](https://xkcd.com/color/rgb/), which are in the public do
 PICTURES = """
 ## Pictures
 
-All pictures of the documentation are made by scripts of this repository, and are under its license, with one exception.
-`own_panels.jpg` and `own_capture.jpg` show a scene with scans of Google Scanned Objects (Downs and others, ICRA 2022),
-copyright 2020 Google LLC, under [CC BY 4.0](https://creativecommons.org/licenses/by/4.0/): frying pan, plate, white bowl,
-patterned bowl, basket and ramekin, with smaller textures and an enlarged basket. `research/own_capture.py` names the page
-of each. Everything else in that scene, and the demo room, is computed by this repository. No image of the captures fox,
-castle and tabletop is in the documentation.
+All pictures of the documentation are made by scripts of this repository, and are under its license, with one
+exception. `own_panels.jpg` and `own_capture.jpg` show a scene with scans of Google Scanned Objects (Downs and others,
+ICRA 2022), copyright 2020 Google LLC, under [CC BY 4.0](https://creativecommons.org/licenses/by/4.0/): frying pan,
+plate, white bowl, patterned bowl, basket and ramekin, with smaller textures and an enlarged basket.
+`research/own_capture.py` names the page of each. Everything else in that scene, and the demo room, is computed by this
+repository. No image of the captures fox, castle and tabletop is in the documentation.
 
 The site contains MathJax (Apache-2.0), which `make docs` fetches from npm.
 """
