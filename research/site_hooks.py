@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +55,7 @@ def mathjax() -> bytes | None:
     kept = ROOT / ".cache" / f"mathjax-{MATHJAX}.js"
     if not kept.is_file():
         sys.path.insert(0, str(ROOT / "web"))
-        from backend import find_npm  # noqa: PLC0415 (the folder is no package)
-
-        npm = find_npm()
+        npm = import_module("backend").find_npm()  # the folder of the page's sources is not a package
         with tempfile.TemporaryDirectory() as folder:
             words = ["pack", f"mathjax@{MATHJAX}", "--silent", "--pack-destination", folder]
             try:
