@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,6 +129,20 @@ class QuickRun:
     def text_encoder(self) -> LazyTextEncoder:
         """Text encoder of the run; access raises the errors of `text_encoder_for`."""
         return text_encoder_for(self, self.device, text_cache_folder(self.run_dir))
+
+    def in_capture(self) -> QuickRun:
+        """Return the run with the centers of the Gaussians in the coordinates of the capture.
+
+        Raises:
+            FileNotFoundError, ValueError: dataparser_transforms.json is missing or damaged.
+        """
+        from normlift_ns.data.transforms import capture_transforms  # noqa: PLC0415 (loads torch)
+
+        means = self.field.arrays["means"].astype(np.float64)
+        for world in reversed(capture_transforms(self.run_dir, self.field.manifest)):
+            means = (means / world.scale - world.transform[:, 3]) @ world.transform[:, :3]
+        arrays = {**self.field.arrays, "means": means.astype(np.float32)}
+        return replace(self, field=self.field._replace(arrays=arrays))
 
     def ask(self, texts: Sequence[str], **rules: Any) -> Answer:
         """Run a query. The arrays of the answer are NumPy arrays.

@@ -140,6 +140,11 @@ class Answer:
             )
         return Finding(self, self.texts.index(text))
 
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Return the arrays as NumPy arrays: relevancy [N, Q], selected [N, Q], valid [N] and reliability [N]."""
+        arrays = {"relevancy": self.relevancy, "selected": self.selected, "valid": self.valid}
+        return {name: as_numpy(x) for name, x in (*arrays.items(), ("reliability", self.field.scalars.reliability))}
+
     def to_json(self) -> list[dict[str, Any]]:
         """Return the numbers of every prompt as plain Python types."""
         answer = self if len(self) < _THREADS else self._as_numpy()
@@ -196,6 +201,12 @@ class Finding:
     def mask(self) -> Bool[Tensor, " n"]:
         """Mask of the selected Gaussians."""
         return self.answer.selected[:, self.index]
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Return the arrays as NumPy arrays: relevancy [N], mask [N], valid [N] and reliability [N]."""
+        arrays = self.answer.numpy()
+        columns = {"relevancy": arrays["relevancy"][:, self.index], "mask": arrays["selected"][:, self.index]}
+        return {**columns, "valid": arrays["valid"], "reliability": arrays["reliability"]}
 
     @property
     def fraction(self) -> float:

@@ -170,15 +170,16 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
     run = arrays.open_quick(lifted)
     assert run is not None
     with create_pipe_input() as typed, create_app_session(input=typed, output=DummyOutput()):
-        typed.send_text("red\nwooden\n \nsky blue\n\x04")
+        typed.send_text("help\nred, yellow\nwooden\n \nsky blue\n\x04")
         run_repl(run, {}, keep_history=True)
         shown = said(capsys)
-        assert "red" in shown and "sky blue" in shown and "wooden" in shown
+        assert "sky blue" in shown and "wooden" in shown and '"salt, pepper"' in shown
+        assert "red, yellow" not in shown and "yellow" in shown  # two prompts
         history = tmp_path / "normlift_ns" / "history"
         assert stat.S_IMODE(history.stat().st_mode) == 0o600
         before = history.read_text()
         assert "+wooden" in before
-        typed.send_text("yellow\n\x04")
+        typed.send_text("yellow\nexit\n")
         run_repl(run, {}, keep_history=False)
         assert history.read_text() == before
         (tmp_path / "file").write_text("")
