@@ -319,7 +319,7 @@ def _describe(source: FeatureSource) -> str:
 
 
 def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
-    """Return whether the vote measures its gate: a posterior vote without --vote-tau, after a consensus that was on.
+    """Return whether the vote measures its gate, as a posterior vote without --vote-tau does after an active consensus.
 
     Args:
         facts: `consensus_facts`, if the consensus is enabled.

@@ -378,10 +378,10 @@ def describe_recognition(facts: Mapping[str, Any]) -> str:
     >>> describe_recognition({"recognized": 812, "confirmed": 1024, "agreement": 0.71})
     'recognized 812 of 1,024 regions in views that were left out; agreement 0.71'
     >>> describe_recognition({"recognized": 0, "confirmed": 0, "agreement": None})
-    'no region was seen alike in other views'
+    'no region has a similar region in other views'
     """
     if facts["confirmed"] == 0:
-        return "no region was seen alike in other views"
+        return "no region has a similar region in other views"
     counts = f"recognized {facts['recognized']:,} of {facts['confirmed']:,} regions in views that were left out"
     return f"{counts}; agreement {facts['agreement']:.2f}"
 

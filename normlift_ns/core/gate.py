@@ -1,9 +1,9 @@
 """Gate of the vote in the units of the features, measured on neighbors that share their regions.
 
-A gate decides from a cosine whether two directions show the same thing. Texts of one scene have cosines of .73 to .95
-in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions of one thing agree
-closely, and the lift itself shows how closely. Let `same` be the cosines of lifted directions of neighbors that share a
-region in at least half of the views that see both::
+A gate decides from a cosine whether two directions belong to the same object. Texts of one scene have cosines of .73 to
+.95 in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions of one object agree
+closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted directions of neighbors
+that share a region in at least half of the views that see both::
 
     tau   = 5 % quantile of same
     gamma = (1 - tau) / 2
@@ -33,9 +33,9 @@ _LEAST_PAIRS = 50
 def sample_pairs(
     gaussians: Int64[Tensor, " m"], neighbors: Int32[Tensor, "m k"], n: int
 ) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:
-    """Return rows of sampled Gaussians, and one of the neighbors of each.
+    """Return rows of sampled Gaussians, and one neighbor of each.
 
-    Index alone decides whether a Gaussian is sampled, and with which neighbor.
+    The sample and the choice of neighbors depend only on the indices of the Gaussians.
 
     Args:
         gaussians: index of every row among all n Gaussians.

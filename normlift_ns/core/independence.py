@@ -1,7 +1,8 @@
 """Reliabilities that count pairs of views, and views by how much they differ in direction.
 
-Features of one Gaussian in two views drift apart with the angle between the views, so views from nearby repeat each
-other's mistakes. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and w::
+Features of one Gaussian in two views differ more if the angle between the views is larger. Nearby views therefore
+repeat the same errors. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and
+w::
 
     s_vw = exp(-theta_vw / 21.7 degrees)
     N_j  = N_eff                                              pairs
@@ -9,7 +10,7 @@ other's mistakes. Let theta_vw be the angle between the directions from Gaussian
     R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
 
 For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is their mean cosine over pairs of views.
-One view has no pair, so a Gaussian of one view has R = r, and not the R of views that agree.
+A Gaussian in a single view has no pair of views, so R = r.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def independent_views(
     Args:
         view_weights: W_jv, [N, views].
         centers: camera centers of the views.
-        drift: degrees.
+        drift: angle in degrees at which s_vw is 1/e.
     """
     count = view_weights.offsets.diff()
     out = torch.zeros(len(view_weights), dtype=torch.float64, device=means.device)

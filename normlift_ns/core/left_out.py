@@ -1,16 +1,16 @@
-"""Quality of a lift without labels: does it recognize regions in views that were left out?
+"""Quality of a lift without labels, measured by its recognition of regions in views that were left out.
 
-Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift; then the
-halves change places. Let u_j be the directions of the Gaussians from the kept views, after a consensus among these
-views if it is enabled, and s a region of a left-out view::
+Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift. Then the
+halves are swapped. Let u_j be the directions of the Gaussians from the kept views, after a consensus among these views
+if it is enabled, and s a region of a left-out view::
 
-    U_s        = normalize(sum_j E_js u_j)                      what the kept views say of the region
+    U_s        = normalize(sum_j E_js u_j)                      feature of the region in the kept views
     recognized = U_s is nearer to F_s than to all other regions of its view
     confirmed  = sum_t J_st F_t over kept regions t with J_st > 0.3 is nearer to F_s than to all others of its view
     agreement  = mean of <U_s, F'_s> over all regions, F'_s after a consensus among the left-out views alone
 
-Only confirmed regions count as recognized or not, because a region that no other view shows alike, such as a wrong or
-merged mask, should not be recognized. The vote has no part: these figures do not predict whether it helps.
+Only confirmed regions are evaluated. A region without a similar region in other views, such as a wrong or merged mask,
+should not be recognized. The figures do not include the vote, and do not predict whether it helps.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def leave_views_out(
         probability: sampling probability of each row.
         features: F, before the consensus; unit rows or 0.
         level: level of every region (default: the same for all). Regions of different levels are not compared.
-        power, least: options of the consensus of the kept views; `least` None: no consensus.
+        power, least: options of the consensus of the kept views. If `least` is None, there is no consensus.
     """
     device = sampled.rows.weight.device
     view, views = sampled.region_view.long(), sampled.num_views

@@ -57,8 +57,8 @@ def refine(
     a mean in 0..1 that counts as much as P views. Neighbors therefore have less influence if i has more views.
 
     All votes use the unrefined directions. In a tie, the nearer neighbor wins. If no neighbor is reliable, i keeps its
-    direction (see `unsupported`), and so it does if less than `min_labeled` of its weight lies in regions. If R_i = 0,
-    S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
+    direction (see `unsupported`). It also keeps it if less than `min_labeled` of its weight lies in regions. If R_i =
+    0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
         config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
@@ -107,7 +107,7 @@ def refine(
 
 
 def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
-    """Return the share of every Gaussian's weight in all views that lies in regions, or 1 without any weight."""
+    """Return the share of every Gaussian's weight, over all views, that lies in regions; 1 without weight."""
     labeled, blank = evidence.rows.row_sums(), evidence.unlabeled.row_sums()
     return torch.where(labeled + blank > 0, labeled / (labeled + blank), 1.0)
 

@@ -29,8 +29,8 @@ def fisheye_pinhole(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
     """Return the camera matrix of the undistorted image of a fisheye camera.
 
     The image keeps its size, its principal point and the ratio of its focal lengths. The focal length is the largest
-    one with which at least `KEPT_SHARE` of the original pixels are inside the image. If too many pixels lie beyond
-    `MAX_ANGLE`, it is the largest one with which all others are inside.
+    one that keeps at least `KEPT_SHARE` of the original pixels inside the image. If too many pixels lie beyond
+    `MAX_ANGLE`, it is the largest one that keeps all others inside.
 
     Raises:
         ValueError: Hardly any pixel lies within `MAX_ANGLE`.
@@ -73,9 +73,9 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
 
 
 def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
-    """Return for sampled pixels the largest factor on the focal lengths with which they are inside the pinhole image.
+    """Return the largest factor on the focal lengths that keeps each sampled pixel inside the pinhole image.
 
-    It is 0 for pixels beyond `MAX_ANGLE` and for those that the distortion does not reach.
+    The factor is 0 for pixels beyond `MAX_ANGLE`, and for pixels that the distortion model does not reach.
     """
     size, center = np.array([lens.width, lens.height], float), np.array(lens[2:4], float)
     grid = np.meshgrid(*((np.arange(_SAMPLES) + 0.5) * side / _SAMPLES for side in size))

@@ -422,7 +422,7 @@ def label_undistortion(*parts: Views) -> Callable[[str, np.ndarray], np.ndarray]
 
 
 def filled_function(views: Views) -> Callable[[str, int, int], Bool[Tensor, "h w"]] | None:
-    """Return a function of an image name and a size that returns True at pixels that the original image shows.
+    """Return a function from an image name and a size to a mask of the pixels that the original image shows.
 
     The result is None unless the views are `ImageViews` with fisheye cameras.
     """

@@ -381,7 +381,7 @@ def _assumptions(
 
 
 def _fisheye_assumption(frame: Frame) -> str:
-    """Return a message about the undistortion of fisheye images, of which a frame is the first."""
+    """Return a message about the undistortion of fisheye images, given the frame of the first image."""
     try:
         kept = kept_share(frame.intrinsics)
     except InputError as error:

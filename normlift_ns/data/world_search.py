@@ -205,7 +205,7 @@ class _Search:
 
 
 def _rounded(scale: float) -> float:
-    """Round a scale to two digits if this changes it only slightly, otherwise to five.
+    """Round a scale to two digits if this hardly changes it, otherwise to five.
 
     >>> _rounded(1.9997), _rounded(0.157858)
     (2.0, 0.15786)

@@ -66,7 +66,7 @@ class CandidateWorld(NamedTuple):
         )
 
     def clip_planes(self, planes: tuple[float, float] | None) -> tuple[float, float] | None:
-        """Return the near and far plane of the training in units of this world; None: those of splatfacto."""
+        """Return the near and far plane of the training in units of this world; None for those of splatfacto."""
         if self.scale_since_training == 1:
             return planes
         near, far = planes or (RasterSettings.near_plane, RasterSettings.far_plane)

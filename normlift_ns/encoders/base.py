@@ -250,7 +250,7 @@ class RegionFeatures:
 def _limit_regions(
     maps: Int32[Tensor, "levels depth h w"], kept: Bool[Tensor, "h w"]
 ) -> Int32[Tensor, "levels depth h w"]:
-    """Set other pixels than `kept` to -1, and renumber the regions that remain on each level."""
+    """Set pixels outside the mask `kept` to -1, and renumber the regions that remain in each level."""
     if bool(kept.all()):
         return maps
     levels = []
