@@ -207,8 +207,8 @@ def pressed(port: int, prompts: Sequence[str]) -> PressTimes:
             page.wait_for_timeout(1500)
         untouched = [page.evaluate("page.scene.render(true)") for _ in range(6)]
         name = page.evaluate(_RENDERER)
-    columns = ([one[kind] / 1e3 for one in found[1:]] for kind in ("colors", "first", "full", "outlined"))
-    return PressTimes(*columns, [one / 1e3 for one in untouched[1:]], name)
+    columns = {kind: [one[kind] / 1e3 for one in found[1:]] for kind in ("colors", "first", "full", "outlined")}
+    return PressTimes(**columns, untouched=[one / 1e3 for one in untouched[1:]], renderer=name)
 
 
 def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:

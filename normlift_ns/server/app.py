@@ -32,7 +32,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
-from uvicorn.protocols.http.h11_impl import H11Protocol, h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import normlift_ns
 from normlift_ns.errors import InputError, describe_error
@@ -168,7 +168,8 @@ class _PromptProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def _watch(self) -> None:
-        if self.conn.their_state is not h11.IDLE:
+        busy = self.cycle is not None and not self.cycle.response_complete
+        if busy or self.transport.get_protocol() is not self:  # a request has arrived, or this is a websocket now
             self._stop_watching()
         elif self._deadline is None:
             self._deadline = self.loop.call_later(_HEADER_TIMEOUT, self.transport.close)

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from websockets.sync.client import connect as connect_websocket
 
 from normlift_ns import connect, open_run
 from normlift_ns.core.field import SemanticField
@@ -289,5 +290,20 @@ def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch)
                     received += line.recv(4096)
                     assert received.startswith(b"HTTP/1.1 200")
                 time.sleep(0.6)
+    finally:
+        server.stop()
+
+
+def test_a_page_may_rest(tmp_path, monkeypatch):
+    monkeypatch.setattr(app_module, "_HEADER_TIMEOUT", 0.3)
+    server = make_server(make_served(tmp_path), port=0)
+    port = server.start()
+    try:
+        with connect_websocket(f"ws://127.0.0.1:{port}{RUN}/session") as line:
+            line.send(json.dumps({"action": "greet", "value": {"token": "one"}, "seq": 1}))
+            time.sleep(1)
+            line.send(json.dumps({"action": "link", "seq": 2}))
+            texts = (text for text in line if isinstance(text, str))
+            assert any(json.loads(text)["seq"] == 2 for text in texts)
     finally:
         server.stop()
