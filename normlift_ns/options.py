@@ -649,7 +649,8 @@ class RefineConfig(CheckedOptions):
     --vote-prior views for all neighbors together. paper: one vote, as for each neighbor (equations 9 and 10 of the
     paper)."""
     k: int = 36
-    """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer."""
+    """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. More than
+    256 count as 256."""
     sigma_d: float | None = None
     """Width of the spatial decay of votes, > 0. Larger values give distant neighbors more weight. The unit is the
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from normlift_ns.evidence_collection import ViewBatch
-from normlift_ns.planning import Measurements, Rate, _observe_loaded, _Observed, make_plan
+from normlift_ns.io.run_dir import SCHEMA_VERSION, write_manifest
+from normlift_ns.planning import Measurements, Rate, _observe_loaded, _Observed, diagnose_recognition, make_plan
 
 FACTS = Measurements(
     device="cpu, 2 threads", views=40, gaussians=1000, dimension=8, regions=10, entries=500, entry_bytes=8,
@@ -75,3 +77,15 @@ def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, at_once
     assert seen == [3, 5, 7, 9][:looked_at]
     assert found.seconds == pytest.approx(0.5 * looked_at)
     assert load_s == pytest.approx(first_s - 0.5)
+
+
+def test_recognition_of_a_lifted_run_is_shown(tmp_path: Path) -> None:
+    facts = {"num_gaussians": 3, "dimension": 2, "means_fingerprint": "", "form": "float16"}
+    recognition = {"recognized": 12, "confirmed": 15, "agreement": 0.5}
+    assert diagnose_recognition([tmp_path / "absent", tmp_path]) == []
+    for name, statistics, told in (("new", {"recognition": recognition}, "12 of 15"), ("old", {}, "old")):
+        folder = tmp_path / name / "normlift"
+        folder.mkdir(parents=True)
+        write_manifest(folder, {**facts, "schema_version": SCHEMA_VERSION, "statistics": statistics}, {})
+        (found,) = diagnose_recognition([tmp_path / "absent", tmp_path / name])
+        assert found.state == "ok" and told in found.found
