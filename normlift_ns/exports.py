@@ -22,8 +22,10 @@ from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.compressed_ply import encode_compressed_ply
+from normlift_ns.data.frames import WorldTransform
 from normlift_ns.data.gltf import encode_glb
 from normlift_ns.data.splat import SplatParameters, check_ply_header
+from normlift_ns.data.splat_transforms import transform_splat
 from normlift_ns.data.spz import decode_spz, encode_spz
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file, atomic_files
@@ -94,6 +96,11 @@ class TrainedSplat(NamedTuple):
     def of(scene: Scene) -> TrainedSplat:
         """Return the Gaussians of a scene."""
         return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
+
+    def transformed(self, by: SimilarityTransform) -> TrainedSplat:
+        """Return the Gaussians after a similarity transform, with plain colors as spherical harmonics of degree 0."""
+        world = WorldTransform(np.column_stack([by.rotation, by.shift / by.scale]), by.scale)
+        return TrainedSplat(transform_splat(self.with_harmonics(), world).parameters, True, self.rasterize_mode)
 
     def with_harmonics(self) -> SplatParameters:
         """Return the Gaussians on the CPU in float32; plain colors become spherical harmonics of degree 0."""
@@ -291,7 +298,7 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
         "instance": {str(i): {"segment": class_id - 1} for i, class_id in enumerate(instances.classes)},
     }
     with atomic_files(*files, overwrite=job.overwrite) as drafts:
-        means = job.scene.gaussians.means.detach().cpu().numpy()
+        means = job.splat.parameters["means"].detach().cpu().numpy()
         np.save(drafts[0], means[job.rows].astype(np.float32))
         for draft, ids in zip(drafts[1:3], (instances.class_id, instances.instance_id)):
             np.save(draft, ids.cpu().numpy()[job.rows].astype(np.int32) - 1)
@@ -451,6 +458,14 @@ class ExportJob:
     transfer: CloudTransfer | None = None
     overwrite: bool = False
     """Replace existing files."""
+    to_capture: SimilarityTransform | None = None
+    """Transform to the coordinates of the files; None for those of the scene."""
+
+    @property
+    def splat(self) -> TrainedSplat:
+        """Gaussians of the scene, in the coordinates of the files."""
+        splat = TrainedSplat.of(self.scene)
+        return splat if self.to_capture is None else splat.transformed(self.to_capture)
 
     @cached_property
     def rows(self) -> Int64[np.ndarray, " m"]:
@@ -486,8 +501,8 @@ def transfer_labels(
 
 def _export_splat(job: ExportJob, path: Path, file_format: SplatFormat | None = None) -> list[str]:
     labels = SplatLabels(job.field, job.answer, job.instances, job.objects)
-    splat, how = TrainedSplat.of(job.scene), {"keep": job.keep, "overwrite": job.overwrite}
-    written = write_splat(path, splat, labels, file_format=file_format, **how)
+    how = {"keep": job.keep, "overwrite": job.overwrite}
+    written = write_splat(path, job.splat, labels, file_format=file_format, **how)
     return [f"{len(written.rows):,} of {len(job.field):,} Gaussians in {path}", *written.remarks]
 
 

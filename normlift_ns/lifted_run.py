@@ -10,9 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int32, Int64, UInt8
 from numpy import ndarray
+from PIL import Image
 from torch import Tensor
 
 from normlift_ns import exports
@@ -32,6 +34,7 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
 from normlift_ns.encoders.null_words import null_words
@@ -94,6 +97,21 @@ class LiftedRun:
         return f"LiftedRun {self.folder}: {len(self.field):,} Gaussians"
 
     @property
+    def features(self) -> Float[Tensor, "n d"]:
+        """Unit direction of every Gaussian after the vote, or 0 without a direction, computed at every access."""
+        return self.field.directions()
+
+    @property
+    def scalars(self) -> Scalars:
+        """Reliability, norm, weight and the other numbers of every Gaussian; see `normlift_ns.Scalars`."""
+        return self.field.scalars
+
+    @property
+    def reliability(self) -> Float[Tensor, " n"]:
+        """Reliability R of every Gaussian, in 0..1."""
+        return self.field.scalars.reliability
+
+    @property
     def config(self) -> Path:
         """Path of config.yml, for ns-viewer and the other commands."""
         return self.folder / "config.yml"
@@ -112,6 +130,7 @@ class LiftedRun:
     def ask(
         self,
         *texts: str,
+        vectors: Mapping[str, Float[Tensor, " d"]] | None = None,
         negatives: Sequence[str] | None = None,
         relevancy: RelevancyRule | Literal["auto"] = "auto",
         threshold: float | Literal["auto"] | None = None,
@@ -121,7 +140,9 @@ class LiftedRun:
         """Compute the relevancy and the selection of every Gaussian for each prompt.
 
         Args:
-            texts: prompts.
+            texts: prompts for the text encoder of the run.
+            vectors: vectors [D] of further prompts by name, in the space of the features. They have any length > 0, and
+                need no text encoder, unless the rule compares with negatives.
             negatives: negative prompts to compare with. If None, use those of the encoder.
             relevancy: formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
                 the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
@@ -131,12 +152,27 @@ class LiftedRun:
             min_reliability: minimum reliability R of selected Gaussians, in 0..1.
             refined: use the directions after the vote.
         Raises:
-            ValueError: there is no prompt, a prompt is empty, or the encoder cannot encode a prompt.
+            ValueError: there is no prompt, a prompt is empty, the encoder cannot encode a prompt, or a vector has
+                another number of values than the features.
+
+        >>> from normlift_ns import open_run
+        >>> run = open_run(config)
+        >>> vector = run.features[run.reliability.argmax()]
+        >>> bool(run.ask("red", vectors={"like this": vector})["like this"].mask.any())
+        True
         """
+        known = {name: self._checked(name, vector) for name, vector in (vectors or {}).items()}
+
+        def encode(names: Sequence[str]) -> Float64[np.ndarray, "q d"]:
+            rows = dict(known)
+            new = [name for name in names if name not in known]
+            rows |= zip(new, np.asarray(self.texts.rows(new), np.float64)) if len(new) > 0 else ()
+            return np.stack([rows[name] for name in names])
+
         question = make_query(
             self.field,
-            self.texts.rows,
-            texts,
+            encode if len(known) > 0 else self.texts.rows,
+            tuple(dict.fromkeys((*texts, *known))),
             negatives=negatives,
             relevancy=relevancy,
             threshold=threshold,
@@ -144,6 +180,16 @@ class LiftedRun:
             refined=refined,
         )
         return run_query(self.field, self.scene.gaussians.means, question)
+
+    def _checked(self, name: str, vector: Float[Tensor, " d"]) -> Float64[np.ndarray, " d"]:
+        """Return the vector of a prompt as a NumPy array."""
+        row = vector.detach().double().cpu().numpy()
+        if row.shape != (self.field.dimension,) or not np.isfinite(row).all() or not row.any():
+            raise InputError(
+                f"vectors[{name!r}] must be {self.field.dimension} finite numbers, like the features of the run, and "
+                f"not all zero; got shape {row.shape}"
+            )
+        return row
 
     def ask_stored(self) -> Answer | None:
         """Answer the query that is stored in the run; return None if the run stores no query."""
@@ -547,6 +593,19 @@ class LiftedRun:
         overlay = render_outputs(display, image.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
 
+    @check_arguments
+    def image(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> Image.Image:
+        """Return `render` as a PIL image, with methods such as `save` and `show`.
+
+        Args:
+            view, found: as in `render`.
+
+        >>> from normlift_ns import open_run
+        >>> open_run(config).image("0001").size
+        (160, 120)
+        """
+        return Image.fromarray(self.render(view, found).cpu().numpy())
+
 
 def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
     return MissingImageError(
@@ -572,7 +631,7 @@ def open_run(
     """Open a lifted run from any working directory.
 
     Args:
-        load_config: config.yml of the run.
+        load_config: config.yml of the run, or its folder.
         data: current path of the dataset, if it was moved.
         device: device of the text encoder (auto, cpu or cuda).
         text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
@@ -589,6 +648,6 @@ def open_run(
     vectors = None if text_embeddings is None else check_path("text_embeddings", text_embeddings)
     if prompt_template is not None:
         check_template(prompt_template)
-    device = choose_device(device)
-    folder, scene, stored = open_stored_run(load_config, data)
+    device, path = choose_device(device), check_path("load_config", load_config)
+    folder, scene, stored = open_stored_run(path / "config.yml" if path.is_dir() else path, data)
     return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=prompt_template), device)

@@ -51,6 +51,18 @@ University, and the file holds its license in full: use, copies, changes and dis
 the notice kept and without use of Princeton's name in advertising. `normlift_ns/encoders/xkcd.json` has the names of
 the [XKCD color survey](https://xkcd.com/color/rgb/), which are in the public domain (CC0).
 """
+PICTURES = """
+## Pictures
+
+All pictures of the documentation are made by scripts of this repository, and are under its license, with one
+exception. `own_panels.jpg` and `own_capture.jpg` show a scene with scans of Google Scanned Objects (Downs and others,
+ICRA 2022), copyright 2020 Google LLC, under [CC BY 4.0](https://creativecommons.org/licenses/by/4.0/): frying pan,
+plate, white bowl, patterned bowl, basket and ramekin, with smaller textures and an enlarged basket.
+`research/own_capture.py` names the page of each. Everything else in that scene, and the demo room, is computed by this
+repository. No image of the captures fox, castle and tabletop is in the documentation.
+
+The site contains MathJax (Apache-2.0), which `make docs` fetches from npm.
+"""
 
 
 def packages() -> dict[str, str]:
@@ -90,7 +102,7 @@ def page() -> str:
         f"{entry.data}.\n"
         for name, entry in WEIGHTS.items()
     )
-    return HEAD + table + WEIGHTS_HEAD + weights + WORDS
+    return HEAD + table + WEIGHTS_HEAD + weights + WORDS + PICTURES
 
 
 if __name__ == "__main__":

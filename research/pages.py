@@ -20,7 +20,16 @@ from research.documents import documents
 from research.plots import DOCS, plots
 from research.tables import tables
 
-PAGES = ("accuracy.md", "speed_and_error.md", "numerics.md", "reliability.md", "front_ends.md", "check.md", "splats.md")
+PAGES = (
+    "accuracy.md",
+    "speed_and_error.md",
+    "numerics.md",
+    "reliability.md",
+    "front_ends.md",
+    "check.md",
+    "splats.md",
+    "paper.md",
+)
 MARKER = re.compile(r"<!-- (?:table: (?P<name>[\w-]+)|end) -->")
 LIKE_A_MARKER = re.compile(r"<!--\s*(table|end)\b", re.IGNORECASE)
 

@@ -5,7 +5,13 @@ README, CONTRIBUTING, SECURITY and CHANGELOG stay where people look for them, an
 
 from __future__ import annotations
 
+import logging
 import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +19,9 @@ import griffe
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
+MATHJAX = "3.2.2"
+"""Version of MathJax, Apache-2.0, that the site contains."""
+_LOG = logging.getLogger("mkdocs.hooks.normlift")
 OUTSIDE = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -24,11 +33,42 @@ _LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
 _DOCTEST = re.compile(r"^(?P<block>(?:>>> .*)(?:\n(?!\s*\n|```).+)*)", re.MULTILINE)
 
 
+def on_config(config: Any) -> Any:
+    """Adds the version to the name in the header."""
+    found = re.search(r'__version__ = "([^"]+)"', (ROOT / "normlift_ns" / "__init__.py").read_text("utf8"))
+    config.site_name = f"{config.site_name} {found[1] if found else ''}".strip()
+    return config
+
+
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages from outside."""
+    """Adds the pages from outside, and MathJax."""
     for name, page in OUTSIDE.items():
         files.append(File.generated(config, page, content=(ROOT / name).read_text("utf8")))
+    script = mathjax()
+    if script is not None:
+        files.append(File.generated(config, "assets/tex-svg.js", content=script))
     return files
+
+
+def mathjax() -> bytes | None:
+    """MathJax in one file, fetched by npm once; None if npm or its registry cannot be reached."""
+    kept = ROOT / ".cache" / f"mathjax-{MATHJAX}.js"
+    if not kept.is_file():
+        sys.path.insert(0, str(ROOT / "web"))
+        npm = import_module("backend").find_npm()  # the folder of the page's sources is not a package
+        with tempfile.TemporaryDirectory() as folder:
+            words = ["pack", f"mathjax@{MATHJAX}", "--silent", "--pack-destination", folder]
+            try:
+                subprocess.run([*(npm or ["npm"]), *words], check=True, capture_output=True, timeout=300)
+            except (OSError, subprocess.SubprocessError) as error:
+                _LOG.info("formulas stay in TeX, because MathJax cannot be fetched with npm: %s", error)
+                return None
+            with tarfile.open(Path(folder) / f"mathjax-{MATHJAX}.tgz") as archive:
+                script = archive.extractfile("package/es5/tex-svg.js")
+                assert script is not None
+                kept.parent.mkdir(exist_ok=True)
+                kept.write_bytes(script.read())
+    return kept.read_bytes()
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+from normlift_ns.evaluation.published import TABLES, with_own_column
 from research.accuracy_report import OTHERS
 from research.agreement import by_regions
 from research.documents import PRESETS, TITLES, Document, Documents, steps, table
@@ -58,7 +61,21 @@ def tables(found: Documents) -> dict[str, str]:
         "agreement": by_regions(found["agreement"]),
         "worlds": worlds(found["worlds"]),
         "focal": focal(found["worlds"]),
+        **{f"paper-{name}": published(name) for name in TABLES},
     }
+
+
+def published(name: str) -> str:
+    """One table of the paper, with an empty column for the reader's own numbers."""
+    rows = with_own_column(TABLES[name], {})
+    shown = [
+        [
+            "" if isinstance(x, float) and math.isnan(x) else f"{x:g}" if isinstance(x, float) else x
+            for x in row.values()
+        ]
+        for row in rows
+    ]
+    return table(tuple(rows[0]), shown)
 
 
 def ablation(accuracy: Document, label: str, prefix: str, group: str = "ablation", *, others: bool = True) -> str:

@@ -61,7 +61,7 @@ FOREIGN = {
     "exports": BASE | {"plyfile"},
     "rendering": TENSORS | {"numpy", "matplotlib", "PIL"},
     "session": BASE,
-    "lifted_run": TENSORS | {"numpy"},
+    "lifted_run": TENSORS | {"numpy", "PIL"},
     "planning": TENSORS,
     "viewer": TENSORS | {"numpy", "PIL"},
     "server": BASE | {"xxhash", "msgspec", "PIL", "anyio", "starlette", "uvicorn", "mcp", "pydantic"},

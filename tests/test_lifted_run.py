@@ -33,6 +33,27 @@ def scene(trained: Path) -> nl.Scene:
     return nl.open_scene(trained)
 
 
+def test_vectors_are_asked_like_texts_and_arrays_come_out_as_numpy(run: nl.LiftedRun, lifted: Path) -> None:
+    red = run.texts.rows(["red"])[0]
+    by_text = run.ask("red", "yellow")
+    for kind in (np.asarray(red), torch.as_tensor(red).half(), np.asarray(red).tolist()):
+        answer = run.ask("yellow", vectors={"mine": kind})
+        assert answer.texts == ("yellow", "mine")
+        assert torch.allclose(answer["mine"].relevancy, by_text["red"].relevancy, atol=1e-3)
+    arrays, finding = by_text.numpy(), by_text["red"].numpy()
+    assert {type(x) for x in (*arrays.values(), *finding.values())} == {np.ndarray}
+    assert np.array_equal(arrays["selected"][:, 0], finding["mask"]) and finding["mask"].any()
+    assert np.array_equal(finding["reliability"], run.reliability.numpy())
+    assert torch.equal(run.scalars.reliability, run.reliability)
+    cosine = run.features.double() @ torch.as_tensor(np.asarray(red), dtype=torch.float64)
+    assert torch.allclose(cosine, run.field.query(torch.as_tensor(red)[None])[:, 0].double(), atol=1e-3)
+    assert np.array_equal(np.asarray(run.image("0003", by_text)), run.render("0003", by_text).numpy())
+    assert len(nl.open_run(lifted.parent).field) == len(run.field)
+    for wrong in (np.ones(3), np.zeros(run.field.dimension)):
+        with pytest.raises(ValueError, match=rf"vectors\['x'\] .* {run.field.dimension} finite"):
+            run.ask(vectors={"x": wrong})
+
+
 def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None:
     answer = run.ask("red", "yellow", min_reliability=0.3)
     red, yellow = answer
@@ -242,6 +263,8 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
+    with pytest.raises(nl.InputError, match="valid file name"):
+        run.export("")
     for value in (object(), float("nan")):
         with pytest.raises(nl.InputError):
             run.export(tmp_path / "b.ply", objects={"a": value})

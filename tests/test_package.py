@@ -63,7 +63,7 @@ def test_wheel_and_sdist_hold_one_package_and_its_readme(built):
     assert len(links) > 15 and all(link.startswith("https://") for link in links)
     paths = [link.removeprefix(files).removesuffix("?raw=true") for link in links if link.startswith(files)]
     assert len(paths) > 15 and all((ROOT / path).is_file() for path in paths)
-    assert f"({files}docs/demo.png?raw=true)" in shown and "Description-Content-Type: text/markdown" in shown
+    assert f"({files}docs/own_panels.jpg?raw=true)" in shown and "Description-Content-Type: text/markdown" in shown
     assert f"\nVersion: {normlift_ns.__version__}\n" in shown
 
 

@@ -239,10 +239,11 @@ class Instances:
     """Class of each Gaussian, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
     instance_id: Int32[Tensor, " n"]
     """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0 for
-    Gaussians without a class or in a component that is too small.
+    Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
+    selection, so further prompts change no number.
     """
     classes: tuple[int, ...]
-    """Class of each object, starting with object 1."""
+    """Class of each object, starting with object 1. An object has no Gaussians left if other prompts took them all."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the names of all classes and objects, by id, as plain Python types."""
@@ -281,7 +282,7 @@ def find_instances(
 ) -> Instances:
     """Assign each selected Gaussian to a class and an object.
 
-    A Gaussian that several prompts select belongs to the prompt with the highest relevancy.
+    A Gaussian that several prompts select belongs to the prompt with the highest relevancy, and to its object there.
 
     Args:
         texts: prompts.
@@ -293,24 +294,24 @@ def find_instances(
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
     >>> instances = find_instances(("cup", "box"), means, relevancy, relevancy > 0.5, min_gaussians=1)
     >>> instances.class_id.tolist(), instances.instance_id.tolist(), instances.classes
-    ([1, 1, 2, 0], [1, 1, 2, 0], (1, 2))
+    ([1, 1, 2, 0], [1, 1, 3, 0], (1, 1, 2))
     """
     class_id = best_prompt(relevancy, selected) + 1
     instance_id = torch.zeros_like(class_id)
     classes: list[int] = []
     for number in range(1, len(texts) + 1):
-        labels, count = _large_components(means, class_id == number, max_gap, min_gaussians)
-        instance_id = torch.where(labels >= 0, labels + 1 + len(classes), instance_id)
+        labels, count = _large_components(means, selected[:, number - 1], max_gap, min_gaussians)
+        instance_id = torch.where((labels >= 0) & (class_id == number), labels + 1 + len(classes), instance_id)
         classes += [number] * count
     return Instances(texts, class_id, instance_id, tuple(classes))
 
 
 def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: Instances) -> list[dict[str, Any]]:
-    """Return a summary of each prompt and its objects, as plain Python types."""
-    tables = []
+    """Return a summary of each prompt and its objects with Gaussians, as plain Python types."""
+    tables, sizes = [], torch.bincount(instances.instance_id.long(), minlength=len(instances.classes) + 1)
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
-        ids = [i for i, class_id in enumerate(instances.classes, 1) if class_id == number]
+        ids = [i for i, class_id in enumerate(instances.classes, 1) if class_id == number and sizes[i] > 0]
         found = asdict(_objects(field, means, in_class, instances.instance_id, ids))
         objects = [{"instance_id": i, **row} for i, row in zip(ids, found["objects"])]
         tables.append({"text": text, "class_id": number, **found, "objects": objects})
@@ -447,6 +448,8 @@ def make_catalogue(
     objects = []
     for number in range(1, count + 1):
         rows = np.flatnonzero(ids == number)
+        if len(rows) == 0:
+            continue
         share = shares[number - 1]
         shows = (share > 0) & (share >= MIN_VIEW_SHARE * share.max(initial=0))
         inside = _inside(means[rows], cameras)

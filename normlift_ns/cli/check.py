@@ -20,7 +20,7 @@ from normlift_ns.cli.lift import NormLift, print_plan
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
 from normlift_ns.io.atomic import write_text_file
-from normlift_ns.options import renamed
+from normlift_ns.options import SourceOptions, renamed
 
 if TYPE_CHECKING:
     from normlift_ns.planning import Diagnostic, Plan
@@ -91,8 +91,13 @@ class NormLiftCheck(NormLift):
             compare = partial(planning.compare_cameras, opened, self.lift, device)
             compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(compare()))
             rows += [] if compared is None else [compared]
-        if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
+        if source is None or any(row.state == "error" for row in rows):
             return rows, None
+        if len(missing) > 0:
+            source = make_source(SourceOptions(encoder="color"), device)
+            stand_in = "without these weights, the plan is that of a lift with --encoder color"
+            advice = "add the time of the networks, or fetch the weights and check again"
+            rows.append(Diagnostic("plan", "warning", stand_in, advice))
         plan = _try(rows, "plan", lambda: planning.plan_opened(opened, source, self.lift, device, self.num_devices))
         if plan is not None:
             rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]

@@ -1,7 +1,7 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
-The demo searches for colors, and then for an object with the small networks of `--regions edges --encoder imagenet`. It
-fetches their weights at the start, and skips the search for the object if that fails.
+The demo searches for colors, then for an object with the small networks of `--regions edges --encoder imagenet`, and
+lists the objects of the room. It fetches the weights at the start, and skips both if that fails.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ _COMPILE = (
 
 @dataclass
 class Demo(CheckedOptions):
-    """Generate a room with a trained run, lift it with ns-normlift, and search it for colors and for an object. Two
-    small networks find the object. The demo downloads their weights (77 MB) once."""
+    """Generate a room with a trained run, lift it with ns-normlift, search it for colors and for an object, and list
+    its objects. Two small networks find the objects. The demo downloads their weights (77 MB) once."""
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""
@@ -141,6 +141,10 @@ class Demo(CheckedOptions):
         found = run.ask(_THING).mask.numpy()
         iou = float((found & truth).sum() / (found | truth).sum())
         info(f"IoU of the Gaussians that match {_THING!r} with the ground truth: {iou:.3f}")
+        CONSOLE.rule("What is in here?")
+        image = self.folder / "objects.png"
+        _show("ns-normlift-query", "--load-config", run.config, "--inventory", "--image", image)
+        NormLiftQuery(run.config, inventory=True, image=image, overwrite=True).main()
         return iou
 
 

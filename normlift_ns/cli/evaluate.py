@@ -55,6 +55,9 @@ class NormLiftEval(CheckedOptions):
     opacity. timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines: scores
     of ideas of SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
     reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
+    compare: Literal["paper"] | None = None
+    """Published results to print next to yours. paper: the tables of the paper that --protocol scannet or lerf and the
+    studies ablation, signals and timing measure, also in the output file."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None
@@ -73,6 +76,7 @@ class NormLiftEval(CheckedOptions):
         from normlift_ns.evaluation import studies  # noqa: PLC0415
         from normlift_ns.evaluation.coverage import coverage_of, write_poses  # noqa: PLC0415
         from normlift_ns.evaluation.options import write_evaluation  # noqa: PLC0415
+        from normlift_ns.evaluation.published import compare_with_paper  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
@@ -92,11 +96,16 @@ class NormLiftEval(CheckedOptions):
             "sweeps": lambda: studies.study_votes(loaded, evaluate, studies.sweeps, device),
         }
         found = {name: measure[name]() for name in self.study}
-        write_evaluation(self.output_path, evaluation, names, studies=found, overwrite=self.overwrite)
+        compared = compare_with_paper(evaluation, found) if self.compare == "paper" else {}
+        write_evaluation(
+            self.output_path, evaluation, names, studies=found, comparison=compared, overwrite=self.overwrite
+        )
         written = [self.output_path, *self._plots(found, evaluation.results)]
         if covered is not None:
             written += write_poses(self._beside("coverage"), covered.poses, covered.pictures, overwrite=self.overwrite)
         _print_tables(evaluation, found)
+        for title, rows in compared.items():
+            CONSOLE.print(rows_table(rows, title))
         info(f"Written: {', '.join(map(str, written))}")
         return evaluation
 
@@ -122,6 +131,10 @@ class NormLiftEval(CheckedOptions):
                     f"--{option.replace('_', '-')} is an option of --protocol {name}, not of {self.protocol}; leave it "
                     "out, or give that protocol"
                 )
+        if self.compare == "paper" and self.protocol not in ("scannet", "lerf"):
+            raise InputError(
+                f"--compare paper needs --protocol scannet or lerf, not {self.protocol}; give one, or leave it out"
+            )
         runs = len(self.load_config)
         if self.protocol == "none":
             self._check_without_truth()

@@ -38,7 +38,8 @@ class NormLiftExport(options.CheckedOptions):
     output_dir: Path
     """Output folder. The command creates it if it is missing."""
     text: tuple[str, ...] = ()
-    """Prompts to search for. Without prompts, the command uses the queries stored in the run, with their options."""
+    """Prompts to search for. Commas and semicolons separate prompts, except between double quotes. Without prompts, the
+    command uses the queries stored in the run, with their options."""
     select: Literal["scene", "selection", "rest", "clean"] = "scene"
     """Gaussians to export. scene: all Gaussians. selection: Gaussians that any prompt selects. rest: Gaussians that no
     prompt selects. clean: all except likely floaters, which are Gaussians floating in front of the cameras."""
@@ -47,6 +48,9 @@ class NormLiftExport(options.CheckedOptions):
     """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The
     command also writes <name>_rows.npy (index of each Gaussian in the run), <name>_names.json (names of class_id and
     instance_id) and <name>_objects.json (objects)."""
+    coordinates: Literal["scene", "capture"] = "scene"
+    """Coordinate system of the exported Gaussians and objects. scene: that of the trained Gaussians and of viewers.
+    capture: that of the cameras before nerfstudio rotated and scaled them."""
     masks_dir: Path | None = None
     """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
     swaps the values. The masks fit the undistorted images that the scene was trained with."""
@@ -64,7 +68,7 @@ class NormLiftExport(options.CheckedOptions):
     The unit is the median distance from a Gaussian to the nearest one at another position."""
     transfer_coordinates: Literal["capture", "scene"] = "capture"
     """Coordinate system of the cloud for --transfer. capture: that of the cameras before nerfstudio rotated and scaled
-    them. scene: that of the Gaussians and of exported files."""
+    them. scene: that of the trained Gaussians."""
     object_max_gap: float = options.OBJECT_MAX_GAP
     """Maximum gap between Gaussians of one object, > 0, in units of the selection's median spacing. Larger values merge
     more objects."""
@@ -100,22 +104,28 @@ class NormLiftExport(options.CheckedOptions):
             for line in EXPORTERS.load(kind).write(job, path):
                 common.info(line)
         if job.objects is not None:
-            common.CONSOLE.print(_objects_table(job.objects["queries"]))
+            common.CONSOLE.print(_objects_table(job.objects["queries"], self.coordinates))
         return outputs["ply"]
 
     def _job(self, run: LiftedRun, cloud: PlyData | None) -> ExportJob:
         """Return the job with the Gaussians to export and the answer to the prompts."""
         from normlift_ns import exports  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
+        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415
 
-        answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
+        prompts = split_texts("--text", self.text)
+        answer = run.ask(*prompts, **self.ask.rules()) if len(prompts) > 0 else run.ask_stored()
+        to_capture = run.to_capture if self.coordinates == "capture" else None
         job = exports.ExportJob(
-            run.scene, run.field, self._keep(run, answer), rest=self.select == "rest", overwrite=self.overwrite
-        )
+            run.scene, run.field, self._keep(run, answer), rest=self.select == "rest", overwrite=self.overwrite,
+            to_capture=to_capture,
+        )  # fmt: skip
         if answer is None:
             return job
         instances = exports.answer_instances(answer, self.object_max_gap, self.object_min_gaussians)
-        objects = {"queries": object_tables(run.field, answer.means, instances), **answer.question.settings()}
+        means = job.splat.parameters["means"] if to_capture is not None else answer.means
+        settings = {**answer.question.settings(), "coordinates": self.coordinates}
+        objects = {"queries": object_tables(run.field, means, instances), **settings}
         transfer = None
         if cloud is not None:
             names = [*exports.INSTANCE_PROPERTIES, *(f"relevancy_{i}" for i in range(len(answer.texts)))]
@@ -197,8 +207,8 @@ class NormLiftExport(options.CheckedOptions):
         preflight.refuse_unused(self, ("object_max_gap", "object_min_gaussians"), "--text")
 
 
-def _objects_table(queries: list[dict[str, Any]]) -> Table:
-    table = Table("text", "object", title="Objects, in scene units")
+def _objects_table(queries: list[dict[str, Any]], coordinates: str = "scene") -> Table:
+    table = Table("text", "object", title=f"Objects; positions in {coordinates} coordinates")
     for name in ("Gaussians", "centroid", "box size", "mean reliability"):
         table.add_column(name, justify="right", overflow="fold")
     for entry in queries:

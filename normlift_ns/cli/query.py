@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
-    from normlift_ns.analysis.objects import Catalogue
+    from normlift_ns.analysis.objects import Catalogue, CatalogueObject
     from normlift_ns.data.open_scene import StoredRun
     from normlift_ns.query.arrays import QuickRun
     from normlift_ns.query.engine import Answer
@@ -65,7 +65,8 @@ class NormLiftQuery(CheckedOptions):
     load_config: Path
     """Path to the config.yml file of the lifted run."""
     text: tuple[str, ...] = ()
-    """Prompts to search for, such as --text mug 'red bowl'. A prompt may contain commas."""
+    """Prompts to search for, such as --text mug 'red bowl' or --text 'mug, red bowl'. Commas and semicolons separate
+    prompts, except between double quotes: --text '"salt, pepper"'."""
     ask: AskOptions = field(default_factory=AskOptions)
     interactive: bool = False
     """Read prompts from the terminal, one after another, while the run stays open."""
@@ -73,6 +74,9 @@ class NormLiftQuery(CheckedOptions):
     """Read one prompt per line from standard input, and print each answer as one line of JSON."""
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
+    coordinates: Literal["scene", "capture"] = "scene"
+    """Coordinate system of all positions in tables and --output-json. scene: that of the Gaussians, of exported files
+    and of viewers. capture: that of the cameras before nerfstudio rotated and scaled them."""
     save_query: bool = False
     """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
@@ -102,13 +106,14 @@ class NormLiftQuery(CheckedOptions):
     by evidence. box has the edge lengths of the oriented box, longest first, and extent the size along x, y and z. Both
     span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least a
     tenth as much of the object as the best image. best views names three images that show the object whole and large.
-    Lengths are in capture units."""
+    If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
     objects.json and objects.csv, and the meshes objects.ply and objects_scene.ply of the boxes. docs/objects.md
     explains every column."""
     meters_per_unit: float | None = None
-    """Length of one capture unit in meters for --objects, > 0. If given, positions and sizes are in meters."""
+    """Length of one capture unit in meters for --objects, > 0. If given, the table of objects is in meters, in the
+    coordinates of the capture."""
     inventory: bool = False
     """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. Each
     object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
@@ -123,7 +128,7 @@ class NormLiftQuery(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder and the renders: auto, cpu or cuda."""
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows."""
@@ -136,7 +141,7 @@ class NormLiftQuery(CheckedOptions):
             answer_lines(run, self.ask.rules())
             return []
         if self.interactive:
-            run_repl(run, self.ask.rules(), keep_history=self.history)
+            run_repl(run, self.ask.rules(), keep_history=self.history, coordinates=self.coordinates)
             return []
         return self._answer(run)
 
@@ -144,7 +149,7 @@ class NormLiftQuery(CheckedOptions):
         """Answer --text, write files, print the table and return its rows."""
         from normlift_ns.query.question import save_query  # noqa: PLC0415 (--help should not wait for NumPy)
 
-        result = run.ask(self.text, **self.ask.rules())
+        result = run.ask(self._prompts, **self.ask.rules())
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
         rows = result.to_json()
         show_why = self._explain(result, rows) if self.explain else None
@@ -153,6 +158,7 @@ class NormLiftQuery(CheckedOptions):
         if self.output_json is not None:
             question = result.question
             rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": question.negatives}
+            rules |= {"coordinates": self.coordinates}
             text = json.dumps({"queries": rows, **rules}, indent=2) + "\n"
             write_text_file(self.output_json, text, overwrite=self.overwrite)
         if self.output_npz is not None:
@@ -162,7 +168,7 @@ class NormLiftQuery(CheckedOptions):
         stored = save_query(run.run_dir / FIELD_FOLDER, result.question) if self.save_query else None
         folders = (self.render_dir, self.explain_dir, self.objects_dir)
         written = [path for path in (self.output_json, self.output_npz, *folders, stored) if path is not None]
-        print_answer(rows, result.question)
+        print_answer(rows, result.question, self.coordinates)
         for print_table in (show_sam3, show_why, show_objects):
             if print_table is not None:
                 print_table()
@@ -179,7 +185,15 @@ class NormLiftQuery(CheckedOptions):
 
             choose_device(self.device)
         open_with = partial(open_quick, self.load_config, device=self.device, **self.ask.encoding())
-        return open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
+        run = open_with() or cast("QuickRun", open_with(means=self._run.scene.gaussians.means.numpy()))
+        return run.in_capture() if self.coordinates == "capture" else run
+
+    @cached_property
+    def _prompts(self) -> tuple[str, ...]:
+        """Prompts of --text, split at commas."""
+        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
+
+        return split_texts("--text", self.text)
 
     @cached_property
     def _run(self) -> StoredRun:
@@ -195,13 +209,17 @@ class NormLiftQuery(CheckedOptions):
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
         """Load everything that the renders need, and return a function that makes and saves them."""
+        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415
 
+        device = choose_device(self.device)
+        init_cuda(device)
         scene, folder = self._run.scene, cast(Path, self.render_dir)
         cameras = training_cameras(scene, self.render_views)
         result, settings = self._answer_with_scene(question), RasterSettings.recorded(self._run.field.manifest)
-        return lambda: save_overlays(scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
+        shared = {"settings": settings, "device": device, "overwrite": self.overwrite}
+        return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Add an explanation to every row, write the images, and return a function that prints the explanations.
@@ -219,8 +237,8 @@ class NormLiftQuery(CheckedOptions):
         for row, why in zip(rows, reasons):
             row["why"] = None if why is None else explanation_to_json(votes.names, why)
         if self.explain_dir is not None:
-            save_vote_images(votes, self.text, reasons, self.explain_dir, overwrite=self.overwrite)
-        return lambda: print_explanations(votes.names, self.text, reasons)
+            save_vote_images(votes, result.question.texts, reasons, self.explain_dir, overwrite=self.overwrite)
+        return lambda: print_explanations(votes.names, result.question.texts, reasons)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
         """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
@@ -260,7 +278,7 @@ class NormLiftQuery(CheckedOptions):
             "segment_agreement": [answer.scalars.c_inter for answer in segmented.answers],
         }
         arrays = {name: torch.stack(tensors, dim=1).cpu().numpy() for name, tensors in columns.items()}
-        return arrays, lambda: print_sam3_table(self.text, summaries)
+        return arrays, lambda: print_sam3_table(result.question.texts, summaries)
 
     def _list_objects(self, question: Query) -> Callable[[], None]:
         """Find objects, write their files, and return a function that prints them.
@@ -279,7 +297,12 @@ class NormLiftQuery(CheckedOptions):
         if self.objects_dir is not None:
             metadata = {"texts": list(question.texts), **question.settings()}
             objects.write_catalogue(catalog, self.objects_dir, question=metadata, overwrite=self.overwrite)
-        return lambda: print_catalog(catalog)
+        return lambda: print_catalog(catalog, self._table_coordinates)
+
+    @property
+    def _table_coordinates(self) -> Literal["scene", "capture"]:
+        """Coordinate system of the table of objects; meters are those of the capture."""
+        return self.coordinates if self.meters_per_unit is None else "capture"
 
     def _list_inventory(self) -> list[dict[str, Any]]:
         """Find the objects of the scene, write files, print the table and return its rows."""
@@ -297,7 +320,7 @@ class NormLiftQuery(CheckedOptions):
             write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
         if self.image is not None:
             save_inventory(run.scene, found, self.image, manifest=run.field.manifest, overwrite=self.overwrite)
-        print_catalog(found.catalog)
+        print_catalog(found.catalog, self._table_coordinates)
         written = [path for path in (self.output_json, self.objects_dir, self.image) if path is not None]
         if len(written) > 0:
             common.info("Written: " + ", ".join(map(str, written)))
@@ -361,7 +384,7 @@ class NormLiftQuery(CheckedOptions):
         """Return the existing renders that new renders of these prompts and views would replace."""
         views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
         views += ["contact_sheet"] if len(views) > 1 else []
-        names = [f"{view}_{i}_{safe_file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
+        names = [f"{view}_{i}_{safe_file_name(text)}.png" for view in views for i, text in enumerate(self._prompts)]
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 
 
@@ -382,20 +405,33 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> None:
-    """Answer the prompts that a user types, one per line, until Ctrl-D. Print an error for invalid prompts.
+_HELP = """Type prompts, separated by commas; double quotes keep a comma: "salt, pepper".
+help: this text. exit, quit or Ctrl-D: end. To ask for one of these words, write it in double quotes."""
+
+
+def run_repl(
+    run: QuickRun,
+    rules: Mapping[str, Any],
+    *,
+    keep_history: bool,
+    coordinates: Literal["scene", "capture"] = "scene",
+) -> None:
+    """Answer the prompts that a user types, until `exit` or Ctrl-D. Print an error for invalid prompts.
 
     Args:
         run: Lifted run.
         rules: Keyword arguments of `QuickRun.ask`.
         keep_history: Store prompts in the history file.
+        coordinates: Coordinate system of the positions of the run.
     """
     from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
     from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
 
+    from normlift_ns.session.prompts import split_prompts  # noqa: PLC0415
+
     file = _history_file() if keep_history else None
     session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
-    common.info(f"{len(run.field.arrays['source']):,} Gaussians. Type one prompt per line; Ctrl-D quits.")
+    common.info(f"{len(run.field.arrays['source']):,} Gaussians. Type a prompt, help or exit.")
     while True:
         try:
             text = session.prompt("> ").strip()
@@ -403,14 +439,20 @@ def run_repl(run: QuickRun, rules: Mapping[str, Any], *, keep_history: bool) -> 
             continue
         except EOFError:
             return
-        if text == "":
+        if text in ("exit", "quit"):
+            return
+        if text in ("help", "?"):
+            common.info(_HELP)
+            continue
+        prompts = split_prompts(text)
+        if len(prompts) == 0:
             continue
         try:
-            answer = run.ask([text], **rules)
+            answer = run.ask(prompts, **rules)
         except (InputError, OSError, MemoryError) as error:
             common.print_error(str(error))
         else:
-            print_answer(answer.to_json(), answer.question)
+            print_answer(answer.to_json(), answer.question, coordinates)
 
 
 def _history_file() -> Path | None:
@@ -468,33 +510,44 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
         np.savez(file, names=np.array(result.question.texts), **arrays, **extra)
 
 
-def print_answer(rows: list[dict[str, Any]], question: Query) -> None:
+def print_answer(
+    rows: list[dict[str, Any]], question: Query, coordinates: Literal["scene", "capture"] = "scene"
+) -> None:
     """Print the table of an answer, and a note for each prompt that has no clear match or is encoded only in part."""
     rule = f"{question.rule} > {question.threshold:.4g}"
-    common.CONSOLE.print(answer_table(rows, rule, question.threshold, narrow=common.CONSOLE.width < 100))
+    narrow = common.CONSOLE.width < 100
+    common.CONSOLE.print(answer_table(rows, rule, question.threshold, coordinates, narrow=narrow))
     for row in rows:
         if row["read_as"] is not None:
             common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the other words.')
         if row["verdict"] in ("weak match", "probably not here"):
-            top = row["histogram"]["top"]
             position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
-            common.info(f"{row['text']}: {row['verdict']}. The nearest match{position} has relevancy {top:.3f}.")
+            peak = common.format_number(row["peak"])
+            common.info(f"{row['text']}: {row['verdict']}. The nearest match{position} has relevancy {peak}.")
 
 
-def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
+def answer_table(
+    rows: list[dict[str, Any]],
+    rule: str,
+    threshold: float,
+    coordinates: Literal["scene", "capture"] = "scene",
+    *,
+    narrow: bool = False,
+) -> Table:
     """Return a table with one row per prompt.
 
     Args:
         rows: Rows of `Answer.to_json`.
         rule: Selection rule for the title, such as lerf > 0.5.
         threshold: Threshold that each histogram marks with a bar |.
+        coordinates: Coordinate system of the positions, for the title.
         narrow: Omit the histograms and the verdicts.
     """
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
     from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
-    result = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
+    result = Table(title=f"Selected: {rule}; positions in {coordinates} coordinates", padding=(0, 0 if narrow else 1))
     wrapped = ("text", "centroid", "extent")
     for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
         justify = "left" if name == "text" else "right"
@@ -523,14 +576,38 @@ def answer_table(rows: list[dict[str, Any]], rule: str, threshold: float, *, nar
 
 
 _MAX_ROWS = 40
-"""Maximum number of objects in the table."""
+"""Maximum number of objects in a table of all objects."""
+_LARGEST = 10
+"""Number of objects in the table if there are more."""
 
 
-def print_catalog(catalog: Catalogue) -> None:
-    """Print a table of the largest objects, in capture coordinates."""
+def print_catalog(catalog: Catalogue, coordinates: Literal["scene", "capture"] = "scene") -> None:
+    """Print a table of the objects. Of more than 40, count those of each prompt and print the 10 largest."""
+    count = len(catalog.objects)
+    largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[: count if count <= _MAX_ROWS else _LARGEST]
+    common.CONSOLE.print(_catalog_table(catalog, sorted(largest, key=lambda item: item.id), coordinates))
+    if count > _MAX_ROWS:
+        parts = [
+            f"{text or 'selection'}: {len(sizes):,} objects, {sum(sizes):,} Gaussians"
+            for text in dict.fromkeys(item.text for item in catalog.objects)
+            for sizes in [[item.gaussians for item in catalog.objects if item.text == text]]
+        ]
+        common.info(
+            f"{'; '.join(parts)}. {count - _LARGEST:,} smaller objects are not shown; write all with "
+            "--objects-dir FOLDER."
+        )
+    if catalog.num_in_small_components > 0:
+        common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
+
+
+def _catalog_table(
+    catalog: Catalogue, objects: Sequence[CatalogueObject], coordinates: Literal["scene", "capture"]
+) -> Table:
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
-    table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if common.CONSOLE.width < 100 else 1))
+    unit = "" if catalog.meters_per_unit is None or coordinates == "scene" else ", in meters"
+    title = f"Objects; positions in {coordinates} coordinates{unit}"
+    table = Table(title=title, padding=(0, 0 if common.CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
     narrow = common.CONSOLE.width < 70
@@ -540,21 +617,14 @@ def print_catalog(catalog: Catalogue) -> None:
         table.add_column(name, justify="right", no_wrap=name not in vectors, overflow="fold", min_width=width)
     if not narrow:
         table.add_column("best views")
-    largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[:_MAX_ROWS]
-    for item in sorted(largest, key=lambda item: item.id):
-        geometry = item.capture
+    for item in objects:
+        geometry = item.scene if coordinates == "scene" else item.capture
         rows = (geometry.centroid, geometry.box.size, geometry.extent)[: len(vectors)]
         numbers = (" ".join(f"{x:.3g}" for x in row) for row in rows)
         cells = (f"{item.gaussians:,}", *numbers, f"{item.reliability:.3f}", str(item.views))
         best = () if narrow else (common.plain_text(" ".join(Path(name).stem for name in item.best_views)),)
         table.add_row(str(item.id), common.plain_text(item.text), *cells, *best)
-    common.CONSOLE.print(table)
-    if len(catalog.objects) > _MAX_ROWS:
-        common.info(
-            f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; write all with --objects-dir FOLDER."
-        )
-    if catalog.num_in_small_components > 0:
-        common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
+    return table
 
 
 # ns-normlift-query --explain: the images that voted for a selection.

@@ -20,8 +20,14 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 """torch.Tensor or numpy.ndarray."""
 TEMPERATURE = 10.0
 """Factor of the cosines inside LERF's softmax."""
+PROMPT_BLOCK = 32
+"""Number of prompts that are compared with all Gaussians at a time, which bounds the memory of a query."""
+_SAMPLED = 16
+"""One of this number of values is in the sample of `_largest`."""
 TOP_QUANTILE = 0.999
 """Quantile over Gaussians that is the top relevancy of a prompt. Single outliers do not affect it."""
+_LARGEST_COSINE = 1.01
+"""Largest cosine that counts as rounded; half precision exceeds 1 by about a thousandth."""
 _PRESENT = 0.62
 """Relevancy by the rule "lerf" that objects in a scene usually reach."""
 
@@ -110,7 +116,7 @@ def relevancy(
             in -2..2.
         temperature: factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: if the rule is unknown, or needs negatives and there are none.
+        ValueError: if a value is not in -1..1, or the rule is unknown, or needs negatives and there are none.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -119,6 +125,24 @@ def relevancy(
     """
     if not 0 < temperature < math.inf:
         raise InputError(f"temperature must be positive and finite, got {temperature}")
+    for name, cosines in (("positive", positive), ("negative", negative)):
+        _check_cosines(name, cosines)
+    return _relevancy(positive, negative, rule, temperature)
+
+
+def _check_cosines(name: str, cosines: Any) -> None:
+    """Raise InputError if a value is not in -1..1, up to rounding."""
+    if cosines is None or 0 in cosines.shape:
+        return
+    largest = float(abs(cosines).max())
+    if not largest <= _LARGEST_COSINE:
+        raise InputError(
+            f"{name} must be cosines in -1..1, got {largest:.6g}; for unit directions [N, D] and unit texts [Q, D], "
+            "pass directions @ texts.T, or use SemanticField.query"
+        )
+
+
+def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: float) -> Any:
     if negative is not None and type(negative) is not type(positive):  # lists, or an array of the other module
         convert = np.asarray if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor
         negative = cast(Any, convert(negative))
@@ -140,7 +164,7 @@ def gaussian_relevancy(
     Raises:
         ValueError: if the rule is unknown, or needs negatives and there are none.
     """
-    values = relevancy(positive, negative, rule=rule)
+    values = _relevancy(positive, negative, rule, TEMPERATURE)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)
 
 
@@ -152,9 +176,20 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
     >>> top_values(np.arange(2001.0)[:, None])
     [1998.0]
     """
-    if isinstance(values, np.ndarray):
-        return np.quantile(values, TOP_QUANTILE, axis=0).tolist()
     place = TOP_QUANTILE * (len(values) - 1)
-    largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile allows 16 million values
-    low, high = largest[-1].double(), largest[max(len(largest) - 2, 0)].double()
+    count = len(values) - math.floor(place)
+    if isinstance(values, np.ndarray):
+        largest = np.stack([_largest(column, count) for column in values.T], axis=1)
+        low, high = largest[0].astype(np.float64), largest[min(1, count - 1)].astype(np.float64)
+    else:
+        largest = values.topk(count, dim=0).values  # torch.quantile allows 16 million values
+        low, high = largest[-1].double(), largest[max(count - 2, 0)].double()
     return (low + (high - low) * (place - math.floor(place))).tolist()
+
+
+def _largest(values: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " count"]:
+    """Return the largest values in ascending order. A sample bounds them, so that only few values are sorted."""
+    sample = np.sort(values[::_SAMPLED])
+    bound = sample[-min(len(sample), 2 * count // _SAMPLED + 8)]
+    candidates = values[values >= bound]
+    return np.sort(candidates if len(candidates) >= count else values)[-count:]

@@ -154,11 +154,12 @@ def write_evaluation(
     runs: Sequence[tuple[str, str]],
     *,
     studies: Mapping[str, Any] | None = None,
+    comparison: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write an evaluation as a JSON file in the format of ns-eval.
 
-    The keys settings, scenes, rows and studies are additional. NaN is written as null.
+    The keys settings, scenes, rows, studies and comparison are additional. NaN is written as null.
 
     Args:
         runs: name and checkpoint of every run.
@@ -170,6 +171,7 @@ def write_evaluation(
     document |= {"results": evaluation.results, "settings": evaluation.settings}
     document |= {"scenes": evaluation.scenes} if evaluation.scenes else {}
     document |= {"rows": evaluation.rows} | ({"studies": studies} if studies else {})
+    document |= {"comparison": comparison} if comparison else {}
     write_text_file(path, json.dumps(_to_json(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
 
 

@@ -31,6 +31,12 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
     return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST else None
 
 
+def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
+    """Return whether `judge` uses cosines, with limits of the encoder or with null words, and not relevancies."""
+    kind = find_encoder_kind(encoder)
+    return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
+
+
 def judge(
     manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
 ) -> Verdict | None:

@@ -48,20 +48,20 @@ def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagn
     for index in prompts[:max_prompts]:
         finding = Finding(answer, index)
         if finding.histogram is not None:
-            warning = _warning(finding, finding.histogram)
+            warning = _warning(finding)
             x = finding.nearest if warning else None
             position = None if x is None else (x[0], x[1], x[2])
             results.append(PromptDiagnostics(finding.text, colors[index], finding.histogram, warning, position))
     return tuple(results)
 
 
-def _warning(finding: Finding, histogram: Histogram) -> str:
+def _warning(finding: Finding) -> str:
     if is_click(finding.text):
         return ""
     position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
     read_as = "" if finding.read_as is None else f'{finding.text}: read as "{finding.read_as}". '
     if finding.verdict in ("weak match", "probably not here"):
-        verdict = f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {histogram.top:.2f}."
+        verdict = f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {finding.peak:.2f}."
         return read_as + verdict
     if finding.peak is None or bool(finding.mask.any()):
         return read_as.strip()

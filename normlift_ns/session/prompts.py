@@ -66,6 +66,18 @@ def split_prompts(text: str) -> list[str]:
     return list(dict.fromkeys(part for part in parts if part))
 
 
+def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Split every text of an option with `split_prompts`.
+
+    Raises:
+        ValueError: there are texts, but no prompts in them.
+    """
+    prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
+    if len(texts) > 0 and len(prompts) == 0:
+        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
+    return prompts
+
+
 def join_prompts(texts: Sequence[str]) -> str:
     """Join texts into a line that `split_prompts` splits into the same texts.
 

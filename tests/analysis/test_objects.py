@@ -45,6 +45,22 @@ def test_parts_smaller_than_one_gaussian_are_refused():
             )
 
 
+def test_further_prompts_change_no_number_of_an_object():
+    means = torch.cat([blob(60, (0, 0, 0), 1), blob(40, (9, 0, 0), 2), blob(30, (18, 0, 0), 3)])
+    g = generator(4)
+    relevancy, selected = torch.rand(130, 3, generator=g), torch.rand(130, 3, generator=g) < 0.95
+    texts = ("a", "b", "c")
+    alone = objects.find_instances(texts[:1], means, relevancy[:, :1], selected[:, :1], max_gap=3.0)
+    together = objects.find_instances(texts, means, relevancy, selected, max_gap=3.0)
+    assert together.classes[: len(alone.classes)] == alone.classes == (1, 1, 1)
+    of_first = together.class_id == 1
+    assert 0 < int(of_first.sum()) < 80
+    assert torch.equal(together.instance_id[of_first], alone.instance_id[of_first])
+    relevancy[:, 0] = 0.0  # the other prompts take all
+    taken = objects.find_instances(texts, means, relevancy, selected | torch.tensor([False, True, False]), max_gap=3.0)
+    assert taken.classes[:3] == (1, 1, 1) and not bool((taken.class_id == 1).any())
+
+
 def test_scale_and_order_do_not_matter():
     means = torch.cat([blob(40, (0, 0, 0), 3), blob(80, (4, 0, 0), 4)])
     selected = torch.rand(120, generator=generator(5)) < 0.9

@@ -78,7 +78,8 @@ def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, tr
     monkeypatch.setattr("urllib.request.urlopen", lambda request, timeout: io.BytesIO())
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
-    assert code == 0 and states(found)["weights"] == "warning" and found["plan"] is None
+    assert code == 0 and states(found)["weights"] == states(found)["plan"] == "warning"
+    assert found["plan"]["total_s"] > 0
     assert "ViT-B-16" in next(row for row in found["findings"] if row["what"] == "weights")["found"]
     given = ("--load-config", trained, "--encoder", "open_clip", "--regions", "patches")
     assert run_entry(monkeypatch, lift.entrypoint, *given, "--output-dir", tmp_path, "--dry-run", "True") == 1

@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from normlift_ns import open_run
 from normlift_ns.analysis.objects import connected_components
-from normlift_ns.cli import export
+from normlift_ns.cli import export, query
 from normlift_ns.exports import answer_instances
 from normlift_ns.rendering.figures import view_mask
 from tests.cli.conftest import run_entry, said
@@ -149,6 +149,27 @@ def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_p
     assert np.all(np.array(ball["centroid"]) <= ball["box"]["max"])
     open_run(lifted).export(tmp_path / "splat.ply", overwrite=True)  # has no table, and leaves none of another's
     assert sorted(path.name for path in tmp_path.iterdir()) == ["splat.ply", "splat_rows.npy"]
+
+
+def test_one_option_puts_tables_and_files_into_the_coordinates_of_the_capture(lifted, tmp_path, monkeypatch, capsys):
+    run = open_run(lifted)
+    found, means = run.ask("red"), run.scene.gaussians.means.double().numpy()
+    asked = ("--load-config", lifted, "--text", "red", "--coordinates", "capture")
+    assert run_entry(monkeypatch, query.entrypoint, *asked, "--objects", "True", "--output-json", tmp_path / "a") == 0
+    assert run_entry(monkeypatch, export.entrypoint, *asked, "--output-dir", tmp_path) == 0
+    assert said(capsys).count("positions in capture coordinates") == 3
+    rows, vertex = np.load(tmp_path / "splat_rows.npy"), PlyData.read(tmp_path / "splat.ply")["vertex"]
+    expected = run.to_capture.transform_points(means)
+    assert np.allclose(np.stack([vertex[axis] for axis in "xyz"], 1), expected[rows], atol=1e-4)
+    grown = np.stack([vertex[f"scale_{i}"] for i in range(3)], 1) - run.scene.parameters["scales"].numpy()[rows]
+    assert np.allclose(grown, np.log(run.to_capture.scale), atol=1e-5)
+    place = run.to_capture.transform_points(np.array([found["red"].centroid]))[0]
+    (red,) = json.loads((tmp_path / "a").read_text())["queries"]
+    assert np.allclose(red["centroid"], place, atol=1e-4)
+    written = json.loads((tmp_path / "splat_objects.json").read_text())
+    ball = run.catalogue(found).objects[0].capture
+    assert written["coordinates"] == "capture"
+    assert np.allclose(written["queries"][0]["objects"][0]["centroid"], ball.centroid, atol=1e-4)
 
 
 def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:

@@ -57,8 +57,8 @@ def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None
     many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
     print_catalog(replace(few, objects=many))
     shown = said(capsys)
-    assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
-    assert "2 smaller objects" in shown and "--objects-dir" in shown
+    assert "1,042" in shown and "1,033" in shown and "1,032" not in shown
+    assert "red: 42 objects" in shown and "32 smaller objects" in shown and "--objects-dir" in shown
 
 
 def test_table_boxes_and_document_say_the_same(written: Path) -> None:

@@ -45,6 +45,14 @@ def test_forms_that_compare_need_negatives():
             relevancy(POSITIVE, negative, rule="lerf")
 
 
+def test_what_is_not_a_cosine_is_refused():
+    for wrong in ({"positive": 3 * POSITIVE}, {"negative": NEGATIVE * torch.inf}, {"positive": POSITIVE.numpy() * 3}):
+        given = {"positive": POSITIVE, "negative": NEGATIVE, **wrong}
+        with pytest.raises(ValueError, match=rf"{next(iter(wrong))} must be cosines in -1\.\.1"):
+            relevancy(**given, rule="lerf")
+    assert relevancy(torch.full((1, 2), 1.001, dtype=torch.half)).shape == (1, 2)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_rule():
     with pytest.raises(ValueError, match=r"rule .*cosine, lerf, margin.*dot"):

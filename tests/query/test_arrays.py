@@ -52,9 +52,11 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     question = Query(
         ("a", "b", "c"), vectors, ("d", "e"), negatives, rule, 0.1, min_reliability=min_reliability, refined=refined
     )
-    expected = engine.run_query(field, means, question)
+    expected = engine.run_query(field, means, question)  # all prompts in one block
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(arrays, "_BLOCK_ELEMENTS", 100)  # rows are read in several blocks
+        for module in (arrays, engine):
+            patch.setattr(module, "PROMPT_BLOCK", 2)
         field.save(folder)
         stored = arrays.ArrayField(*read_field(Path(folder)))
         found = engine.run_query(stored, stored.arrays["means"], question)
@@ -168,15 +170,16 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
     run = arrays.open_quick(lifted)
     assert run is not None
     with create_pipe_input() as typed, create_app_session(input=typed, output=DummyOutput()):
-        typed.send_text("red\nwooden\n \nsky blue\n\x04")
+        typed.send_text("help\nred, yellow\nwooden\n \nsky blue\n\x04")
         run_repl(run, {}, keep_history=True)
         shown = said(capsys)
-        assert "red" in shown and "sky blue" in shown and "wooden" in shown
+        assert "sky blue" in shown and "wooden" in shown and '"salt, pepper"' in shown
+        assert "red, yellow" not in shown and "yellow" in shown  # two prompts
         history = tmp_path / "normlift_ns" / "history"
         assert stat.S_IMODE(history.stat().st_mode) == 0o600
         before = history.read_text()
         assert "+wooden" in before
-        typed.send_text("yellow\n\x04")
+        typed.send_text("yellow\nexit\n")
         run_repl(run, {}, keep_history=False)
         assert history.read_text() == before
         (tmp_path / "file").write_text("")
