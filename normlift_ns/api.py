@@ -114,7 +114,7 @@ def lift_run(
         check_alignment: compare three training images with renders of the scene before the lift. Warn if they differ,
             and raise if they do not show the same scene.
         device: auto, cpu or cuda.
-        export: folder to also write the 2D features to, as LangSplat files. If None, do not write them.
+        export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, called with (stage, steps done, total steps).
         say: callback for status lines and warnings, such as `print`.
     Raises:
@@ -268,7 +268,7 @@ def announce(prepared: PreparedLift) -> None:
 
 
 def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
-    """Compare training images with renders of the scene; return a warning if they differ, and raise if nothing fits."""
+    """Compare renders with training images; return a warning if they differ, or raise if the scene is another one."""
     settings = RasterSettings.recorded({**scene.identity, "gsplat_rules": resolve_gsplat_version(scene, options)})
     measured_with = RasterSettings.recorded(scene.identity)
     match = scene.alignment if isinstance(scene, SplatScene) and settings == measured_with else None

@@ -45,7 +45,7 @@ class MissingImageError(InputError, KeyError, IndexError):
 
 
 class OutputError(Exception):
-    """Error for a failed write to standard output. It is not an OSError, because loaders treat those as read errors."""
+    """Error for a failed write to standard output. It is not an OSError, which loaders report as a read error."""
 
 
 def escape_unprintable(text: str, keep: str = "") -> str:

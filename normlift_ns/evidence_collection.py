@@ -23,7 +23,7 @@ from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
-from normlift_ns.data.images import label_undistortion
+from normlift_ns.data.images import filled_function, label_undistortion
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
@@ -238,6 +238,8 @@ def observe_views(
             a label map differs in size from its camera.
     """
     source = undistorting_source(downscaled_source(source, downscale), label_undistortion(scene.train))
+    if isinstance(source, RegionFeatures) and render_settings is None:
+        source = replace(source, filled=filled_function(scene.train))
     waiting = deque[View]()
 
     def images() -> Iterator[tuple[Tensor, str]]:
@@ -384,13 +386,13 @@ def _downscaled(view: View, divisor: int) -> View:
 def check_undistorted(source: FeatureSource, *views: View) -> None:
     """Check that the label map of an undistorted image was not made from the original, distorted image.
 
-    Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
-    show the distorted image, so the function accepts only maps of exactly the undistorted size.
+    Undistortion crops an image by a few pixels, but may move its content by many. A map of a different size may
+    therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
 
     Args:
         views: The same view at every size that the label map may have.
     Raises:
-        ValueError: The map has another size. If the source resamples maps, the function warns instead.
+        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
@@ -401,7 +403,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     sizes = [(view.camera.width, view.camera.height) for view in views]
     reason = "training undistorted the image"
     if (width, height) not in sizes:
-        kind = "the size of the original image" if (width, height) == original_size else "another size"
+        kind = "the size of the original image" if (width, height) == original_size else "a different size"
         mismatch = f"is {width}x{height} (width x height), {kind}; {reason} to {sizes[0][0]}x{sizes[0][1]}"
         if not maps.resample:
             raise InputError(

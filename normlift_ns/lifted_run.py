@@ -246,7 +246,7 @@ class LiftedRun:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: all Gaussians of `part` are invisible, the mask has the wrong type or length, the name is
+            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Or the name is
                 reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
@@ -371,8 +371,8 @@ class LiftedRun:
             part: answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
                 refined directions.
         Raises:
-            ValueError: the selection is empty, or the mask has the wrong type or length. Also if the run stores only
-                directions, and the evidence or the features are no longer in its cache.
+            ValueError: the selection is empty, or the mask has the wrong type or length. Or the run stores only
+                directions, and its cache no longer has the evidence or the features.
             FileNotFoundError: the run stores only directions, and an image is missing.
 
         >>> from normlift_ns import open_run
@@ -529,7 +529,7 @@ class LiftedRun:
         """Return an answer, finding or mask as a mask [N] of Gaussians.
 
         Raises:
-            ValueError: `part` has another type or length.
+            ValueError: `part` has the wrong type or length.
         """
         mask = part.mask if isinstance(part, Answer | Finding) else None
         if mask is None:

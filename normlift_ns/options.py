@@ -66,7 +66,13 @@ _OPTIONS_BY_RANGE = {
     _at_least(2): ("test_every",),
     _at_least(3, 10**5): ("views",),
     _at_least(2000, 10**8): ("num_gaussians",),
-    OptionRange(0.0, 1.0, "in 0..1"): ("consensus_min_agreement", "min_reliability", "min_opacity", "purity"),
+    OptionRange(0.0, 1.0, "in 0..1"): (
+        "consensus_min_agreement",
+        "min_labeled",
+        "min_reliability",
+        "min_opacity",
+        "purity",
+    ),
     OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
     OptionRange(0.0, _MAX_FLOAT, "not negative"): (
         "delta",
@@ -98,7 +104,7 @@ def named_as_flags() -> Iterator[None]:
         _show_flags.reset(token)
 
 
-VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "prior")}
+VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "min_labeled", "prior")}
 """Command-line names of the fields of `RefineConfig`."""
 
 
@@ -189,7 +195,7 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
     """Return the renamed flags of an options dataclass and its groups, as a dictionary from old to new flags.
 
     Args:
-        prefix: Prefix of the flags. With another prefix than "--", the flags of `RefineConfig` have no old names.
+        prefix: Prefix of the flags. With a prefix other than "--", the flags of `RefineConfig` have no old names.
     """
     names = VOTE_FLAGS if options is RefineConfig and prefix == "--" else getattr(options, "old_names", {})
     flags = {f"{prefix}{old}".replace("_", "-"): f"{prefix}{new}".replace("_", "-") for old, new in names.items()}
@@ -377,7 +383,7 @@ def check_path(name: str, value: object) -> Path:
         name: Name of the option, for messages.
         value: The string or path.
     Raises:
-        InputError: The value has another type, or contains NUL or a character that the file system cannot encode.
+        InputError: The value has the wrong type, or contains NUL or a character that the file system cannot encode.
         PathError: A name is too long, the path leads through a file, or its links form a loop.
 
     >>> check_path("data", "fox").name
@@ -441,6 +447,7 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
+ReliabilityKind = Literal["paper", "pairs", "angular"]
 """Weighting of a Gaussian's own evidence against that of its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
@@ -593,8 +600,8 @@ class SplatOptions:
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    the cfg.yml or cfg.json of gsplat's trainer says so, a PLY file has two scales, or the file name contains 2dgs;
-    otherwise 3dgs."""
+    gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs; otherwise
+    3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
     Inria's trainer, else black."""
@@ -612,11 +619,12 @@ class VoteParameters(NamedTuple):
     tau: float
     gamma: float
     delta: float
+    min_labeled: float
 
 
 VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
-    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
-    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
+    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0, min_labeled=0.2),
+    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0, min_labeled=0.0),
 }
 """Default parameters of each kind of vote. The help texts of `RefineConfig` repeat them."""
 
@@ -647,13 +655,18 @@ class RefineConfig(CheckedOptions):
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
     """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
-    directions. None: 0.9 for posterior, 0.95 for paper."""
+    directions. None: for posterior, measured on neighbors that share their regions after a consensus, otherwise 0.9;
+    0.95 for paper."""
     gamma: float | None = None
     """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
-    and different directions. None: 0.05 for posterior, 0.4 for paper."""
+    and different directions. None: for posterior, (1 - tau) / 2 with a measured tau, otherwise 0.05; 0.4 for paper."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
+    min_labeled: float | None = None
+    """Share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. With larger values,
+    objects without a mask take fewer directions from their neighbors. Gaussians that no view shows may always change.
+    None: 0.2 for posterior, 0 for paper."""
     prior: float = 4.0
     """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
     overrule Gaussians with more views."""
@@ -692,6 +705,9 @@ class LiftOptions(CheckedOptions):
     reliability_beta: float = 1.0
     """Strength of the prior in the reliability, in virtual views, >= 0. Larger values lower the reliability of
     Gaussians with few views."""
+    reliability: ReliabilityKind = "paper"
+    """Reliability R to store. paper: equation 8 of the paper. pairs: agreement of pairs of views, so that a Gaussian of
+    one view is not reliable. angular: the same, but views from nearby count less. The vote always uses the paper's."""
     unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""
@@ -706,10 +722,13 @@ class LiftOptions(CheckedOptions):
     consensus_sample: int = 50
     """Maximum number of Gaussians that the consensus samples in each region, at least 1. Larger values are more exact
     and slower. Needs --consensus True."""
-    consensus_min_agreement: float = 0.4
+    consensus_min_agreement: float | None = None
     """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
-    may be random. Larger values disable the consensus in more scenes. Use 0 if each mask shows one object, even
-    roughly. Needs --consensus True."""
+    may be random. Larger values disable the consensus in more scenes. Use 0 if each region shows one object, even
+    roughly. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus True."""
+    recognition: bool = True
+    """Report how well the lift recognizes regions of views that were left out: half of the views, then the other half.
+    This compares captures, encoders and settings without labels. It does not change the result and costs seconds."""
     refine: bool = True
     """Repair directions by a vote among neighboring Gaussians. Each Gaussian copies the direction that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)
@@ -733,7 +752,7 @@ class LiftOptions(CheckedOptions):
     """Reuse cached 2D features and evidence of earlier lifts if their inputs are the same."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state. Configs of version 0.1 name `storage` `form` and have no consensus."""
+        """Restore the state. Configs of version 0.1 have the name `form` for `storage`, and no consensus."""
         options = {"storage" if name == "form" else name: value for name, value in state.items()}
         vars(self).update({"consensus": False, **options})
 

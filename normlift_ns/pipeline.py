@@ -14,19 +14,32 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.consensus import SAMPLING_SEED, Consensus, consensus, with_original_reliability
+from normlift_ns.core.consensus import (
+    CHANCE_AGREEMENT,
+    SAMPLING_SEED,
+    Consensus,
+    consensus,
+    hash_to_unit,
+    sample_gaussians,
+    with_original_reliability,
+)
+from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.independence import independent_views, pair_reliability
+from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import clamp_k, refine, unsupported
+from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import check_unique_stems
@@ -39,16 +52,19 @@ from normlift_ns.evidence_collection import (
     ViewObservations,
     sample_evenly,
 )
-from normlift_ns.options import (
-    LiftOptions,
-    RefineConfig,
-)
+from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
+CHANGED_COSINE = 0.98
+"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+_OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
+"""Kinds of regions that are objects or parts of them."""
+_COMPARED = 20_000
+"""Approximate number of Gaussians whose directions are compared before and after the vote."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
 
 
@@ -57,7 +73,8 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Duration of each stage, in order: features, evidence, consensus (if enabled), lift, neighbors, vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus and recognition (if enabled), lift, neighbors,
+    vote, store."""
 
 
 def lift_scene(
@@ -77,7 +94,7 @@ def lift_scene(
         cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: device for rasterizing, lifting and voting.
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
-        export: folder to also write the 2D features to, as LangSplat files. If None, do not write them.
+        export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
@@ -94,17 +111,23 @@ def lift_scene(
             agreed = consensus(views.evidence, table, level=views.level, **consensus_options(options))
             step()
         table, facts = agreed.features, consensus_facts(options, agreed)
+    if options.recognition:
+        with stages("recognition") as step:
+            facts |= recognition_facts(views, options)
+            step()
     with stages("lift") as step:
         lifted, own = lift_features(views, table, options)
         check_directions(count_directions(lifted), len(means), source)
         step()
     copied = None
     if options.refine:
-        copied, vote_facts = vote_directions(means, lifted, own, options.vote, stages)
+        level = views.level if measures_gate(options, facts) else None
+        copied, options, vote_facts = vote_directions(means, lifted, own, options, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
+        lifted = with_stored_reliability(lifted, means, collection)
         statistics = lift_statistics(collection, views, lifted.scalars.reliability, facts)
-        provenance = lift_provenance(collection, encoder, statistics)
+        provenance = lift_provenance(collection, options, encoder, statistics)
         field = SemanticField.build(
             lifted, means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
         )
@@ -135,6 +158,8 @@ def plan_collection(
     """
     gaussians, names = scene.gaussians.to(device), scene.train.names
     options = replace(options, vote=clamp_k(options.vote, len(gaussians))) if options.refine else options
+    if options.consensus:
+        options = replace(options, consensus_min_agreement=min_agreement(options, source.identity))
     config = choose_raster_config(scene, gaussians, options)
     available = set(source.available(names))
     usable = [index for index, name in enumerate(names) if name in available]
@@ -163,9 +188,23 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
     return replace(config, backend=resolve_backend(gaussians, **config.options))
 
 
+def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingProxyType({})) -> float:
+    """Return the agreement up to which the consensus leaves features unchanged.
+
+    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may not.
+
+    Args:
+        features: identity of the source of 2D features, as in the manifest.
+    """
+    if options.consensus_min_agreement is not None:
+        return options.consensus_min_agreement
+    kind = features.get("regions", features).get("kind")
+    return 0.0 if kind in _OBJECT_REGIONS else CHANCE_AGREEMENT
+
+
 def consensus_options(options: LiftOptions) -> dict[str, Any]:
     """Return the keyword arguments for `consensus`."""
-    least = options.consensus_min_agreement
+    least = min_agreement(options)
     return {"power": options.consensus_power, "sample": options.consensus_sample, "least": least}
 
 
@@ -173,6 +212,23 @@ def consensus_facts(options: LiftOptions, result: Consensus) -> dict[str, Any]:
     """Return the manifest entry for the consensus."""
     facts = {"seed": SAMPLING_SEED, "gaussians": result.gaussians, "agreement": result.agreement}
     return {"consensus": {**consensus_options(options), **facts}}
+
+
+def recognition_facts(
+    views: ViewObservations, options: LiftOptions, sample: tuple[Evidence, Float64[Tensor, " m"]] | None = None
+) -> dict[str, Any]:
+    """Return the manifest entry for the recognition of regions in left-out views.
+
+    Args:
+        sample: evidence and sampling probabilities of the Gaussians from `sample_gaussians` (default: sample them).
+    """
+    if sample is None:
+        rows, size = views.evidence.rows, views.evidence.num_regions
+        chosen, probability = sample_gaussians(rows, size, options.consensus_sample)
+        sample = views.evidence.select_gaussians(chosen), probability
+    least = min_agreement(options) if options.consensus else None
+    found = leave_views_out(*sample, views.features, level=views.level, power=options.consensus_power, least=least)
+    return {"recognition": found.facts}
 
 
 def lift_features(
@@ -193,6 +249,26 @@ def lift_features(
         own = torch.where(lifted.scalars.norm > 0, before.own_evidence, 0.0)
         lifted = replace(lifted, scalars=with_original_reliability(lifted.scalars, before))
     return lifted, own
+
+
+def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collection: EvidenceCollection) -> Lifted:
+    """Replace the paper's R by the kind of R to store.
+
+    Args:
+        lifted: lift with the paper's R of the features before the consensus.
+        means: centers of its Gaussians.
+    """
+    kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
+    if kind == "paper":
+        return lifted
+    views = scalars.n_eff.double()
+    norm = torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
+    if kind == "angular":
+        cameras = (collection.scene.train.cameras[index] for index in collection.views)
+        centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])
+        views = independent_views(lifted.evidence.view_weights(), means, centers.to(means.device))
+    value = pair_reliability(norm, views, beta).to(scalars.reliability)
+    return replace(lifted, scalars=replace(scalars, reliability=value))
 
 
 def count_directions(lifted: Lifted) -> Int64[Tensor, " 2"]:
@@ -239,40 +315,96 @@ def _describe(source: FeatureSource) -> str:
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
+def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
+    """Return whether the vote measures its gate: a posterior vote without --vote-tau, after a consensus that was on.
+
+    Args:
+        facts: `consensus_facts`, if the consensus is enabled.
+    """
+    agreement = facts["consensus"]["agreement"] if "consensus" in facts else []
+    changed = any(x > min_agreement(options) for x in agreement)
+    return changed and options.vote.vote == "posterior" and options.vote.tau is None
+
+
+def with_gate(options: LiftOptions, cosines: Float64[Tensor, " q"] | None) -> tuple[LiftOptions, dict[str, Any]]:
+    """Resolve the gate of the vote, and return it for the manifest if it was measured.
+
+    Args:
+        cosines: cosines of all processes from `shared_region_cosines`, or None for the gate of the options.
+    """
+    gate = None if cosines is None else relative_gate(cosines)
+    if cosines is None or gate is None:
+        return replace(options, vote=replace(options.vote, **options.vote.numbers._asdict())), {}
+    tau, gamma = gate
+    gamma = gamma if options.vote.gamma is None else options.vote.gamma
+    facts = {"gate": {"tau": tau, "gamma": gamma, "pairs": len(cosines)}}
+    return replace(options, vote=replace(options.vote, tau=tau, gamma=gamma)), facts
+
+
 def vote_directions(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
     own: Float[Tensor, " n"],
-    config: RefineConfig,
+    options: LiftOptions,
     stages: StageTimer,
-) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
+    *,
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Int32[Tensor, " n"], LiftOptions, dict[str, Any]]:
     """Let neighboring Gaussians vote on their directions.
 
+    Args:
+        level: level of every region, to measure the gate (default: the gate of the options).
     Returns:
-        For every Gaussian, the index of the Gaussian whose direction it takes. Also the shares of Gaussians that
-        change their direction, and of those without support.
+        For every Gaussian, the index of the Gaussian whose direction it takes. Also the options with all numbers of the
+        vote, and the gate and the counts for the manifest.
     """
     reliability, n = lifted.scalars.reliability, len(means)
+    gaussians = torch.arange(n, device=means.device)
     with stages("neighbors", n):
-        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.report, "neighbors"))
+        neighbors = nearest_neighbors(means, options.vote.k, progress=partial(stages.report, "neighbors"))
     with stages("vote", n):
+        cosines = None
+        if level is not None:
+            cosines = shared_region_cosines(lifted, *sample_pairs(gaussians, neighbors.index, n), level)
+        options, facts = with_gate(options, cosines)
         progress = partial(stages.report, "vote")
-        copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress)
-        counts = count_votes(copied, torch.arange(n, device=means.device), neighbors, reliability)
-    return copied, vote_shares(counts, n)
+        copied = refine(
+            means, lifted.directions, reliability, options.vote,
+            own=own, labeled=labeled_share(lifted.evidence), neighbors=neighbors, progress=progress,
+        )  # fmt: skip
+        changed = count_changes(lifted, copied.long(), gaussians, n)
+        copied = copied if int(changed[0]) > 0 else gaussians.int()  # a vote that changes nothing stores nothing
+        counts = count_votes(copied, gaussians, neighbors, reliability)
+    return copied, options, facts | vote_shares(counts, changed, n)
+
+
+def count_changes(
+    lifted: Lifted, source: Int64[Tensor, " m"], gaussians: Int64[Tensor, " m"], n: int
+) -> Int64[Tensor, " 2"]:
+    """Return the number of sampled Gaussians whose direction changes by more than `CHANGED_COSINE`, and of all sampled.
+
+    Args:
+        source: rows in the lift of the Gaussians whose directions the first m Gaussians take.
+        gaussians: indices of the first m Gaussians among all n, which decide whether they are sampled.
+    """
+    row = (hash_to_unit(gaussians) < min(1.0, _COMPARED / max(1, n))).nonzero().squeeze(1)
+    copies = row[source[row] != row]
+    cosine = (lifted.directions(copies) * lifted.directions(source[copies])).sum(dim=1)
+    return torch.stack([(cosine < CHANGED_COSINE).sum(), row.new_tensor(len(row))])
 
 
 def count_votes(
     copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
 ) -> Int64[Tensor, " 2"]:
-    """Return the number of Gaussians that changed their direction, and the number without support."""
+    """Return the number of Gaussians that copied another direction, and the number without support."""
     return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
 
 
-def vote_shares(counts: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
-    """Return the counts from `count_votes` as shares of n Gaussians, for the manifest."""
-    changed, lost = counts.tolist()
-    return {"refined_share": changed / n, "unsupported_share": lost / n}
+def vote_shares(counts: Int64[Tensor, " 2"], changed: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
+    """Return the counts from `count_votes` and `count_changes` as shares of n Gaussians, for the manifest."""
+    (copied, lost), (turned, sampled) = counts.tolist(), changed.tolist()
+    shares = {"refined_share": copied / n, "changed_share": turned / max(1, sampled)}
+    return {**shares, "unsupported_share": lost / n}
 
 
 def lift_statistics(
@@ -302,9 +434,13 @@ def lift_statistics(
 
 
 def lift_provenance(
-    collection: EvidenceCollection, encoder: Mapping[str, Any], statistics: Mapping[str, Any]
+    collection: EvidenceCollection, options: LiftOptions, encoder: Mapping[str, Any], statistics: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the metadata of a lift for the manifest."""
+    """Return the metadata of a lift for the manifest.
+
+    Args:
+        options: options with the gate that the vote used.
+    """
     scene, config = collection.scene, collection.config
     return {
         **scene.identity,
@@ -312,7 +448,7 @@ def lift_provenance(
         "cameras": camera_summary(scene.train.cameras),
         "cameras_held_out": camera_summary(scene.held_out.cameras),
         "features": collection.source.identity,
-        "options": asdict(collection.options),
+        "options": asdict(options),
         "views_lifted": [scene.train.names[index] for index in collection.views],
         "views_without_features": list(collection.missing),
         "gsplat_rules": config.gsplat_version,

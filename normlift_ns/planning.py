@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -40,7 +40,7 @@ from normlift_ns.encoders.open_clip import has_local_clip_weights
 from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.weights import find_local_sam
 from normlift_ns.io.memory import free_memory
-from normlift_ns.io.run_dir import cache_folder, run_directory
+from normlift_ns.io.run_dir import FIELD_FOLDER, MANIFEST_FILE, cache_folder, read_manifest, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
 from normlift_ns.progress import StageTimer, peak_gib
 from normlift_ns.segmentation.registry import resolve_source
@@ -170,7 +170,7 @@ class Plan:
 def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
     """Estimate the cost of a lift.
 
-    The devices share the views and the Gaussians. The steps before the views, loading and writing are not shared.
+    The devices share the work on views and Gaussians, but not the preparation, the loading of networks and the writing.
 
     Args:
         num_devices: number of processes that share the work, each with its own device; at least 1.
@@ -282,11 +282,17 @@ def measure_core(
         if options.consensus:
             with stages("consensus"):
                 agreed = consensus(observed.evidence, table, **pipeline.consensus_options(options)).features
+        if options.recognition:
+            with stages("recognition"):
+                pipeline.recognition_facts(observed, options)
         with stages("lift"):
             lifted, own = pipeline.lift_features(observed, agreed, options)
         if options.refine:
             vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
-            copied, _ = pipeline.vote_directions(means, lifted, own, vote, stages)
+            voted = replace(options, vote=vote)
+            copied, _, _ = pipeline.vote_directions(
+                means, lifted, own, voted, stages, level=level if options.consensus else None
+            )
         with stages("store"):
             field = SemanticField.build(lifted, means, copied, tolerance=options.tolerance, storage=options.storage)
         stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
@@ -295,7 +301,8 @@ def measure_core(
     # The first two measurements only load or compile kernels for these sizes.
     _, _, (small, few, few_bytes), (large, many, many_bytes) = map(costs, 2 * (most // _SAMPLE_RATIO, most))
     counts = _items(evidence, times, len(gaussians), options)
-    counts |= {"consensus": counts["consensus"] * factor**2, "lift": counts["lift"] * factor}
+    for name, power in (("consensus", 2), ("recognition", 2), ("lift", 1)):
+        counts[name] *= factor**power
     rates = {name: _rate((few[name], small[name]), (many[name], large[name]), counts[name]) for name in small}
     return rates, _rate((few["store"], few_bytes), (many["store"], many_bytes), counts["store"])
 
@@ -311,13 +318,13 @@ def _rate(small: tuple[float, float], large: tuple[float, float], count: float) 
 def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:
     """Count the items of each stage.
 
-    The items are sampled Gaussians in all regions for the consensus, evidence entries for the lift, and Gaussians for
-    the other stages.
+    The items are sampled Gaussians in all regions for the consensus and the recognition, evidence entries for the lift,
+    and Gaussians for the other stages.
     """
     per_region = torch.bincount(evidence.rows.column.long(), minlength=evidence.num_regions)
     sampled = float(per_region.clamp(max=options.consensus_sample).sum()) * times
     others = dict.fromkeys(("neighbors", "vote", "store"), float(gaussians))
-    return {"consensus": sampled, "lift": float(evidence.nnz * times), **others}
+    return {"consensus": sampled, "recognition": sampled, "lift": float(evidence.nnz * times), **others}
 
 
 DiagnosticState = Literal["ok", "warning", "error"]
@@ -363,6 +370,36 @@ def diagnose_cameras(warning: str | None) -> Diagnostic:
     """Return the diagnostic for the warning of `compare_cameras`, which is None if images and renders match."""
     match = "three images match renders from their cameras"
     return Diagnostic("cameras", "ok" if warning is None else "warning", warning or match)
+
+
+def describe_recognition(facts: Mapping[str, Any]) -> str:
+    """Describe how well the lift recognizes regions in views that were left out, from the manifest.
+
+    >>> describe_recognition({"recognized": 812, "confirmed": 1024, "agreement": 0.71})
+    'recognized 812 of 1,024 regions in views that were left out; agreement 0.71'
+    >>> describe_recognition({"recognized": 0, "confirmed": 0, "agreement": None})
+    'no region was seen alike in other views'
+    """
+    if facts["confirmed"] == 0:
+        return "no region was seen alike in other views"
+    counts = f"recognized {facts['recognized']:,} of {facts['confirmed']:,} regions in views that were left out"
+    return f"{counts}; agreement {facts['agreement']:.2f}"
+
+
+def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
+    """Report how well the first lifted run among some folders recognizes left-out views, from its manifest.
+
+    Args:
+        run_dirs: folders that may hold a lifted run.
+    """
+    for run_dir in run_dirs:
+        if (run_dir / FIELD_FOLDER / MANIFEST_FILE).is_file():
+            facts = read_manifest(run_dir / FIELD_FOLDER)[0].get("statistics", {}).get("recognition")
+            if facts is None:
+                advice = "lift again to measure how well it recognizes views that were left out"
+                return [Diagnostic("lifted run", "ok", str(run_dir), advice)]
+            return [Diagnostic("lifted run", "ok", describe_recognition(facts))]
+    return []
 
 
 def diagnose_device(device: str) -> Diagnostic:

@@ -65,7 +65,7 @@ def results(candidates: Sequence[Candidate], lifted: Lifted, voters: Voters, cla
     sources: dict[Candidate, list[Tensor]] = {one: [] for some in gates.values() for one in some}
     averaged: dict[Candidate, list[Tensor]] = {one: [] for one in candidates if one.vote == "linear"}
     if len(sources) + len(averaged) > 0:
-        for part in _parts(lifted, voters, cosines=len(sources) > 0):
+        for part in parts(lifted, voters, cosines=len(sources) > 0):
             for (tau, gamma), some in gates.items():
                 for one, source in zip(some, part.sources(some, tau, gamma), strict=True):
                     sources[one].append(source)
@@ -118,12 +118,12 @@ class _Part:
 
     def sources(self, candidates: Sequence[Candidate], tau: float, gamma: float) -> list[Tensor]:
         """[m] whose direction every voter takes by each candidate, as `refine` finds it."""
-        terms = [self._terms(one) for one in candidates]
+        terms = [self.terms(one) for one in candidates]
         gate = torch.sigmoid((self.gram.float() - tau) / gamma)
         agreed = torch.bmm(gate, torch.stack([weight.float() for _, weight, _ in terms], dim=2))
         return [self._winners(r, agreed[:, :, i], margin) for i, (r, _, margin) in enumerate(terms)]
 
-    def _terms(self, one: Candidate) -> tuple[Tensor, Tensor, Tensor | float]:
+    def terms(self, one: Candidate) -> tuple[Tensor, Tensor, Tensor | float]:
         """R and weights [m, K + 1], and the margin that the best neighbour must win by."""
         r, square = self.reliability(one.vote), (self.distance / one.sigma_d) ** 2
         if one.vote != "posterior":
@@ -156,7 +156,7 @@ def _decay(r: Tensor, square: Tensor) -> Tensor:
     return torch.exp(-0.5 * (square - nearest).nan_to_num(0, posinf=torch.inf).clamp(min=0))
 
 
-def _parts(lifted: Lifted, voters: Voters, *, cosines: bool) -> Iterator[_Part]:
+def parts(lifted: Lifted, voters: Voters, *, cosines: bool) -> Iterator[_Part]:
     numbers, kind = lifted.scalars, voters.group.device.type
     half = kind == "cuda"
     everyone = lifted.directions(dtype=torch.float16) if half and cosines else None

@@ -72,7 +72,7 @@ class Site:
         if settings.voters is not None:
             kept = voters.group[voters.group >= 0].unique()
             voters = renumbered(voters, kept)
-        self.voters = voters
+        self.voters, self.kept = voters, kept
         if place.kind == "masks":
             self.cut: Pieces | None = None
             self._whole = whole

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from normlift_ns import Camera, Evidence, GaussianScene, RefineConfig, lift, rasterize_evidence
+from normlift_ns import Camera, Evidence, GaussianScene, LiftOptions, lift, rasterize_evidence
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.partition import Partition
 from normlift_ns.distributed.communicator import EvidenceShard, TorchCommunicator, redistribute_evidence
@@ -105,7 +105,7 @@ def core_alone(case: Case, device: str) -> Found:
     clock.lap("exchange")
     lifted = lift(evidence, case.table)
     clock.lap("lift")
-    copied, _ = vote_directions(case.scene.means, lifted, lifted.scalars.own_evidence, RefineConfig(), stages)
+    copied, _, _ = vote_directions(case.scene.means, lifted, lifted.scalars.own_evidence, LiftOptions(), stages)
     clock.lap("vote")
     return Found(lifted.scalars, copied, {**clock.seconds, "neighbors": stages.seconds["neighbors"]}, evidence)
 
@@ -127,7 +127,7 @@ def core(team: TorchCommunicator, case: Case, folder: Path, device: str) -> Foun
     clock.lap("lift")
     own = lifted.scalars.own_evidence
     stages = StageTimer(lambda stage, done, total: None)
-    copied, _ = vote_distributed(case.scene.means, lifted, own, RefineConfig(), portion, stages)
+    copied, _, _ = vote_distributed(case.scene.means, lifted, own, LiftOptions(), portion, stages)
     clock.lap("vote")
     clock.seconds |= {name: stages.seconds[name] for name in ("neighbors",)}
     return Found(lifted.scalars.map(portion.all_gather), portion.all_gather(copied), clock.seconds, evidence)

@@ -1,11 +1,12 @@
-"""How long ns-normlift-view takes: from its start to its page, and from pressing Ask to the answer.
+"""Times and sizes of ns-normlift-view: of its start, of its page in Chromium, of an answer and of a query over HTTP.
 
+    python -m research.view               lifts the fox capture first
     python -m research.view --load-config outputs/room/normlift/demo/config.yml
 
-`python -m research.latency` measures the same on the fox capture. The answer is timed by a client that speaks the
-protocol of sessions, from the press to the last byte of the colors, least of 8 prompts after a first one (which loads
-the text encoder). With Chromium installed, press_to_picture is timed in it until the picture changes; its unit names
-what drew.
+Chromium draws in software (SwiftShader) on the cores that the server uses too, in a window of 1300 x 800 pixels. Each
+load is that of a new browser, without anything in its cache. A press is Enter in the search box; the text encoder is
+loaded already. A frame counts once WebGL has finished it. The page draws a slow frame without outlines first, and adds
+them when it rests; both times are measured. Client programs speak the protocol of sessions, or HTTP.
 """
 
 from __future__ import annotations
@@ -15,34 +16,82 @@ import json
 import os
 import shutil
 import socket
+import statistics
 import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from http.client import HTTPConnection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.request import urlopen
 
+import torch
 from websockets.sync.client import ClientConnection, connect
 
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.spz import encode_spz
+from normlift_ns.server.app import PAGE_FOLDER
 from research.report import RESULTS, Report
-from tests.captures import SHARED
+from tests.browser.page import CALM
+from tests.browser.person import chromium
+from tests.captures import SHARED, trained_state
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 PATIENCE = 180
 """Seconds."""
 COLOURS = ("orange", "crimson", "teal", "purple", "dark green", "sky blue", "yellow", "brown", "grey")
+BUNDLE = PAGE_FOLDER / "assets"
+REPEATS, SIZE = 5, (1300, 800)
+NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 _PROGRAM = "from normlift_ns.cli.start import view; view()"
-_FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+_FULL = "performance.getEntriesByName('picture').length > 0"
+_PICTURES = """() => {
+  const start = performance.getEntriesByName("press")[0]?.startTime ?? 0, outlined = performance.now() - start;
+  const of = (...names) => performance.getEntriesByType("measure").find(({name}) => names.includes(name))?.duration;
+  return {colors: of("colors"), first: of("coarse", "picture"), full: of("picture"), outlined};
+}"""
+"""Milliseconds since the page was opened, or since a press: the page measures them."""
+_RENDERER = """() => {
+  const gl = page.scene.renderer.getContext(), info = gl.getExtension("WEBGL_debug_renderer_info");
+  return gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+}"""
+
+
+@dataclass(frozen=True)
+class ViewServer:
+    """A viewer of a run in a process of its own."""
+
+    process: subprocess.Popen[str]
+    port: int
+    start_seconds: float
+    """Seconds until it said that the page can be opened."""
+
+    def worked(self) -> float:
+        """Seconds that processors have worked for it."""
+        ticks = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+        return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+
+    def resident(self) -> int:
+        """Bytes of memory that it holds."""
+        pages = Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+    def run(self) -> str:
+        """The id of its run."""
+        with urlopen(f"http://127.0.0.1:{self.port}/api/runs") as answer:
+            return json.load(answer)["runs"][0]["id"]
 
 
 @contextmanager
-def served(config: Path) -> Iterator[tuple[int, float, Callable[[], tuple[float, float]]]]:
-    """The port of a viewer of a run, the seconds until it said so, and what tells the seconds since its start and those
-    that processors have worked for it.
-    """
+def served(config: Path) -> Iterator[ViewServer]:
+    """A viewer of a run, which is stopped afterwards."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -54,13 +103,7 @@ def served(config: Path) -> Iterator[tuple[int, float, Callable[[], tuple[float,
         said = next((line for line in process.stdout if f":{port}" in line), None)
         if said is None:
             raise RuntimeError(f"the viewer of {config} did not start")
-        said_at = time.perf_counter() - start
-
-        def spent() -> tuple[float, float]:
-            ticks = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-            return time.perf_counter() - start, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
-
-        yield port, said_at, spent
+        yield ViewServer(process, port, time.perf_counter() - start)
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -105,63 +148,140 @@ class Client:
         return time.perf_counter() - start, self.bytes
 
 
-def pictured(port: int, prompts: Sequence[str]) -> tuple[float, str]:
-    """Seconds from the press in Chromium until the picture changes, least of some, and the renderer's name."""
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+def seconds_to_load(port: int) -> tuple[float, float]:
+    """Seconds from opening the page in a new browser until it shows the scene, coarse and at full resolution."""
+    with chromium() as browser:
+        page = opened(browser, port)
+        until(page, _FULL)
+        times = page.evaluate(_PICTURES)
+    return times["first"] / 1e3, times["full"] / 1e3
 
-    box: Any = {"x": 0, "y": 0, "width": 320, "height": 480}
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=_FLAGS)
-        page = browser.new_page(viewport={"width": 640, "height": 480})
-        page.set_default_timeout(1e3 * PATIENCE)  # drawn in software a large scene takes seconds
-        page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
-        box_of_prompts = page.get_by_role("searchbox")
-        box_of_prompts.wait_for()
-        page.wait_for_timeout(5000)
-        name = page.evaluate(
-            "() => { const gl = document.createElement('canvas').getContext('webgl2');"
-            "const e = gl.getExtension('WEBGL_debug_renderer_info');"
-            "return gl.getParameter(e ? e.UNMASKED_RENDERER_WEBGL : gl.RENDERER); }"
-        )
-        seconds = []
-        for prompt in prompts[:4]:
-            box_of_prompts.fill(prompt)
-            page.wait_for_timeout(3000)
-            before, start = page.screenshot(clip=box), time.perf_counter()
-            box_of_prompts.press("Enter")
-            while page.screenshot(clip=box) == before and time.perf_counter() - start < PATIENCE:
-                pass
-            seconds.append(time.perf_counter() - start)
-            page.wait_for_timeout(3000)
-        browser.close()
-    return min(seconds[1:]), name
+
+def until(page: Page, expression: str) -> None:
+    """Waits until an expression holds in the page, whose policy for scripts forbids Playwright's own way to wait."""
+    deadline = time.monotonic() + PATIENCE
+    while not page.evaluate(expression):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{expression}: never")
+        time.sleep(0.2)  # to look takes time from the renderer
+
+
+def opened(browser: Browser, port: int) -> Page:
+    """The page in a tab of its own."""
+    page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+    page.set_default_timeout(1e3 * PATIENCE)  # software WebGL takes seconds per frame of a large scene
+    page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
+    return page
+
+
+class PressTimes(NamedTuple):
+    """Seconds from each press of Enter."""
+
+    colors: list[float]
+    """Until the colors are handed to WebGL."""
+    first: list[float]
+    """Until the first changed picture is drawn."""
+    full: list[float]
+    """Until the picture at full resolution is drawn."""
+    outlined: list[float]
+    """Until the picture has its outline too."""
+    untouched: list[float]
+    """Duration of a frame at full resolution without any change."""
+    renderer: str
+
+
+def pressed(port: int, prompts: Sequence[str]) -> PressTimes:
+    """Times in Chromium of all prompts but the first."""
+    found: list[dict[str, float]] = []
+    with chromium() as browser:
+        page = opened(browser, port)
+        until(page, f"Boolean(window.page) && ({CALM})()")
+        box = page.get_by_role("searchbox")
+        for prompt in prompts:
+            box.fill(prompt)
+            page.evaluate("performance.clearMarks(), performance.clearMeasures()")
+            box.press("Enter")
+            until(page, f"{_FULL} && ({CALM})()")
+            found.append(page.evaluate(_PICTURES))
+            page.wait_for_timeout(1500)
+        untouched = [page.evaluate("page.scene.render(true)") for _ in range(6)]
+        name = page.evaluate(_RENDERER)
+    columns = ([one[kind] / 1e3 for one in found[1:]] for kind in ("colors", "first", "full", "outlined"))
+    return PressTimes(*columns, [one / 1e3 for one in untouched[1:]], name)
+
+
+def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:
+    """Seconds of some queries over one HTTP connection, after a first one."""
+    line, seconds = HTTPConnection("127.0.0.1", port, timeout=PATIENCE), []
+    body = json.dumps({"texts": [prompt], "arrays": arrays})
+    for _ in range(51):
+        start = time.perf_counter()
+        line.request("POST", f"/api/runs/{run}/query", body)
+        answer = line.getresponse()
+        content = answer.read()
+        seconds.append(time.perf_counter() - start)
+        if answer.status != 200:
+            raise RuntimeError(f"status {answer.status}: {content[:200]!r}")
+    line.close()
+    return seconds[1:]
+
+
+def million_bytes() -> int:
+    """Bytes of 1,000,000 Gaussians of SH degree 3 as the page gets them: rows of the castle capture in random order,
+    moved a little, with coefficients of degrees 2 and 3 drawn from those of degree 1, which is more than in real scenes.
+    """
+    splat, g = trained_state("castle"), torch.Generator().manual_seed(0)
+    rows, others = torch.randint(0, len(splat["gauss_params.means"]), (2, 5_000_000), generator=g)
+    values = {name: splat[f"gauss_params.{name}"].detach().float()[rows[:1_000_000]] for name in NAMES}
+    values["means"] += 0.01 * torch.randn(values["means"].shape, generator=g)
+    drawn = splat["gauss_params.features_rest"].detach().float()[others[:4_000_000]].reshape(1_000_000, 12, 3)
+    values["features_rest"] = torch.cat([values["features_rest"], drawn], dim=1)
+    return len(encode_spz(SplatParameters(**values)))
+
+
+def add_spread(report: Report, key: str, values: Sequence[float], unit: str) -> None:
+    """Adds the median as `key`, and the least and the most."""
+    report.add(key, statistics.median(values), f"{unit}, median of {len(values)}")
+    report.add(f"{key}.least", min(values), unit)
+    report.add(f"{key}.most", max(values), unit)
 
 
 def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, picture: bool = True) -> None:
-    """Adds view.*: of a lifted run.
+    """Adds the metrics of a lifted run.
 
     Args:
         picture: time Chromium too, which takes minutes for large scenes without a GPU.
     """
-    with served(config) as (port, seconds, spent):
-        report.add("view.start_s", seconds, "s until the page can be opened")
-        with urlopen(f"http://127.0.0.1:{port}/api/runs") as answer:
-            run = json.load(answer)["runs"][0]["id"]
+    start = time.perf_counter()
+    with served(config) as server:
+        report.add("start_s", server.start_seconds, "s until the page can be opened")
+        port, run = server.port, server.run()
         with connect(f"ws://127.0.0.1:{port}/api/runs/{run}/session", max_size=None) as line:
             client = Client(line)
-            shown, worked = spent()
-            report.add("view.drawn_s", shown, "s from the start until its Gaussians are in a page that is open")
-            report.add("view.drawn_cpu_s", worked, "s of processor time of the server until then")
+            shown = time.perf_counter() - start
+            report.add("drawn_s", shown, "s from the start until its Gaussians are in a page that is open")
+            report.add("drawn_cpu_s", server.worked(), "s of processor time of the server until then")
             client.ask(prompts[0])
             asked = [client.ask(prompt) for prompt in prompts[1:]]
-        report.add("view.drawn", client.drawn, "Gaussians")
-        report.add("view.press_to_bytes_s", min(x[0] for x in asked), "s")
-        report.add("view.bytes_per_answer", 1, "byte per drawn Gaussian")
+        report.add("drawn", client.drawn, "Gaussians")
+        add_spread(report, "press_to_bytes_s", [x[0] for x in asked], "s")
+        report.add("bytes_per_answer", 1, "byte per drawn Gaussian")
         rest = max(x[1] for x in asked) - client.drawn
-        report.add("view.other_bytes_per_answer", rest, "bytes of state and headers")
+        report.add("other_bytes_per_answer", rest, "bytes of state and headers")
+        for arrays in ("none", "safetensors"):
+            add_spread(report, f"http_{arrays}_s", known_prompt(port, run, prompts[0], arrays), "s")
+        with urlopen(f"http://127.0.0.1:{port}/api/runs/{run}/geometry") as answer:
+            report.add("geometry_bytes_per_gaussian", len(answer.read()) / client.drawn, "bytes")
+        report.add("bundle_bytes", sum(one.stat().st_size for one in BUNDLE.glob("*.gz")), "bytes, compressed")
         if picture and shutil.which("chromium"):
-            pressed, name = pictured(port, prompts)
-            report.add("view.press_to_picture_s", pressed, f"s, {name}")
+            loads = [seconds_to_load(port) for _ in range(REPEATS)]
+            add_spread(report, "load_coarse_s", [one for one, _ in loads], "s")
+            add_spread(report, "load_full_s", [one for _, one in loads], "s")
+            times = pressed(port, prompts)
+            for name, values in times._asdict().items():
+                if name != "renderer":
+                    key = "untouched_frame_s" if name == "untouched" else f"press_to_{name}_s"
+                    add_spread(report, key, values, f"s, {times.renderer}")
 
 
 def fox_run(folder: Path) -> Path:
@@ -176,12 +296,6 @@ def fox_run(folder: Path) -> Path:
     return run.config
 
 
-def add_fox_view(report: Report) -> None:
-    """Adds view.*: of the fox capture, drawn whole."""
-    with tempfile.TemporaryDirectory() as folder:
-        add_view(report, fox_run(Path(folder)))
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
@@ -190,8 +304,10 @@ if __name__ == "__main__":
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("view")
-    if arguments.load_config is None:
-        add_fox_view(found)
-    else:
-        add_view(found, arguments.load_config, arguments.prompts, picture=not arguments.no_picture)
+    with tempfile.TemporaryDirectory() as folder:
+        run = arguments.load_config or fox_run(Path(folder))
+        add_view(found, run, arguments.prompts, picture=not arguments.no_picture)
+    found.add(
+        "million_bytes", million_bytes(), "bytes of 1,000,000 Gaussians of SH degree 3 (castle, see the function)"
+    )
     found.write(arguments.output)

@@ -1,6 +1,7 @@
 """Distances of renders from the images' mean color, and the search for the world of a splat, on the captures.
 
     python -m research.worlds                     results/worlds.json
+    python -m research.worlds --processes 16      the same on 16 cores
     python -m research.worlds --quick             two worlds and four rotations of each capture
 
 The cameras of a capture are written in the world of its splat, which is right. Then the splat is turned and scaled by
@@ -15,12 +16,19 @@ ones; <capture>.<world>.found, .margin in the first world, .psnr in the found on
 from __future__ import annotations
 
 import argparse
+import atexit
+import os
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import cache
+from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from PIL import Image
@@ -56,8 +64,11 @@ TURNS = {
     "exchange": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
     "scale_2.5": 2.5 * np.eye(3),
     "scale_0.23": 0.23 * np.eye(3),
+    "scale_0.0137": 0.0137 * np.eye(3),
     "z_up_to_y_up_scale_100": 100 * _QUARTER,
 }
+Rows = list[tuple[str, float, str]]
+"""Keys, values and units of metrics."""
 _CONTRAST, _NOISE = 0.1, 2.0
 """Factor on the contrast of the pale capture, and standard deviation of its noise in levels of 255."""
 
@@ -138,47 +149,89 @@ def _first(case: Case, matrix: np.ndarray | None, options: dict[str, Any]) -> Al
     return measure_alignment(scene, explain=False)
 
 
-def measure(case: Case, report: Report, *, quick: bool) -> None:
-    """Add the figures of one capture."""
+def measure_right(case: Case) -> Rows:
+    """Return the figures of the right world, and of other focal lengths in it."""
     name = case.name
-    case.open()  # compiles kernels and reads the images
     scene, watch = case.open()
     match = measure_alignment(scene, explain=False)
     assert scene.identity["source_world"]["name"] == "the world of its cameras"
+    rows = [(f"{name}.right.seconds", watch.seconds, "s")]
     for key, value in (("margin", match.margin), ("psnr", match.psnr), ("mean_color", match.mean_color_psnr)):
-        report.add(f"{name}.right.{key}", value, "dB")
-    report.add(f"{name}.right.seconds", watch.seconds, "s")
-    wrong = []
-    for key, part, matrix, options in list(case.worlds())[:: 8 if quick else 1]:
-        first = _first(case, matrix, options)
-        scene, watch = case.open(matrix, **options)
-        world = scene.identity["source_world"]
-        found = scene.alignment is not None and part in world["name"] and _is_right(scene, case)
-        wrong.append(first.margin)
-        report.add(f"{name}.{key}.found", found, "of 1")
-        report.add(f"{name}.{key}.margin", first.margin, "dB")
-        report.add(f"{name}.{key}.psnr", measure_alignment(scene, explain=False).psnr, "dB")
-        report.add(f"{name}.{key}.seconds", watch.seconds, "s")
-        print(name, key, world["name"], found, f"{watch.seconds:.1f} s", flush=True)
-    taken, rotations, generator = 0, 4 if quick else ROTATIONS, np.random.default_rng(CAPTURES.index(name))
-    for number in range(rotations):
-        turn = Rotation.from_quat(generator.normal(size=4)).as_matrix()
-        frames = in_file_world(case.frames, _square(turn))
-        scene, watch = case.open(frames=frames)
-        taken += scene.alignment is not None
-        wrong.append(measure_alignment(scene, explain=False).margin)
-        print(name, "random", number, f"{wrong[-1]:.1f} dB, {watch.seconds:.1f} s, {taken} taken", flush=True)
-    report.add(f"{name}.wrong.margin", max(wrong), "dB")
-    report.add(f"{name}.random.rotations", rotations, "rotations")
-    report.add(f"{name}.random.taken", taken, "rotations")
+        rows.append((f"{name}.right.{key}", value, "dB"))
     for factor in FACTORS:
         lenses = [frame.intrinsics._replace(fx=factor * frame.intrinsics.fx, fy=factor * frame.intrinsics.fy)
                   for frame in case.frames]  # fmt: skip
         frames = [replace(frame, intrinsics=lens) for frame, lens in zip(case.frames, lenses)]
         scene, _ = case.open(frames=frames, world_transform=None)
         match = measure_alignment(scene, explain=False)
-        report.add(f"{name}.focal{factor}.psnr", match.psnr, "dB")
-        report.add(f"{name}.focal{factor}.margin", match.margin, "dB")
+        rows += [(f"{name}.focal{factor}.psnr", match.psnr, "dB"), (f"{name}.focal{factor}.margin", match.margin, "dB")]
+    return rows
+
+
+def measure_world(case: Case, number: int) -> Rows:
+    """Return the figures of one of `Case.worlds`."""
+    key, part, matrix, options = next(islice(case.worlds(), number, None))
+    first = _first(case, matrix, options)
+    scene, watch = case.open(matrix, **options)
+    world = scene.identity["source_world"]
+    found = scene.alignment is not None and part in world["name"] and _is_right(scene, case)
+    print(case.name, key, world["name"], found, f"{watch.seconds:.1f} s", flush=True)
+    name, psnr = f"{case.name}.{key}", measure_alignment(scene, explain=False).psnr
+    return [
+        (f"{name}.found", found, "of 1"),
+        (f"{name}.margin", first.margin, "dB"),
+        (f"{name}.psnr", psnr, "dB"),
+        (f"{name}.seconds", watch.seconds, "s"),
+    ]
+
+
+def measure_rotations(case: Case, numbers: range) -> Rows:
+    """Return for random rotations whether they are taken, and their margins."""
+    generator = np.random.default_rng(CAPTURES.index(case.name))
+    turns, rows = generator.normal(size=(ROTATIONS, 4)), []
+    for number in numbers:
+        turn = Rotation.from_quat(turns[number]).as_matrix()
+        scene, watch = case.open(frames=in_file_world(case.frames, _square(turn)))
+        taken, margin = scene.alignment is not None, measure_alignment(scene, explain=False).margin
+        print(case.name, "random", number, f"{margin:.1f} dB, {watch.seconds:.1f} s", "taken" * taken, flush=True)
+        rows += [(f"{case.name}.random{number}.taken", taken, ""), (f"{case.name}.random{number}.margin", margin, "dB")]
+    return rows
+
+
+def summarize(name: str, rows: Rows) -> Rows:
+    """Return the rows of a capture with one row for all random rotations, and with the largest wrong margin."""
+    kept = [row for row in rows if ".random" not in row[0]]
+    taken = [value for key, value, _ in rows if key.endswith(".taken")]
+    right = (f"{name}.right.", f"{name}.focal")
+    wrong = [value for key, value, _ in rows if key.endswith(".margin") and not key.startswith(right)]
+    return [
+        *kept,
+        (f"{name}.wrong.margin", max(wrong), "dB"),
+        (f"{name}.random.rotations", len(taken), "rotations"),
+        (f"{name}.random.taken", sum(taken), "rotations"),
+    ]
+
+
+def _limit_threads(count: int) -> None:
+    torch.set_num_threads(count)
+    numba.set_num_threads(count)
+
+
+@cache
+def _case(name: str) -> Case:
+    """Return the case of a capture, one in every process, with compiled kernels."""
+    folder = tempfile.TemporaryDirectory()
+    atexit.register(folder.cleanup)
+    case = Case(name, Path(folder.name))
+    case.open()
+    return case
+
+
+def _piece(name: str, part: int | range | None) -> Rows:
+    case = _case(name)
+    if part is None:
+        return measure_right(case)
+    return measure_world(case, part) if isinstance(part, int) else measure_rotations(case, part)
 
 
 def _is_right(scene: SplatScene, case: Case) -> bool:
@@ -194,15 +247,22 @@ def _is_right(scene: SplatScene, case: Case) -> bool:
 def main() -> None:
     """Measure all captures, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few worlds and rotations")
-    parser.add_argument("--captures", nargs="+", default=CAPTURES, help="names of captures")
+    parser.add_argument("--quick", action="store_true", help="two worlds and four rotations")
+    parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES, help="names of captures")
+    parser.add_argument("--processes", type=int, default=1, help="number of processes that share the cores")
     parser.add_argument("--name", default="worlds", help="name of the results")
     args = parser.parse_args()
-    torch.set_num_threads(2)
-    report = Report(args.name)
-    for name in args.captures:
-        with tempfile.TemporaryDirectory() as folder:
-            measure(Case(name, Path(folder)), report, quick=args.quick)
+    rotations, step = (4, 8) if args.quick else (ROTATIONS, 1)
+    report, found = Report(args.name), dict[str, list[Any]]()
+    threads = max(1, len(os.sched_getaffinity(0)) // args.processes)
+    with ProcessPoolExecutor(args.processes, get_context("spawn"), _limit_threads, (threads,)) as pool:
+        for name in args.captures:
+            count = len(TURNS) + (3 if name == "pale" else 4)
+            parts = [None, *range(0, count, step), *(range(i, i + 2) for i in range(0, rotations, 2))]
+            found[name] = [pool.submit(_piece, name, part) for part in parts]
+        for name, pieces in found.items():
+            for row in summarize(name, [row for piece in pieces for row in piece.result()]):
+                report.add(*row)
     report.write()
 
 

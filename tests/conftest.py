@@ -40,10 +40,20 @@ if not torch.cuda.is_available():  # Triton kernels run in its interpreter; Trit
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keeps research out of the default tiers."""
+    """Keeps research out of the default tiers; lets the first of several processes alone import nerfstudio.
+
+    Files that import it come first, then those that share runs; the other process begins in the middle of the list.
+    """
     for item in items:
         if "research" in item.path.parts:
             item.add_marker("extra")
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        needs = {name: {x.path for x in items if name in _fixtures(x)} for name in ("nerfstudio", "made_once")}
+        items.sort(key=lambda item: [item.path not in paths for paths in needs.values()])
+
+
+def _fixtures(item: pytest.Item) -> list[str]:
+    return getattr(item, "fixturenames", [])
 
 
 def pytest_collection_finish() -> None:

@@ -212,10 +212,6 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="color"), timestamp="a/b", device="cpu")
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
-    for config in (None, 5, [], {}, float("nan"), b"x"):
-        for opened in (nl.open_run, nl.open_scene):
-            with pytest.raises(nl.InputError, match="load_config must be a path"):
-                opened(config)
     wrong = {"precision": "x", "image_source": "x", "weight_power": 0, "storage": "zip", "unlabeled": "x"}
     for name, value in wrong.items():
         with pytest.raises(nl.InputError, match=f"{name} must be one of"):
@@ -260,34 +256,18 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
         run.ask(["red", "blue"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")
-    with pytest.raises(ValueError, match="contrast, cosine, lerf, margin, auto, got 'LERF'"):
-        run.ask("red", relevancy="LERF")  # type: ignore[arg-type]
-    for wrong in (
-        *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),
-        *({"threshold": value} for value in (float("nan"), "x", [1], 10**400, True)),
-        *({"refined": value} for value in ("yes", None, 1)),
-        *({"negatives": value} for value in (5, [1])),
-    ):
-        with pytest.raises(nl.InputError):
-            run.ask("red", **wrong)  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="min_reliability"):
+        run.ask("red", min_reliability=5.0)
     with pytest.raises(nl.InputError, match="valid characters"):
         run.ask("red\0")
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
-    for path, more in (
-        *((path, {}) for path in ("", "\0.ply", None, 5)),
-        *((tmp_path / "b.ply", {"objects": {"a": value}}) for value in (object(), float("nan"))),
-        *((tmp_path / "b.ply", {name: "False"}) for name in ("answer", "overwrite")),
-    ):
+    for value in (object(), float("nan")):
         with pytest.raises(nl.InputError):
-            run.export(path, **more)  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="got 'red'"):
-        run.save("red")  # type: ignore[arg-type]
+            run.export(tmp_path / "b.ply", objects={"a": value})
     assert list(tmp_path.iterdir()) == []
     assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
-    with pytest.raises(TypeError, match="found must be"):
-        run.render(0, "red")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r" 3 .* 343"):
         run.save(Query(("a",), torch.ones(1, 3)))
     stored = run.ask_stored()

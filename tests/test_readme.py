@@ -31,21 +31,15 @@ FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text("utf8")
 PAGE_NAMES = ("front_ends", "splats", "scale", "check", "viewer", "objects", "install", "files", "troubleshooting")
 PAGE_NAMES = (*PAGE_NAMES, "honest_answers", "python", "../README")
 TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
-OTHERS = {
-    "--app_opt",
-    "--auto-scale-poses",
-    "--center-method",
-    "--orientation-method",
-    "--csv",
-    "--xml",
-    "--white_background",
-    "--eval",
-    "--filter-value",
-    "--no-deps",
-    "--no-normalize-world-space",
+OTHERS = {"--app_opt", "--auto-scale-poses", "--center-method", "--csv", "--eval", "--filter-value", "--no-deps"}
+OTHERS |= {
     "--normalize-world-space",
+    "--no-normalize-world-space",
+    "--orientation-method",
+    "--white_background",
+    "--xml",
 }
-OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--viewer"}
+OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--viewer", "--xml"}
 OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
 OTHERS |= {"--keep-crs", "--torch-backend"}  # OpenSplat, uv
 """Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""

@@ -102,9 +102,7 @@ for run in (
 
 @pytest.mark.slow
 def test_all_recipes_work(extended: Path, lifted: Path, tmp_path: Path) -> None:
-    python(extended, "-c", SOURCE, lifted, tmp_path)
-    python(extended, "-c", RULE, lifted)
-    python(extended, "-c", FLAT)
+    python(extended, "-c", SOURCE + RULE + FLAT, lifted, tmp_path)
     asked = ("--load-config", lifted, "--text", "red", "--relevancy", "mean", "--negatives", "blue")
     python(extended, "-m", "normlift_ns.cli.query", *asked, "--output-json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())

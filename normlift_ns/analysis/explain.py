@@ -41,7 +41,6 @@ from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
 from normlift_ns.rasterization.settings import RasterSettings
-from normlift_ns.segmentation.sam import SamMasks
 
 _UNLISTED_SHARE = 0.1
 """Maximum fraction of an image's weight in regions that are not listed."""
@@ -166,8 +165,7 @@ def explain_selection(
     Args:
         features: one unit row per column (region) of the evidence.
         selected: True for the selected Gaussians.
-        source: index of the Gaussian from which each Gaussian has its direction, from `refine`; None if all Gaussians
-            have their own.
+        source: index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
         beta, unlabeled: as in `lift`.
     Raises:
         ValueError: nothing is selected, or the numbers of Gaussians or regions differ.
@@ -190,7 +188,7 @@ def explain_selection(
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of the Gaussians `rows` as one row; count repeated Gaussians repeatedly."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; a Gaussian counts once per occurrence."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)
@@ -333,7 +331,7 @@ class RecordedVotes:
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
-        """Read one image after another, and yield it with outlines of the regions that voted.
+        """Yield the images one after another, with outlines of the regions that voted.
 
         Raises:
             FileNotFoundError: an image no longer exists.
@@ -399,10 +397,10 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        """Feature source of the lift, without networks: their results come from the cache only."""
+        """Return the feature source of the lift. Encoders and SAM only read the cache; they load no network."""
 
         def is_quick(part: Any) -> bool:
-            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or isinstance(part, SamMasks))
+            return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or hasattr(part, "checkpoint"))
 
         return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
 

@@ -1,14 +1,14 @@
 """Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
 Each image in which two neighboring Gaussians have a region gives this pair a count. The count is 1 if both have the
-same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)), with the usual
-disagreement of the views, s = 1 - median ||f_j||. The affinity of two parts is the mean of the counts over all images
-and all pairs of neighbors across their border::
+same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median
+||f_j|| is the usual disagreement of the views. The affinity of two parts is the mean of the counts over all images and
+all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
-a surface; it keeps parts apart that touch at few pairs only. Initially, every Gaussian is a part. Each part joins the
+a surface. It separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
 part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
 so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
 Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
@@ -36,7 +36,7 @@ from normlift_ns.options import OBJECT_MIN_GAUSSIANS
 
 MAX_OBJECTS = 20
 """Maximum number of objects in an inventory."""
-MIN_SHARE = 0.001
+MIN_EVIDENCE = 0.001
 """Minimum evidence of an object, as a fraction of the evidence of all images."""
 _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
@@ -119,7 +119,7 @@ def find_inventory(
     weight = (evidence.rows.row_sums() + evidence.unlabeled.row_sums()).numpy()
     size, total = np.bincount(part), np.bincount(part, weight)
     order = np.argsort(-total, kind="stable")
-    large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_SHARE * weight.sum()) & (total[order] > 0)
+    large = (size[order] >= OBJECT_MIN_GAUSSIANS) & (total[order] >= MIN_EVIDENCE * weight.sum()) & (total[order] > 0)
     listed = order[large][:MAX_OBJECTS]
     number = np.zeros(len(size), np.int32)
     number[listed] = np.arange(1, len(listed) + 1)
@@ -203,8 +203,8 @@ def _targets(
 ) -> Int64[np.ndarray, " n"]:
     """Return the part that each part joins, which is the larger part with the largest affinity, or itself.
 
-    Only the chosen borders count. Ties go to the larger part, then to the part with the smaller index. Of two equally
-    large parts, the part with the smaller index counts as larger.
+    Only the borders in the mask `chosen` count. Ties go to the larger part, then to the part with the smaller index. Of
+    two equally large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
     target = np.concatenate([borders.second[chosen], borders.first[chosen]])
@@ -255,7 +255,7 @@ def best_words(
         directions: unit directions of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
         vectors: one unit row per word, names first.
-        by_chance: number of pairs that may exceed the limit by chance; inf: accept every best name.
+        by_chance: number of pairs that may exceed the limit by chance; inf accepts every best name.
         count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T

@@ -238,8 +238,8 @@ class Instances:
     class_id: Int32[Tensor, " n"]
     """Class of each Gaussian, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
     instance_id: Int32[Tensor, " n"]
-    """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. 0 for
-    Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
+    """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0
+    for Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
     selection, so further prompts change no number.
     """
     classes: tuple[int, ...]
@@ -288,7 +288,7 @@ def find_instances(
         texts: prompts.
         max_gap, min_gaussians: as in `find_objects`.
     Raises:
-        ValueError: for the reasons of `find_objects`.
+        ValueError: as in `find_objects`.
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
@@ -415,7 +415,7 @@ def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> Similar
     Args:
         run_dir, identity: as in `capture_transforms`.
     Raises:
-        ValueError, FileNotFoundError: for the reasons of `capture_transforms`.
+        ValueError, FileNotFoundError: as in `capture_transforms`.
     """
     worlds = capture_transforms(run_dir, identity)
     inverses = (SimilarityTransform.inverse_of(world.transform, world.scale) for world in reversed(worlds))
@@ -478,7 +478,7 @@ def make_catalogue(
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
     """Return the fraction of each of V images that each of M objects covers, with occlusion.
 
-    It is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
+    The fraction is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
     count = len(instances.classes)
     if count == 0:

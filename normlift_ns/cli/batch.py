@@ -440,7 +440,7 @@ def lift_captures(
             file_lock.finish_claim(claim, file_lock.ABANDONED)
             raise
         if outcome is None:
-            on_message(f"{capture.name}: taken over by another worker, which received no heartbeats of this worker")
+            on_message(f"{capture.name}: taken over by another worker, which received no heartbeat from this worker")
             continue
         file_lock.append_jsonl(folder / f"{worker}{file_lock.JSONL_SUFFIX}", outcome)
         file_lock.finish_claim(claim, outcome.state)
@@ -539,3 +539,7 @@ class NormLiftBatch(CheckedOptions):
 def entrypoint() -> None:
     """Run ns-normlift-batch, and return to the caller if it succeeds."""
     run_command(NormLiftBatch)
+
+
+if __name__ == "__main__":
+    entrypoint()

@@ -83,8 +83,10 @@ class NormLiftCheck(NormLift):
         scene = opened.scene
         count = f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, {len(scene.held_out)} held out"
         rows.append(Diagnostic("capture", "ok", count))
-        rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
+        rows += [Diagnostic("images", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))
+        lifted = [opened.run_dir, *([self.load_config.parent] if self.load_config is not None else [])]
+        rows += _try(rows, "lifted run", lambda: planning.diagnose_recognition(lifted)) or []
         if self.check_alignment:
             compare = partial(planning.compare_cameras, opened, self.lift, device)
             compared = _try(rows, "cameras", lambda: planning.diagnose_cameras(compare()))
@@ -140,3 +142,7 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
 def entrypoint() -> None:
     """Run ns-normlift-check, and return to the caller if it succeeds."""
     run_command(NormLiftCheck)
+
+
+if __name__ == "__main__":
+    entrypoint()

@@ -140,7 +140,7 @@ class Demo(CheckedOptions):
         NormLiftQuery(run.config, (_THING,), render_dir=renders, overwrite=True).main()
         found = run.ask(_THING).mask.numpy()
         iou = float((found & truth).sum() / (found | truth).sum())
-        info(f"IoU of the Gaussians that answer {_THING!r} with the ground truth: {iou:.3f}")
+        info(f"IoU of the Gaussians that match {_THING!r} with the ground truth: {iou:.3f}")
         CONSOLE.rule("What is in here?")
         image = self.folder / "objects.png"
         _show("ns-normlift-query", "--load-config", run.config, "--inventory", "--image", image)

@@ -318,10 +318,14 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         consensus = statistics["consensus"]
         levels = (describe_consensus(agreement, consensus["least"], kind) for agreement in consensus["agreement"])
         table.add_row("consensus", "; ".join(levels))
+    if "recognition" in statistics:
+        from normlift_ns.planning import describe_recognition  # noqa: PLC0415 (torch is loaded by now)
+
+        table.add_row("left-out views", describe_recognition(statistics["recognition"]))
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
         unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
-        refined = f"{statistics['refined_share']:.1%} of the Gaussians copied a neighbor's feature"
+        refined = f"{statistics['changed_share']:.1%} of the Gaussians changed their direction by more than 11 degrees"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}
@@ -373,7 +377,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
-    'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
+    'regions overlap by chance (agreement 0.30, needs more than 0.40), so features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
     'if they are rough masks of objects, try --consensus-min-agreement 0'
     """
@@ -383,7 +387,8 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         extent = "applied" if agreement >= least + AGREEMENT_RAMP else "applied in part"
         return f"agreement {agreement:.2f}, {extent}"
     unchanged = (
-        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}), features stay unchanged"
+        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}), so features "
+        "stay unchanged"
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged

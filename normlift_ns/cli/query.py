@@ -356,7 +356,7 @@ class NormLiftQuery(CheckedOptions):
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
         for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name) and not (self.inventory and name == "output_json"):
-                raise InputError(f"--{name.replace('_', '-')} works only with --text; leave it out with {flags[0]}")
+                raise InputError(f"--{name.replace('_', '-')} works only with --text; remove it or {flags[0]}")
         self._check_dependent_options()
         if self.interactive and not sys.stdin.isatty():
             raise InputError(

@@ -18,12 +18,18 @@ def _start(module: str, command: str) -> None:
         os._exit(130)
 
 
+def _serve(module: str, command: str) -> None:
+    # threads of OpenMP that wait actively would take the time of other requests
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    _start(module, command)
+
+
 lift = partial(_start, "lift", "NormLift")
 query = partial(_start, "query", "NormLiftQuery")
 export = partial(_start, "export", "NormLiftExport")
 evaluate = partial(_start, "evaluate", "NormLiftEval")
-view = partial(_start, "view", "NormLiftView")
-serve = partial(_start, "serve", "NormLiftServe")
+view = partial(_serve, "view", "NormLiftView")
+serve = partial(_serve, "serve", "NormLiftServe")
 batch = partial(_start, "batch", "NormLiftBatch")
 check = partial(_start, "check", "NormLiftCheck")
 weights = partial(_start, "weights", "NormLiftWeights")

@@ -70,7 +70,7 @@ def _hub(
     user: str, megabytes: float, license_name: str, data: str, repository: str,
     local: str, find: Callable[[], Path | None], download: Callable[[], Path],
 ) -> Weights:  # fmt: skip
-    """Return weights of the hub.
+    """Return the entry for weights on the Hugging Face Hub.
 
     Args:
         local: Required files of the repository, and the option that takes a local copy of them.
@@ -119,16 +119,16 @@ WEIGHTS: dict[str, Weights] = {
         "--encoder open_clip",
         600,
         "MIT",
-        "LAION-2B: links to images of the web, each under terms of its own; LAION recommends it for research",
+        "LAION-2B: links to web images, each under its own terms; LAION recommends it for research",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
         "open_clip_model.safetensors or open_clip_pytorch_model.bin, for --encoder-pretrained FILE",
         _find_open_clip,
         lambda: open_clip.find_open_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED)[0],
     ),
-    "siglip": _family("siglip", 813, "Apache-2.0", "WebLI: images of the web, not published"),
-    "siglip2": _family("siglip2", 1500, "Apache-2.0", "WebLI: images of the web, not published"),
+    "siglip": _family("siglip", 813, "Apache-2.0", "WebLI: web images, not published"),
+    "siglip2": _family("siglip2", 1500, "Apache-2.0", "WebLI: web images, not published"),
     "metaclip2": _family(
-        "metaclip2", 7400, "CC BY-NC 4.0: non-commercial", "pairs selected from Common Crawl: images of the web"
+        "metaclip2", 7400, "CC BY-NC 4.0: non-commercial", "pairs selected from Common Crawl: web images"
     ),
     "imagenet": _package(IMAGENET, "Apache-2.0", _IMAGENET_TERMS),
     "sam": _sam(
@@ -171,7 +171,7 @@ class NormLiftWeights(CheckedOptions):
         """Fetch the requested weights, or print the table.
 
         Raises:
-            InputError: A name is unknown, or an index serves another file than expected.
+            InputError: A name is unknown, or an index serves an unexpected file.
             FileNotFoundError: Weights cannot be downloaded.
         """
         for name in self.get:
@@ -215,3 +215,7 @@ def _show(found: dict[str, Path | None]) -> None:
 def entrypoint() -> None:
     """Run ns-normlift-weights, and return to the caller if it succeeds."""
     run_command(NormLiftWeights)
+
+
+if __name__ == "__main__":
+    entrypoint()

@@ -1,9 +1,9 @@
 """Consensus of regions across views, computed before the lift.
 
 An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
-that cover the same Gaussians do not. The consensus therefore moves each feature toward those of overlapping regions in
-other views. Let E be the evidence, and W_jv(s) the weight of Gaussian j in the view of region s, including pixels
-without a region. Sums run over the Gaussians that are visible in both views::
+that cover the same Gaussians usually do not have this error. The consensus therefore moves each feature toward those of
+overlapping regions in other views. Let E be the evidence, and W_jv(s) the weight of Gaussian j in the view of region s,
+including pixels without a region. Sums run over the Gaussians that are visible in both views::
 
     p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 if below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
@@ -109,7 +109,7 @@ def consensus(
         sample: smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
         least: largest B at which regions overlap by chance and keep their features, in 0..1.
     Raises:
-        ValueError: if `features` or `level` has another length, a feature is neither a unit vector nor 0, or another
+        ValueError: if `features` or `level` has the wrong length, a feature is neither a unit vector nor 0, or another
             argument is out of range.
 
     >>> import torch
@@ -224,7 +224,7 @@ def sample_gaussians(
     count = count_entries(rows)
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
     index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.indices
-    number = _hash_to_unit(index)
+    number = hash_to_unit(index)
     while True:
         probability = _largest_share(rows, share)
         chosen = (number < probability).nonzero().squeeze(1)
@@ -285,7 +285,7 @@ def region_overlaps(
     return Overlaps(SparseRows(row_offsets(row, size), column.int(), iou), inside, agreement)
 
 
-def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+def hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
     """Return a pseudo-random number in [0, 1) for every index, computed by the finalizer of MurmurHash3."""
     x = index + SAMPLING_SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
@@ -371,7 +371,7 @@ others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `M
 def _inner_products(
     shares: SparseRows, visible: SparseRows, labeled: SparseRows, view: Int64[Tensor, " s"], views: int
 ) -> Iterator[_Block]:
-    """Yield the sums for all regions, block by block."""
+    """Yield the sums of `_Block` for all regions, one block at a time."""
     order = shares.column.argsort(stable=True)
     row, weight = shares.row_index()[order].int(), shares.weight[order]
     by_region = SparseRows(row_offsets(shares.column, len(view)), row, weight)  # the transpose

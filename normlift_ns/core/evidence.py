@@ -217,7 +217,7 @@ class Evidence(TensorRecord):
             columns: new column of every old column, or -1 for none, with one row per level.
             region_view: view of every new column, non-decreasing.
         Raises:
-            ValueError: if a new column does not exist, or belongs to another view than its old columns.
+            ValueError: if a new column does not exist, or belongs to a different view than its old columns.
         """
         if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
             raise InputError(
@@ -278,7 +278,7 @@ class Evidence(TensorRecord):
             remarks: additional metadata for the file header, by name.
             own: skip the checks of `io.guard`, for files in a run or cache of this package.
         Raises:
-            ValueError: if this would replace an input, a file of a run or data set, or a file of another type.
+            ValueError: if this would replace an input, a file of a run or data set, or a file of a different type.
             OSError: if the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled

@@ -94,8 +94,8 @@ class SemanticField(TensorRecord):
             storage: "auto" chooses the smallest storage whose bound is within the tolerance.
             provenance: JSON-ready metadata for the manifest, such as source config, step, encoder and hyperparameters.
         Raises:
-            ValueError: if `means` or `source` has another length, an option is invalid, or no rank meets the tolerance
-                for storage "low_rank".
+            ValueError: if `means` or `source` has the wrong length, an option is invalid, or no rank meets the
+                tolerance for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
         if len(means) != n or (source is not None and len(source) != n):
@@ -155,7 +155,7 @@ class SemanticField(TensorRecord):
         The cosine is 0 for Gaussians without a direction.
 
         Raises:
-            ValueError: if a vector has another dimension, is zero or is not finite.
+            ValueError: if a vector has the wrong dimension, is zero or is not finite.
         """
         if text_vectors.shape[1] != self.dimension:
             raise InputError(
@@ -171,7 +171,7 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
-        """Return the null level of every Gaussian as one column, or no column without a null vocabulary."""
+        """Return the null level of every Gaussian as one column; no columns if there is no null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
@@ -224,7 +224,7 @@ class SemanticField(TensorRecord):
             beside: digests of other files that belong to the field, by their paths relative to the folder.
             own: skip the checks of `io.guard`, for folders in a run of this package.
         Raises:
-            ValueError: if this would replace an input, a file of a run or data set, or a file of another type.
+            ValueError: if this would replace an input, a file of a run or data set, or a file of a different type.
             FileExistsError: if the folder contains a field and `overwrite` is False.
             OSError: if a file cannot be written, for instance because the disk is full.
         """

@@ -153,7 +153,7 @@ def lift(
     Returns:
         `Lifted`, in float64 if the evidence or the features are float64, else in float32.
     Raises:
-        ValueError: if `features` has another length, a row is not a unit vector, a weight is outside 0..1e15, or an
+        ValueError: if `features` has the wrong length, a row is not a unit vector, a weight is outside 0..1e15, or an
             option is invalid.
 
     >>> import torch
@@ -278,7 +278,7 @@ def check_unit_rows(
         advice: suggestion for the user in the message.
         allow_zeros: accept rows of zeros too.
     Raises:
-        ValueError: if a row has another length or is not finite. The message counts such rows and shows three.
+        ValueError: if a row has the wrong length or is not finite. The message counts such rows and shows three.
 
     >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize them").round(decimals=6)
     tensor([1.], dtype=torch.float64)

@@ -185,7 +185,7 @@ def encode_directions(
 def arrange_directions(
     parts: Sequence[Float16[Tensor, "_ r"]], gaussians: Sequence[Int64[Tensor, " _"]], basis: Tensor | None, n: int
 ) -> StoredDirections:
-    """Join parts of the directions of n Gaussians in index order; `gaussians` are the indices of the rows of each."""
+    """Join parts of the directions of n Gaussians in index order; `gaussians` has the indices of each part's rows."""
     row_of = torch.zeros(n + 1, dtype=torch.int64, device=parts[0].device)
     for index in gaussians:
         row_of[index + 1] = 1

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import can_use_triton, retry_in_halves
-from normlift_ns.core.evidence import check_not_negative
+from normlift_ns.core.evidence import Evidence, check_not_negative
 from normlift_ns.core.lift import check_unit_rows
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
@@ -38,6 +38,7 @@ def refine(
     config: RefineConfig | None = None,
     *,
     own: Float[Tensor, " n"] | None = None,
+    labeled: Float[Tensor, " n"] | None = None,
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
@@ -56,7 +57,8 @@ def refine(
     a mean in 0..1 that counts as much as P views. Neighbors therefore have less influence if i has more views.
 
     All votes use the unrefined directions. In a tie, the nearer neighbor wins. If no neighbor is reliable, i keeps its
-    direction (see `unsupported`). If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
+    direction (see `unsupported`), and so it does if less than `min_labeled` of its weight lies in regions. If R_i = 0,
+    S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
         config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
@@ -64,6 +66,8 @@ def refine(
             If it is a function of indices, such as `Lifted.directions`, only one block is in memory at a time.
         reliability: R in 0..1.
         own: `Lifted.scalars.own_evidence`, required by the posterior vote and ignored by the paper's vote.
+        labeled: `labeled_share` of the evidence. Gaussians below `config.min_labeled` keep their direction (default:
+            all may change).
         neighbors: result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
             search for the K of `clamp_k(config, n)`).
         progress: callback after every block of Gaussians, with the number that are done and their total.
@@ -97,7 +101,15 @@ def refine(
     if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
         directions = directions.__getitem__  # in blocks, because the kernel copies its rows
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
-    return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
+    return refine_subset(
+        order, neighbors, directions, reliability, config, own=own, labeled=labeled, width=width, progress=progress
+    )
+
+
+def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
+    """Return the share of every Gaussian's weight in all views that lies in regions, or 1 without any weight."""
+    labeled, blank = evidence.rows.row_sums(), evidence.unlabeled.row_sums()
+    return torch.where(labeled + blank > 0, labeled / (labeled + blank), 1.0)
 
 
 def _check_inputs(
@@ -136,6 +148,7 @@ def refine_subset(
     *,
     own: Float[Tensor, " n"] | None,
     width: Float64[Tensor, ""],
+    labeled: Float[Tensor, " m"] | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
     """Run `refine` for some of the first m Gaussians. The other Gaussians only serve as neighbors.
@@ -146,6 +159,7 @@ def refine_subset(
         directions, reliability: as in `refine`, for all n Gaussians.
         own: as in `refine`, used for voters only, or None for the paper's vote.
         width: sigma_d, in the units of the distances.
+        labeled: as in `refine`, for the first m Gaussians.
         progress: as in `refine`.
     """
     n, device, on_gpu = len(reliability), reliability.device, can_use_triton(reliability)
@@ -153,6 +167,8 @@ def refine_subset(
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
     can_change = _any_reliable(neighbors, reliability)[voters]  # a neighbor that is not reliable cannot win
+    if labeled is not None:
+        can_change &= labeled[voters] >= config.numbers.min_labeled
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
@@ -193,7 +209,8 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     ...     clamp_k(RefineConfig(k=100), 5).k, str(caught[0].message)
     (4, 'k is 100, but only 4 other Gaussians can vote; the vote uses 4 neighbors')
     """
-    config = replace(config, **config.numbers._asdict())
+    gate = {"tau": config.tau, "gamma": config.gamma}  # the pipeline may measure those that are None
+    config = replace(config, **(config.numbers._asdict() | gate))
     k = min(config.k, max(1, n - 1), MAX_VOTERS)
     if k == config.k:
         return config

@@ -118,7 +118,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
         problem = (
-            f"The splat does not show what its images show: renders from three of the cameras reach {match.psnr:.1f} "
+            f"The splat does not match its images: renders from three of the cameras reach {match.psnr:.1f} "
             f"dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
@@ -145,4 +145,4 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
     """Return a mask of the Gaussians whose centers are inside the image and in front of the camera."""
     _, _, depth, inside = camera.project(means)
-    return inside & (depth > 0.01)
+    return inside & (depth > 0)

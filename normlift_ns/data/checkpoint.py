@@ -158,8 +158,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint. Also if the step is
-            invalid or differs from the step in the file name.
+        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint, or the step is invalid
+            or differs from the step in the file name.
     """
     advice = "give another checkpoint with --load-step"
     loaded = load_torch_archive(path, "as ns-train splatfacto writes them", advice)
@@ -191,10 +191,11 @@ def validate_step(step: Any, path: Path) -> int:
     Raises:
         ValueError: The step is not a whole number in range, or differs from the step in the file name.
     """
+    step = int(step) if isinstance(step, np.integer) else step
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
         raise InputError(
             f"{path}: its step is {str(step)[:40]} ({type(step).__name__}), expected a whole number from 0 to "
-            f"{_MAX_STEP:,}. Copy it again, or give another checkpoint with --load-step."
+            f"{_MAX_STEP:,}. Copy it again, or give another checkpoint."
         )
     expected = _step_of(path)
     if expected is not None and expected != step:
@@ -326,8 +327,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]
-    splats = [splat_from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
-    steps = {step for step, _, _ in loaded}
+    splats = [splat_from_parameters(rank.parameters, file) for file, rank in zip(files, loaded)]
+    steps = {rank.step for rank in loaded}
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
         steps_named = f"steps: {', '.join(map(str, sorted(steps)))}"
         raise InputError(
@@ -337,7 +338,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     names = splats[0].parameters
     merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
     validate_splat(merged, files[0])
-    return SplatFile(merged, step=steps.pop(), pose_adjust=loaded[0][2], by_gsplat=True)
+    first = loaded[0]
+    return SplatFile(merged, None, steps.pop(), first.pose_adjust, by_gsplat=True, remarks=first.remarks)
 
 
 def _rank_files(path: Path) -> tuple[Path, ...]:
@@ -363,10 +365,21 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
     return tuple(ranks[rank] for rank in sorted(ranks))
 
 
-def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
-    """Read the step, the parameters by splatfacto's names, and the pose adjustments of one rank."""
+class _Rank(NamedTuple):
+    """Contents of the file of one GPU."""
+
+    step: int
+    parameters: dict[str, Tensor]
+    """Parameters by splatfacto's names."""
+    pose_adjust: Float[Tensor, "v 9"] | None
+    remarks: tuple[str, ...]
+    """Messages about parameters that are ignored."""
+
+
+def _read_rank(path: Path) -> _Rank:
     loaded = load_torch_archive(path, "as gsplat's simple_trainer writes them", _ADVICE)
     splats = _splats(path, loaded)
+    remarks = check_extra_names((str(name) for name in splats if name not in _GSPLAT_NAMES), path)
     for name in _GSPLAT_NAMES:
         check_dense_tensor(splats[name], name, path)
     if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
@@ -377,7 +390,7 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     parameters = {name: splats[name] for name in ("means", "quats", "scales")}
     parameters["opacities"] = splats["opacities"][:, None]
     parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
-    return validate_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded)
+    return _Rank(validate_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded), remarks)
 
 
 def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
@@ -385,8 +398,12 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
     splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
-        hint = "; for a nerfstudio run, give its config.yml with --load-config" if "pipeline" in keys else ""
-        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats`, found {keys}{hint}.")
+        hint = "Give a file of gsplat's simple_trainer"
+        if "pipeline" in keys:
+            hint = "For a nerfstudio run, give its config.yml with --load-config"
+        elif isinstance(loaded, tuple):
+            hint = "For Inria's trainer, give point_cloud/iteration_…/point_cloud.ply with --load-ply"
+        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats`, found {keys}. {hint}.")
     if "app_module" in loaded:
         raise InputError(
             f"{path} contains an appearance network, `app_module` (--app_opt), which computes the colors of its "
@@ -400,7 +417,6 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
             f"{', '.join(sorted(map(str, splats)))}. Expected 3D Gaussians with spherical harmonics. Give a file of "
             "gsplat's simple_trainer with --load-gsplat."
         )
-    check_extra_names((str(name) for name in splats if name not in _GSPLAT_NAMES), path)
     return splats
 
 

@@ -28,6 +28,12 @@ CAMERA_MODELS = {
     "RADIAL_FISHEYE": "f cx cy k1 k2",
     "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
     "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    "SIMPLE_DIVISION": "f cx cy k",
+    "DIVISION": "fx fy cx cy k",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "EUCM": "fx fy cx cy alpha beta",
+    "EQUIRECTANGULAR": "w h",
 }
 """Names of the parameters of COLMAP's camera models. The models are in the order of their IDs in binary files."""
 _MODELS = (*PERSPECTIVE_MODELS, *FISHEYE_MODELS)
@@ -35,6 +41,8 @@ _SIMPLE_IF_ZERO = {
     "FULL_OPENCV": ("k4", "k5", "k6"),
     "FOV": ("omega",),
     "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1"),
+    "SIMPLE_DIVISION": ("k",),
+    "DIVISION": ("k",),
 }
 """Camera models that equal one of `_MODELS` if the given parameters are zero."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
@@ -126,8 +134,7 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
 
     Args:
         model: Folder of the reconstruction.
-        text_first: If both formats exist, read the text files, as nerfstudio does, instead of the binary files, as
-            COLMAP does.
+        text_first: True to prefer text files, as nerfstudio does; False to prefer binary files, as COLMAP does.
     Raises:
         FileNotFoundError: A file is missing.
         ValueError: A file is damaged, or contains duplicate IDs, invalid image sizes, poses that are not finite, no
@@ -181,7 +188,7 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
     """Return the intrinsics of a camera.
 
-    The models FULL_OPENCV, FOV and THIN_PRISM_FISHEYE are supported only if they equal a simpler model.
+    Models in `_SIMPLE_IF_ZERO` are supported only if they equal a simpler model.
 
     Raises:
         ValueError: `normlift_ns` cannot undistort images of this camera model.

@@ -33,8 +33,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
         cameras: Folder of a COLMAP project, or a transforms.json, with old and new images.
         images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
-        FileNotFoundError, ValueError: The errors of `open_splat`; no image is new; fewer than two images are known; or
-            known cameras have moved relative to each other.
+        FileNotFoundError, ValueError: The errors of `open_splat`. Also, no image is new, fewer than two images are
+            known, or known cameras have moved relative to each other.
     """
     path = cameras.absolute()
     is_transforms = path.suffix == ".json" or (path / "transforms.json").is_file()

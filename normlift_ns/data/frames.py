@@ -80,8 +80,8 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         file: Path of its image, for error messages.
         size: Width and height of the image in pixels.
     Raises:
-        FileNotFoundError, ValueError: The errors of `read_image_header`, or the mask has other channels or another
-            size. The message gives both paths.
+        FileNotFoundError, ValueError: The errors of `read_image_header`, or the mask has the wrong channels or
+            the wrong size. The message gives both paths.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):
@@ -97,7 +97,7 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
 
 
 def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tuple[str, ...]:
-    """Return warnings in whole sentences about images that image viewers display in another way than training."""
+    """Return warnings in whole sentences about images that image viewers and training display differently."""
     kinds = (
         (
             [header.rotated for header in headers],
@@ -127,10 +127,10 @@ GIVE_IMAGES = "give the folder of the images with --images"
 """Advice on missing images if the options do not contain their folder."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """Perspective camera models that `Intrinsics` can represent, by their names in COLMAP and nerfstudio."""
-FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion that moves no pixel. nerfstudio takes fisheye cameras whose distortion is zero for pinholes."""
+"""Distortion that moves no pixel. nerfstudio treats fisheye cameras without distortion as pinhole cameras."""
 
 
 class Intrinsics(NamedTuple):
@@ -168,7 +168,7 @@ class Intrinsics(NamedTuple):
         return self._replace(k1=self.k1 if self.is_distorted else _SMALLEST, fisheye=True)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """Return the intrinsics of the same image at another size in pixels."""
+        """Return the intrinsics of the same image at a different size in pixels."""
         x, y = width / self.width, height / self.height
         return self._replace(
             fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
@@ -342,7 +342,8 @@ def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) ->
         advice: Advice on an unsuitable image, for error messages.
     Raises:
         FileNotFoundError: The file is missing.
-        ValueError: The file is not an image, it has another aspect ratio than its camera, or its mask is not valid.
+        ValueError: The file is not an image, its aspect ratio differs from that of its camera, or its mask is not
+            valid.
     """
     width, height = read_image_header(frame.file).size
     camera = frame.intrinsics
@@ -351,7 +352,7 @@ def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) ->
         if abs(camera.width * scale - width) > 1 or abs(camera.height * scale - height) > 1:
             raise InputError(
                 f"{frame.file} has {width} x {height} pixels, but its camera in {source} has {camera.width} x "
-                f"{camera.height}, which is another aspect ratio. Replace the images with those that the cameras were "
+                f"{camera.height}, a different aspect ratio. Replace the images with those that the cameras were "
                 f"computed from, or with proportionally smaller copies, or {advice}."
             )
         camera = camera.resized(width, height)

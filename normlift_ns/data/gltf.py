@@ -12,6 +12,7 @@ import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
+from urllib.parse import unquote
 
 import msgspec
 import numpy as np
@@ -149,11 +150,11 @@ def _placed(gltf: _Gltf, mesh: int, file: SplatFile) -> SplatFile:
 
 
 def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
-    """Return the similarity from a mesh to its scene; raise InputError for several places and for other transforms."""
+    """Return the similarity from a mesh to its scene; raise InputError for several instances or other transforms."""
     path, nodes, matrix = gltf.path, gltf.document.nodes, np.eye(4)
     holders = [number for number, node in enumerate(nodes) if node.mesh == mesh]
     if len(holders) > 1 or any(_INSTANCING in nodes[number].extensions for number in holders):
-        raise InputError(f"{path} places its splat several times, expected once. Export one of them, or a PLY file.")
+        raise InputError(f"{path} has several instances of its splat, expected one. Export one of them, or a PLY file.")
     parents = {child: number for number, node in enumerate(nodes) for child in node.children}
     number = holders[0] if holders else None
     for _ in nodes:
@@ -162,7 +163,7 @@ def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
                 matrix = _local_matrix(path, nodes[number]) @ matrix
             number = parents.get(number)
     if number is not None:
-        raise _damaged(path, "its nodes are their own parents")
+        raise _damaged(path, "a node is its own parent or ancestor")
     try:
         return decompose_similarity(matrix, f"The transform of the splat in {path}")
     except InputError as error:
@@ -195,8 +196,13 @@ def _open_gltf(path: Path) -> _Gltf:
     text, binary = _glb_chunks(path) if is_glb else (read_file(path), b"")
     try:
         document = msgspec.json.decode(text, type=_Document)
-    except (msgspec.DecodeError, msgspec.ValidationError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"its JSON does not match the glTF schema ({error})") from error
+    except msgspec.ValidationError as error:
+        raise InputError(
+            f"{path} is JSON that does not match the schema of glTF ({error}). Expected a glTF file with a splat; "
+            "export one, or a PLY file."
+        ) from error
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise _damaged(path, f"its JSON cannot be read ({error})") from error
     if not str(document.asset.get("version", "")).startswith("2."):
         raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export glTF 2.0.")
     unknown = sorted(set(document.extensions_required) - _KNOWN)
@@ -261,7 +267,7 @@ def _read_attributes(gltf: _Gltf, primitive: _Primitive) -> SplatParameters:
     degree = max((d for d in range(1, _MAX_DEGREE + 1) if _harmonic(d, 0) in primitive.attributes), default=0)
     rest = [read(_harmonic(d, i), 3) for d in range(1, degree + 1) for i in range(2 * d + 1)]
     if any(len(x) != len(scales) for x in rest):
-        raise _damaged(gltf.path, f"its spherical harmonics do not have {len(scales)} rows, as its scales do")
+        raise _damaged(gltf.path, "its spherical harmonics and scales differ in their number of rows")
     parameters = {
         "means": read("POSITION", 3),
         "quats": read(f"{_EXTENSION}:ROTATION", 4).roll(1, dims=1),
@@ -282,8 +288,13 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
     accessors = gltf.document.accessors
     accessor = accessors[index] if 0 <= index < len(accessors) else None
     kind = None if accessor is None else _TYPES.get(accessor.component_type)
-    if accessor is None or kind is None or accessor.sparse is not None or _SIZES.get(accessor.type) != size:
-        raise _damaged(gltf.path, f"{name} is not a dense accessor of {size} numbers")
+    if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):
+        raise InputError(
+            f"{gltf.path} has {name} in a sparse accessor, expected a dense one. Export it without sparse accessors, "
+            "or as a PLY file."
+        )
+    if accessor is None or kind is None or _SIZES.get(accessor.type) != size:
+        raise _damaged(gltf.path, f"{name} is not an accessor of {size} numbers")
     view, data = _view_bytes(gltf, accessor.buffer_view)
     dtype = np.dtype(kind)
     stride = dtype.itemsize * size if view.byte_stride is None else view.byte_stride
@@ -317,8 +328,9 @@ def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
             return base64.b64decode(text, validate=True)
         except (binascii.Error, ValueError) as error:
             raise _damaged(path, f"a data URI is not base64 ({error})") from error
-    file = path.parent / buffer.uri
-    if "/" in buffer.uri or "\\" in buffer.uri or "\0" in buffer.uri or file.name != buffer.uri:
+    name = unquote(buffer.uri)
+    file = path.parent / name
+    if "/" in name or "\\" in name or "\0" in name or file.name != name:
         raise InputError(
             f"{path} has the buffer {buffer.uri[:80]!r}, expected the name of a file in the same folder. Export it as "
             "a GLB file."

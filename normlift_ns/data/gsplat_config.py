@@ -94,14 +94,14 @@ def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
 
 def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, of_3dgut: str | None) -> None:
     if of_3dgut is not None:
-        problem = f"{of_3dgut} true (3DGUT), which renders Gaussians in another way"
+        problem = f"{of_3dgut} true (3DGUT), which renders Gaussians differently"
     elif model_type not in (None, "3dgs", "2dgs"):
-        problem = f"model_type {model_type[:40]}, which renders Gaussians in another way"
+        problem = f"model_type {model_type[:40]}, which renders Gaussians differently"
     elif camera_model not in (None, "pinhole"):
         problem = f"camera_model {camera_model[:40]}"
     else:
         return
     raise InputError(
-        f"{path} says that the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
+        f"According to {path}, the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
         "Train it again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
     )

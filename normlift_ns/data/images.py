@@ -11,12 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int64, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View, Views
+from normlift_ns.data.fisheye import filled_pixels, fisheye_pinhole, undistort_fisheye, undistort_labels
 from normlift_ns.data.frames import Frame, ImageHeader, Intrinsics, check_mask, image_warnings, read_image_header
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import open_regular, protect_inputs, read_text
@@ -27,8 +28,8 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
 
     Args:
         names: Sorted names of all images.
-        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, or Inria's with
-            --eval.
+        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, and in Inria's
+            with --eval.
         eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
             below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
@@ -254,8 +255,8 @@ class SplitViews:
         """Check the headers of all images, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. For
-                nerfstudio runs, also if an image or a mask has the wrong size. The message gives the path.
+            FileNotFoundError, ValueError: A file is missing, is not an image, or has an unsupported pixel format. In
+                nerfstudio runs, images and masks must also have the right size. The message gives the path.
         """
         headers = [read_image_header(file) for file in self.files]
         for index, header in enumerate(headers):
@@ -293,8 +294,9 @@ class ImageViews(SplitViews):
 
     Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images. The camera
     matrix becomes OpenCV's optimal one without black borders, and images are cropped to its region of interest. Images
-    of fisheye cameras keep their size; their masks are undistorted without interpolation, and are False at pixels that
-    lie outside of the original image.
+    of fisheye cameras keep their size and at least 90 % of their pixels if a pinhole camera can show them (see
+    `fisheye_pinhole`); their masks are undistorted without interpolation, and are False at pixels that the original
+    image does not show.
 
     Args:
         frames: Image files and their cameras.
@@ -323,21 +325,14 @@ class ImageViews(SplitViews):
         lens = self._lens(index)
         if not lens.fisheye:
             return super()._undistort(index, image, mask)
-        kept = undistort_labels(np.ones((1, *image.shape[:2]), int) if mask is None else mask[None].astype(int), lens)
-        used = None if (kept == 1).all() else torch.from_numpy(kept[0] == 1)
-        return torch.from_numpy(undistort_image(image, lens)[0]), used, True
+        used = filled_pixels(lens) if mask is None else undistort_labels(mask[None].astype(int), lens)[0] == 1
+        return torch.from_numpy(undistort_fisheye(image, lens)), None if used.all() else torch.from_numpy(used), True
 
     def _pinhole(self, index: int) -> tuple[Float[Tensor, "3 3"], int, int]:
-        matrix, width, height = super()._pinhole(index)
         lens = self._lens(index)
-        if lens.fisheye and not float(matrix[0, 0]) > _MIN_MAGNIFICATION * lens.fx:
-            raise InputError(
-                f"the angle of view of its fisheye lens (fx {lens.fx:g}, {lens.width} x {lens.height} pixels, k1 to k4 "
-                f"{[*lens[6:9], lens.k4]}) is too wide for a pinhole camera, or its distortion is wrong. Expected less "
-                "than about 160 degrees along the shorter side. Undistort the images to a smaller angle, for example "
-                "with colmap image_undistorter, and give the new images and cameras"
-            )
-        return matrix, width, height
+        if not lens.fisheye:
+            return super()._pinhole(index)
+        return torch.from_numpy(fisheye_pinhole(lens)).float(), lens.width, lens.height
 
     def _check_header(self, index: int, header: ImageHeader) -> None:
         if problem := _mode_problem(header.mode):
@@ -349,12 +344,6 @@ class ImageViews(SplitViews):
                 raise InputError(problem)
             mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
             return np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
-
-
-_MIN_MAGNIFICATION = 0.2
-"""Minimum ratio of the focal lengths of the undistorted and the original image of a fisheye camera."""
-_SAMPLES = 256
-"""Number of rows and of columns of pixels from which `kept_share` is estimated."""
 
 
 def _mode_problem(mode: str) -> str | None:
@@ -415,30 +404,11 @@ def _undistorted(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int
 
 
 def _undistorted_fisheye(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int]]:
-    maps, pinhole = _fisheye_maps(lens)
-    pixels = cv2.remap(image, maps[0], maps[1], interpolation=cv2.INTER_LINEAR)
-    return pixels.reshape(*pixels.shape[:2], -1), np.asarray(pinhole), (0, 0)
-
-
-def _fisheye_maps(lens: Intrinsics) -> tuple[tuple[Any, Any], Any]:
-    """Return the x and y of each undistorted pixel in the original image, and the new camera matrix."""
     matrix, coefficients, pinhole = _fisheye(lens)
     size = (lens.width, lens.height)
     maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1)
-    return maps, pinhole
-
-
-def undistort_labels(maps: Int[np.ndarray, "levels h w"], lens: Intrinsics) -> Int64[np.ndarray, "levels h w"]:
-    """Undistort label maps of a fisheye image, in any size, without interpolation.
-
-    Pixels that lie outside of the original image become -1.
-    """
-    height, width = maps.shape[1:]
-    x, y = (np.rint(positions) for positions in _fisheye_maps(lens.resized(width, height))[0])
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    undistorted = np.full(maps.shape, -1, np.int64)
-    undistorted[:, inside] = maps[:, y[inside].astype(int), x[inside].astype(int)]
-    return undistorted
+    pixels = cv2.remap(image, maps[0], maps[1], interpolation=cv2.INTER_LINEAR)
+    return pixels.reshape(*pixels.shape[:2], -1), np.asarray(pinhole), (0, 0)
 
 
 def label_undistortion(*parts: Views) -> Callable[[str, np.ndarray], np.ndarray] | None:
@@ -447,18 +417,24 @@ def label_undistortion(*parts: Views) -> Callable[[str, np.ndarray], np.ndarray]
     The result is None unless the views are `ImageViews` with fisheye cameras. Other views keep the size of an image, or
     have label maps of the undistorted images.
     """
-    frames = [frame for views in parts if isinstance(views, ImageViews) for frame in views.frames]
-    lenses = {frame.name: frame.intrinsics for frame in frames if frame.intrinsics.fisheye}
+    lenses = _fisheye_lenses(*parts)
     return None if len(lenses) == 0 else lambda name, maps: undistort_labels(maps, lenses[name])
 
 
-def kept_share(lens: Intrinsics) -> float:
-    """Return the share of the pixels of a fisheye image that remain in the undistorted image, in 0..1."""
-    matrix, coefficients, pinhole = _fisheye(lens)
-    x, y = ((np.arange(_SAMPLES) + 0.5) * side / _SAMPLES - 0.5 for side in (lens.width, lens.height))
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(1, -1, 2)
-    found = cv2.fisheye.undistortPoints(points, matrix.astype(float), coefficients.astype(float), P=pinhole)[0]
-    return float(((found > -0.5) & (found < [lens.width - 0.5, lens.height - 0.5])).all(axis=1).mean())
+def filled_function(views: Views) -> Callable[[str, int, int], Bool[Tensor, "h w"]] | None:
+    """Return a function of an image name and a size that returns True at pixels that the original image shows.
+
+    The result is None unless the views are `ImageViews` with fisheye cameras.
+    """
+    lenses = _fisheye_lenses(views)
+    if len(lenses) == 0:
+        return None
+    return lambda name, height, width: torch.from_numpy(filled_pixels(lenses[name].resized(width, height)))
+
+
+def _fisheye_lenses(*parts: Views) -> dict[str, Intrinsics]:
+    frames = [frame for views in parts if isinstance(views, ImageViews) for frame in views.frames]
+    return {frame.name: frame.intrinsics for frame in frames if frame.intrinsics.fisheye}
 
 
 def _fisheye(lens: Intrinsics) -> tuple[Any, Any, Any]:

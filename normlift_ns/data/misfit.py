@@ -1,4 +1,4 @@
-"""Causes of a poor alignment: another focal length, principal point, distortion or primitive that fits the images."""
+"""Causes of a poor alignment: a different focal length, principal point, distortion or primitive fits the images."""
 
 from __future__ import annotations
 
@@ -76,13 +76,13 @@ class _Pair(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Values of one or two numbers of a lens to try, coarsest first."""
+    """Search over one or two parameters of a lens, from a coarse grid to small steps."""
 
     make: Callable[..., Lens]
     values: Sequence[Iterable[float]]
-    """Coarse grid along each number."""
+    """Coarse grid of each parameter."""
     step: float
-    """Distance of neighbors in the grid."""
+    """Distance between neighbors in the grid."""
 
 
 _SEARCHES = (
@@ -99,15 +99,15 @@ def explain_misfit(
     min_psnr: float,
     min_margin: float,
 ) -> str | None:
-    """Return a sentence about a change with which the renders fit the images, or None if none does.
+    """Return a sentence about a change that makes the renders fit the images; None if there is no such change.
 
     Changes of the lens are tried by warping the images, so nothing is rendered.
 
     Args:
         views: views of the images.
         renders: their renders.
-        render_flat: function that renders a view as 2D Gaussians; None: the renders are good enough, so only small
-            changes of the lens are looked for.
+        render_flat: function that renders a view as 2D Gaussians. If None, the renders are good enough, and only small
+            changes of the lens are tried.
         min_psnr: PSNR in dB that the change must reach.
         min_margin: distance in dB that it must have from the PSNR of the mean color.
     """
@@ -140,7 +140,7 @@ def _blurred(image: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c h w"]:
 
 
 def _whole(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "1 1 h w"]:
-    """Return 1 at pixels whose blurred color has no masked pixels in it, otherwise less."""
+    """Return the unmasked fraction of each pixel's blur window, 1 without masked pixels."""
     return _blurred(mask[None, None].float())
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 import torch
@@ -20,7 +20,6 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View, Views, camera_summary, cameras_differ
-from normlift_ns.data.alignment import Alignment
 from normlift_ns.data.checkpoint import find_checkpoint, read_checkpoint
 from normlift_ns.data.frames import Frame, check_frames, check_lens_types
 from normlift_ns.data.images import ImageViews
@@ -32,6 +31,9 @@ from normlift_ns.io.atomic import complete_interrupted_writes, write_text_file
 from normlift_ns.io.run_dir import check_run, field_folder, recorded_gsplat_version, resolve_manifest_paths
 from normlift_ns.options import Background, RasterizeMode, check_number, check_path
 from normlift_ns.rasterization.rasterize import view_colors
+
+if TYPE_CHECKING:
+    from normlift_ns.data.alignment import Alignment
 
 BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 
@@ -220,8 +222,8 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
     """Return the scene with additional training views. Their cameras must be in the world of the scene.
 
     Raises:
-        FileNotFoundError, ValueError: An image is missing or cannot be read, or it has a fisheye camera and the images
-            of a `SplatScene` do not, or the other way round.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or only one of it and the images of a
+            `SplatScene` has a fisheye camera.
     """
     views = ImageViews(frames, scene.background)
     remarks = (*scene.remarks, *views.check_files())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +14,11 @@ from jaxtyping import Float
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.data.cameras import adjust_poses, read_camera_file
+from normlift_ns.data.fisheye import KEPT_SHARE, MAX_ANGLE, kept_share
+from normlift_ns.data.frames import Frame
 from normlift_ns.data.gltf import GLB_MAGIC
 from normlift_ns.data.gsplat_config import find_gsplat_config
-from normlift_ns.data.images import held_out_names, kept_share
+from normlift_ns.data.images import held_out_names
 from normlift_ns.data.inria_config import TEST_EVERY, find_inria_config
 from normlift_ns.data.open_scene import SplatScene, split_views
 from normlift_ns.data.splat import SplatFile, SplatParameters, flatten_splat, validate_splat
@@ -78,6 +81,7 @@ def open_splat(
 
     def scene_in(candidate: CandidateWorld) -> SplatScene:
         placed, world = candidate.place(cameras.frames), candidate.world
+        planes = candidate.clip_planes(file.clip_planes if file.primitive == "2dgs" else None)
         if file.pose_adjust is not None:
             placed = adjust_poses(placed, held_out, file.pose_adjust, path)
         train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), background)
@@ -100,7 +104,8 @@ def open_splat(
                     "scale": float(world.scale),
                     "opencv_cameras": candidate.opencv_cameras,
                 },
-                **({"primitive": "2dgs", "clip_planes": file.clip_planes} if file.primitive == "2dgs" else {}),
+                **({"primitive": "2dgs"} if file.primitive == "2dgs" else {}),
+                **({} if planes is None else {"clip_planes": planes}),
             },
             options.rasterize_mode or file.rasterize_mode or "classic",
             background,
@@ -134,12 +139,12 @@ def _check_coordinates(
         return
     x, y, z = (float(f"{value:.2g}") for value in center)
     matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
-    place = f" Cameras: printf '{matrix}' > offset.txt, and --world-transform offset.txt"
+    place = f" For the cameras, run printf '{matrix}' > offset.txt, and give --world-transform offset.txt."
     raise InputError(
         f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
         f"zone. The step of float32 is {step:.2g} there, too coarse for Gaussians {width:.2g} wide. Subtract the same "
-        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Splat: export it with this offset "
-        f"from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
+        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Export the splat with this "
+        f"offset from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
     )
 
 
@@ -162,7 +167,16 @@ _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
 """Formats that are detected regardless of the suffix. The exception is splat, which has no characteristic bytes."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
+_JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
+"""Unsupported formats by the names of their files."""
 _BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
+_DOWNLOAD = "Download the file itself instead of the page that shows it."
+_STRANGERS = {
+    b"version https://git-lfs": ("a pointer of Git LFS", "Fetch the file that it stands for, with: git lfs pull"),
+    b"<!doctype html": ("an HTML page", _DOWNLOAD),
+    b"<html": ("an HTML page", _DOWNLOAD),
+}
+"""First bytes of files that downloads leave in the place of a splat, with their kind and advice."""
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
@@ -243,7 +257,7 @@ _CLIP_PLANES = (0.2, 1e10)
 
 
 def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
-    """Return a file whose primitive is known: that of the options, the files or the file name, in this order.
+    """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
         ValueError: if options and files contradict each other.
@@ -280,17 +294,24 @@ def _format(path: Path) -> str:
         return suffix
     suffix = suffix.lower()
     head = b""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, expected the file of a splat. Give a file in it.")
     if path.is_file():
         with open_regular(path) as file:
             head = file.read(_HEAD_BYTES)
+    for start, (kind, advice) in _STRANGERS.items():
+        if head.lstrip().lower().startswith(start):
+            raise InputError(f"{path} is {kind}, expected a splat. {advice}")
     if head.startswith(b"PK"):  # torch.save writes ZIP archives
+        if suffix in _UNREAD:
+            raise _unread(path, suffix.upper())
         _refuse_archive(path)
         return "pt"
     for start, name in _MAGIC.items():
         if head.startswith(start):
             return name
-    if suffix in _UNREAD or path.name == "meta.json":
-        raise _unread(path, suffix.upper() if suffix in _UNREAD else "SOG")
+    if suffix in _UNREAD or path.name in _JSON_FORMATS:
+        raise _unread(path, _JSON_FORMATS.get(path.name, suffix.upper()))
     if head.lstrip()[:1] == b"{":
         return "gltf"
     return suffix if suffix in _SNIFFED else "ply"
@@ -337,7 +358,8 @@ def _assumptions(
     texts.append(
         "Weights are computed as in gsplat, with the version of --gsplat-version (default: 1.4). Versions before 1.6 "
         "cap the opacity of a Gaussian in a pixel at 0.999; version 1.6 and Inria's trainer cap it at 0.99. Inria's "
-        "trainer assumes that the principal point is the image center. Images are undistorted as in ns-train."
+        "trainer assumes that the principal point is the image center. Images of perspective cameras are undistorted "
+        "as in ns-train."
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"
@@ -345,15 +367,25 @@ def _assumptions(
     else:
         texts.append(f"All {len(frames)} images are lifted; to hold out some, give --test-every or --eval-images.")
     texts += cameras.remarks
-    lens = frames[0].intrinsics
-    if lens.fisheye:
-        texts.append(
-            f"Fisheye images are undistorted as in ns-train, which keeps {kept_share(lens):.0%} of the pixels of "
-            f"{frames[0].name}. Masks and label maps are undistorted too: give those of the original images."
-        )
+    if frames[0].intrinsics.fisheye:
+        texts.append(_fisheye_assumption(frames[0]))
     if options.colmap is not None:
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})
         if unused > 0:
             texts.append(f"{unused} files in {folder} have no camera and are skipped.")
     return texts
+
+
+def _fisheye_assumption(frame: Frame) -> str:
+    """Return a message about the undistortion of fisheye images, of which a frame is the first."""
+    try:
+        kept = kept_share(frame.intrinsics)
+    except InputError as error:
+        raise InputError(f"The camera of {frame.file} cannot be used: {error}") from error
+    angle = math.degrees(MAX_ANGLE)
+    limit = "" if kept >= KEPT_SHARE else f"; the others lie more than {angle:.0f} degrees from its optical axis"
+    return (
+        f"Fisheye images are undistorted to pinhole cameras of the same size. {frame.name} keeps {kept:.0%} of its "
+        f"pixels{limit}. Masks and label maps are undistorted too: give those of the original images."
+    )

@@ -33,14 +33,14 @@ class ReducedView(NamedTuple):
     """Divisor of the sides of the image, at least 1."""
 
     def reduced(self, side: int) -> ReducedView:
-        """Return the view at no more than `side` pixels, by averaging pixels, which needs no further filter."""
+        """Return the view at no more than `side` pixels, by averaging pixels."""
         camera = self.view.camera
         divisor = max(1.0, max(camera.width, camera.height) / side)
         width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
         return ReducedView(self.view.downscaled(height, width), self.divisor * divisor)
 
     def psnr(self, image: UInt8[Tensor, "h w 3"]) -> float:
-        """Return the PSNR in dB of a render, outside the mask of the view."""
+        """Return the PSNR in dB of a render, over the pixels that the mask of the view keeps."""
         difference = (self.view.image.float() - image.float()) / 255
         if self.view.mask is not None:
             difference = difference[self.view.mask]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
@@ -182,7 +182,7 @@ _FLATNESS = math.log(1e-3)
 
 
 def flatten_splat(splat: SplatParameters) -> SplatParameters:
-    """Return 2D Gaussians as thin 3D ones, for viewers and files that have no others."""
+    """Return 2D Gaussians as thin 3D ones, for viewers and file formats that support only 3D Gaussians."""
     in_plane = splat.scales[:, :2]
     return replace(splat, scales=torch.cat([in_plane, in_plane.amin(dim=1, keepdim=True) + _FLATNESS], dim=1))
 
@@ -245,7 +245,11 @@ def read_ply(path: Path) -> SplatFile:
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count == 0:
-        raise InputError(f"{path} has no vertices, expected Gaussians. Give the PLY file of a trained splat.")
+        found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "nothing"
+        raise InputError(
+            f"{path} has no Gaussians: expected the element vertex, found {found}. Give the PLY file of a trained "
+            "splat."
+        )
     mode = _mode([*data.comments, *vertex.comments])
     if any(item.name == PACKED for item in vertex.properties):
         parameters, rounding = unpack_compressed_ply(data, path)
@@ -292,7 +296,7 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file whose header is changed to a form that plyfile reads, without a change of its length.
+    """PLY file with a header of the same length that plyfile can read.
 
     Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
     comments.
@@ -316,16 +320,27 @@ def _parse_ply(path: Path) -> PlyData:
     try:
         with _PlainHeader(path) as stream:
             return PlyData.read(stream, mmap="c")
+    except PlyHeaderParseError as error:
+        if file_kind(path) != ".ply":
+            raise _not_ply(path, error) from error
+        raise InputError(
+            f"{path} has a header that is damaged or not of PLY 1.0 ({' '.join(str(error).split())[:200]}). Copy it "
+            "again, or export it with another program."
+        ) from error
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
         if file_kind(path) == ".ply":
             raise InputError(
                 f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
                 "do not match its header. Copy it again."
             ) from error
-        raise InputError(
-            f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
-            "to convert other formats, run for example: splat-transform scene.sog scene.ply"
-        ) from error
+        raise _not_ply(path, error) from error
+
+
+def _not_ply(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
+        "to convert other formats, run for example: splat-transform scene.sog scene.ply"
+    )
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
@@ -358,8 +373,8 @@ def check_ply_header(path: Path) -> None:
     lines = header.replace(b"\r", b"\n").split(b"\n")
     if header.startswith(b"ply") and (end == b"" or max(map(len, lines)) > _MAX_LINE_BYTES):
         raise InputError(
-            f"{path} is truncated or damaged: its header has no end_header in the first {_MAX_HEADER_BYTES:,} bytes, "
-            f"or a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
+            f"{path} is truncated or damaged: its header does not end within {_MAX_HEADER_BYTES:,} bytes, or it has "
+            f"a line of more than {_MAX_LINE_BYTES:,} bytes. Expected a complete PLY file; copy it again."
         )
     lines = [line.split() for line in lines]
     starts = [i for i, words in enumerate(lines) if words[:1] == [b"element"]]

@@ -147,10 +147,12 @@ def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:
 
 
 def _read_header(data: bytes, path: Path) -> _Header:
-    if len(data) < _HEADER.size or not data.startswith(SPZ_MAGIC):
+    if len(data) < _HEADER.size and SPZ_MAGIC.startswith(data[:4]):
+        raise _damaged(path, f"its header ends after {len(data)} of {_HEADER.size} bytes")
+    if not data.startswith(SPZ_MAGIC):
         raise InputError(
-            f"{path} is not an SPZ file: it begins with {data[:4].hex() or 'nothing'}, expected {SPZ_MAGIC.hex()}. If "
-            "it is a compressed file of another kind, decompress it first, for example with gunzip."
+            f"{path} is not an SPZ file: it begins with {data[:4].hex()}, expected {SPZ_MAGIC.hex()}. If "
+            "it is a compressed file of a different kind, decompress it first, for example with gunzip."
         )
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack_from(data)
     if not 2 <= version <= 4:
@@ -209,8 +211,10 @@ def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
     streams = []
     for i, size in enumerate(sizes):
         packed, unpacked = _TABLE_ENTRY.unpack_from(data, start + i * _TABLE_ENTRY.size)
-        if unpacked != size or packed > len(data) - offset:
+        if unpacked != size:
             raise _damaged(path, f"its stream {i} declares {unpacked:,} bytes, expected {size:,}")
+        if packed > len(data) - offset:
+            raise _damaged(path, f"its stream {i} ends after {len(data) - offset:,} of {packed:,} bytes")
         streams.append(_decompress_zstd(data[offset : offset + packed], size, path))
         offset += packed
     return header, [*streams, *[b""] * (len(header.sizes) - len(streams))]

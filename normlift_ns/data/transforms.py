@@ -133,7 +133,7 @@ def read_json_file(path: Path, expected: str) -> Any:
 
 
 def read_transforms_entries(path: Path) -> TransformsEntries:
-    """Read and validate a transforms.json, without a check that its images exist.
+    """Read and validate a transforms.json, without checking that its images exist.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -360,8 +360,8 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         name, first, second = differ[0]
         kept, others = (", ".join(dict.fromkeys(item[i][0] for item in differ)) for i in (1, 2))  # type: ignore[index]
         raise InputError(
-            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} by {first[0]}, which "
-            f"nerfstudio reads, and {second[1]:g} by {second[0]}, which programs such as instant-ngp and Brush read. "
+            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} from {first[0]}, which "
+            f"nerfstudio reads, and {second[1]:g} from {second[0]}, which programs such as instant-ngp and Brush read. "
             f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
         )
@@ -455,8 +455,8 @@ def _distortion(
     """Return the distortion parameters k1, k2, k3, p1, p2 and k4.
 
     Raises:
-        ValueError: A parameter is not zero that the camera type does not have: k4 of perspective cameras, p1 and p2 of
-            fisheye cameras, and further ones.
+        ValueError: A parameter that the camera type does not have is not zero, such as k4 of perspective cameras, or p1
+            and p2 of fisheye cameras.
     """
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
     if entry.distortion_params is not None:
@@ -698,7 +698,7 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform that maps the median of points to the origin, their widest axis to x, narrowest to z."""
+    """Return the transform that maps the median of points to the origin, their longest axis to x, the shortest to z."""
     center = np.median(points, axis=0)
     covariance = np.cov(points - center, rowvar=False)
     if not np.isfinite(covariance).all():

@@ -33,18 +33,18 @@ _LIKELY, _MAX_LIKELY = 0.7, 4
 _SCALES = 1.12 ** np.arange(-61, 62)
 """Uniform scales that are tried, 0.001 to 1000."""
 _SHRINKING = (0.04, 0.02, 0.01)
-"""Steps of the logarithm of a scale, in which points refine it."""
+"""Step sizes of the logarithm of a scale, by which points refine it."""
 _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
 """Longer side of the renders that refine a scale further, and their distance in its logarithm; largest number of moves
 by this distance."""
 _MIN_START = 2.0
-"""Distance in dB from the mean color of an image that a first render needs."""
+"""Minimum lead in dB of a first render over the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
 """Angle of the turns that must fit worse than a world that is taken, and longer side of their renders in pixels."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
-"""Relative distance from a number of two digits within which a scale is that number."""
+"""Relative distance below which a scale is rounded to a number of two digits."""
 
 
 class _Points(NamedTuple):
@@ -119,7 +119,7 @@ class _Search:
 
     Args:
         scene: the scene in one of the worlds.
-        here: this world.
+        here: the world of `scene`.
         device: torch device to render on.
     """
 
@@ -158,7 +158,7 @@ class _Search:
         return small.psnr(self._render(small, candidate)) >= small.psnr(small.mean_color()) + _MIN_START
 
     def _farthest(self, candidate: CandidateWorld) -> ReducedView:
-        """Return the view whose camera is farthest from the origin, so that a scale changes its image most."""
+        """Return the view whose camera is farthest from the origin, because a change of scale affects it most."""
         motion = self._motion(candidate)
         return max(self._views, key=lambda small: float(motion.move(small.view.camera.world_to_camera)[:3, 3].norm()))
 
@@ -166,9 +166,10 @@ class _Search:
         """Render a view of the scene in a world."""
         camera = small.view.camera
         camera = replace(camera, world_to_camera=self._motion(candidate).move(camera.world_to_camera))
-        return small._replace(view=small.view._replace(camera=camera)).render(
-            self._scene, self._gaussians, RasterSettings()
-        )
+        identity = self._scene.identity
+        planes = candidate.clip_planes(identity.get("clip_planes"))
+        settings = RasterSettings.recorded({**identity, "clip_planes": planes})
+        return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
         """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
@@ -204,7 +205,7 @@ class _Search:
 
 
 def _rounded(scale: float) -> float:
-    """Return a scale with two digits if it is close to such a number, otherwise with five.
+    """Round a scale to two digits if this changes it only slightly, otherwise to five.
 
     >>> _rounded(1.9997), _rounded(0.157858)
     (2.0, 0.15786)
@@ -220,7 +221,7 @@ def _likely(agreement: Float[Tensor, " w"]) -> list[int]:
 
 
 def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
-    """Draw points of the Gaussians, more of large and opaque ones, always the same."""
+    """Sample points of the Gaussians with a fixed seed. Large and opaque Gaussians get more points."""
     gaussians, generator = scene.gaussians, torch.Generator().manual_seed(0)
     rows = gaussians.drawable.nonzero().squeeze(1)
     rows = rows[:: len(rows) // _MAX_SAMPLED + 1]
@@ -274,8 +275,8 @@ def find_world(
 ) -> SplatScene:
     """Return the scene in the world in which its renders reach the usual PSNR.
 
-    That is the first world if it fits, and then no other one is tried. Otherwise it is the only other one that fits; if
-    none or several fit, the scene in the first world is returned.
+    If the first world fits, no other world is tried. Otherwise, the result is the scene in the only other world that
+    fits, or in the first world if none or several fit.
 
     Args:
         candidates: possible worlds.
@@ -304,8 +305,8 @@ def find_world(
     fits = "; ".join(f"{world.name} ({other.psnr:.1f} dB)" for world, _, other in found)
     if len(found) > 1:
         say(
-            f"The splat fits its images in several worlds: {fits}. So it stays in {here.name} ({match.psnr:.1f} dB). "
-            "Name the right one by a file with --world-transform."
+            f"The splat fits its images in several worlds: {fits}. It stays in {here.name} ({match.psnr:.1f} dB). "
+            "To use another one, give its transform as a file with --world-transform."
         )
         return scene
     _, other, other_match = found[0]

@@ -1,4 +1,4 @@
-"""Worlds that tools give splats, as maps from the world of the cameras."""
+"""Worlds in which tools place splats, as maps from the world of the cameras."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from normlift_ns.data.splat import SplatFile
 from normlift_ns.data.transforms import CameraFile, decompose_similarity, gsplat_normalization, read_world_transform
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
+from normlift_ns.rasterization.settings import RasterSettings
 
 _MIN_POINTS = 4
 _SAME = 1e-3
@@ -48,6 +49,8 @@ class CandidateWorld(NamedTuple):
     """Map from the cameras' world to that of the splat."""
     opencv_cameras: bool = False
     """True if the camera file has poses with OpenCV's axes (y down, z forward), although its format has OpenGL's."""
+    scale_since_training: float = 1.0
+    """Uniform scale that the splat got after its training. It applies to the clip planes of the training too."""
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
@@ -55,9 +58,19 @@ class CandidateWorld(NamedTuple):
         return np.vstack([self.world.scale * self.world.transform, [0, 0, 0, 1]])
 
     def scaled(self, scale: float) -> CandidateWorld:
-        """Return the world after another uniform scale about its origin."""
-        world = self.world._replace(scale=self.world.scale * scale)
-        return self._replace(name=f"{self.name} and a scale of {scale:g}", world=world)
+        """Return the world, scaled uniformly about its origin."""
+        return self._replace(
+            name=f"{self.name} and a scale of {scale:g}",
+            world=self.world._replace(scale=self.world.scale * scale),
+            scale_since_training=self.scale_since_training * scale,
+        )
+
+    def clip_planes(self, planes: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Return the near and far plane of the training in units of this world; None: those of splatfacto."""
+        if self.scale_since_training == 1:
+            return planes
+        near, far = planes or (RasterSettings.near_plane, RasterSettings.far_plane)
+        return near * self.scale_since_training, far * self.scale_since_training
 
     def place(self, frames: Sequence[Frame]) -> list[Frame]:
         """Return the frames with poses in this world."""
@@ -72,8 +85,9 @@ def with_opengl_axes(frames: Sequence[Frame]) -> list[Frame]:
 def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile) -> list[CandidateWorld]:
     """Return the worlds in which a splat may lie; the first is the one that the options and files state.
 
-    With `--world-transform auto`, further worlds follow. They are those of gsplat's trainer, ns-train and
-    `applied_transform`, with rotations between the axes of tools, and cameras with the axes of OpenCV.
+    With `--world-transform auto`, further worlds follow. They are the worlds of gsplat's trainer, ns-train and
+    `applied_transform`. Each is also tried with rotations between the axes of tools, and with cameras that have
+    OpenCV's axes.
 
     Raises:
         FileNotFoundError, ValueError: if the world that the options state cannot be read or computed.

@@ -174,8 +174,7 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
 
 
 def splatfacto_config() -> Any:
-    """Return the config of nerfstudio's method splatfacto, without importing its list of all methods, which takes
-    seconds."""
+    """Return the config of nerfstudio's method splatfacto, without the slow import of nerfstudio's list of methods."""
     from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # noqa: PLC0415
 

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, Int32
+from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns import api, pipeline
@@ -23,11 +23,13 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     sampled_consensus,
 )
+from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField, choose_form
+from normlift_ns.core.gate import sample_pairs, shared_region_cosines
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
-from normlift_ns.core.refine import decay_width, refine_subset
+from normlift_ns.core.refine import decay_width, labeled_share, refine_subset
 from normlift_ns.distributed.communicator import (
     EvidenceShard,
     TorchCommunicator,
@@ -39,7 +41,7 @@ from normlift_ns.distributed.communicator import (
 from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations, chunk_views
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import LiftOptions
 from normlift_ns.progress import StageTimer
 
 
@@ -72,17 +74,25 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
             agreed = consensus_distributed(views, portion, **pipeline.consensus_options(options))
             step()
         table, facts = agreed.features, pipeline.consensus_facts(options, agreed)
+    if options.recognition:
+        with stages("recognition") as step:
+            sample = gather_sample(views, portion, options.consensus_sample)
+            local = pipeline.recognition_facts(views, options, sample) if team.rank == 0 else None
+            facts |= team.broadcast_object(local)
+            step()
     with stages("lift") as step:
         lifted, own = pipeline.lift_features(views, table, options)
         pipeline.check_directions(team.all_reduce(pipeline.count_directions(lifted)), len(means), collection.source)
         step()
     copied = None
     if options.refine:
-        copied, vote_facts = vote_distributed(means, lifted, own, options.vote, portion, stages)
+        level = views.level if pipeline.measures_gate(options, facts) else None
+        copied, options, vote_facts = vote_distributed(means, lifted, own, options, portion, stages, level=level)
         facts |= vote_facts
     with stages("store") as step:
+        lifted = pipeline.with_stored_reliability(lifted, means[portion.indices], collection)
         statistics = pipeline.lift_statistics(collection, views, portion.all_gather(lifted.scalars.reliability), facts)
-        provenance = pipeline.lift_provenance(collection, prepared.encoder, statistics)
+        provenance = pipeline.lift_provenance(collection, options, prepared.encoder, statistics)
         field = build_field_distributed(
             lifted, means, copied, portion,
             tolerance=options.tolerance, storage=options.storage, provenance=provenance,
@@ -139,50 +149,71 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
     """
     team, (evidence, features, level) = portion.communicator, views
     check_consensus_inputs(evidence.num_regions, features, level)
+    sampled, probability = gather_sample(views, portion, sample)
+    if team.rank > 0:
+        out = features.to(evidence.rows.weight.device, copy=True)
+        return Consensus(team.broadcast(out), team.broadcast_object(None), len(probability))
+    result = sampled_consensus(sampled, probability, features, level=level, **options)
+    return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
+
+
+def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> tuple[Evidence, Float64[Tensor, " m"]]:
+    """Return the evidence of the Gaussians that all processes sample, by index, and their sampling probabilities.
+
+    Args:
+        sample: Number of Gaussians of every region; see `consensus`.
+    """
+    team, evidence = portion.communicator, views.evidence
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
     sampled = evidence.select_gaussians(chosen)
     order = team.all_gather(portion.indices[chosen]).argsort()
     rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
-    probability = team.all_gather(probability)[order]
-    if team.rank > 0:
-        out = features.to(evidence.rows.weight.device, copy=True)
-        return Consensus(team.broadcast(out), team.broadcast_object(None), len(order))
-    sampled = replace(sampled, rows=rows, unlabeled=unlabeled)
-    result = sampled_consensus(sampled, probability, features, level=level, **options)
-    return result._replace(features=team.broadcast(result.features), agreement=team.broadcast_object(result.agreement))
+    return replace(sampled, rows=rows, unlabeled=unlabeled), team.all_gather(probability)[order]
 
 
 def vote_distributed(
     means: Float[Tensor, "n 3"],
     lifted: Lifted,
     own: Float[Tensor, " m"],
-    config: RefineConfig,
+    options: LiftOptions,
     portion: Partition,
     stages: StageTimer,
-) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
+    *,
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Int32[Tensor, " m"], LiftOptions, dict[str, Any]]:
     """Run `vote_directions` in several processes.
 
     Returns:
-        The Gaussian whose direction each Gaussian of the partition takes, and statistics. The statistics are the
-        fractions of all Gaussians that change their direction and that have no support.
+        The Gaussian whose direction each Gaussian of the partition takes, the options with all numbers of the vote, and
+        the gate and the counts of all Gaussians for the manifest.
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):
         progress = partial(stages.report, "neighbors")
-        neighbors = nearest_neighbors(means, config.k, of=gaussians, progress=progress, team=team)
+        neighbors = nearest_neighbors(means, options.vote.k, of=gaussians, progress=progress, team=team)
     with stages("vote", len(gaussians)):
         halo = gather_halo(lifted, neighbors, portion)
+        cosines = None
+        if level is not None:
+            pairs = sample_pairs(gaussians, halo.neighbors.index, len(means))
+            cosines = team.all_gather(shared_region_cosines(halo.lifted, *pairs, level))
+        options, facts = pipeline.with_gate(options, cosines)
+        config = options.vote
         neighbors, reliability = halo.neighbors, portion.all_gather(lifted.scalars.reliability)[halo.gaussians]
         own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
         rows = refine_subset(
             portion.curve_rows, neighbors, halo.lifted.directions, reliability, config,
             own=None if config.vote == "paper" else own,
+            labeled=labeled_share(lifted.evidence),
             width=decay_width(team.all_gather(neighbors.spacing), config),
             progress=partial(stages.report, "vote"),
         )  # fmt: skip
         copied = halo.gaussians[rows[: len(gaussians)].long()].int()
+        source = rows[: len(gaussians)].long()
+        changed = team.all_reduce(pipeline.count_changes(halo.lifted, source, gaussians, len(means)))
+        copied = copied if int(changed[0]) > 0 else gaussians.int()
         counts = team.all_reduce(pipeline.count_votes(copied, gaussians, neighbors, reliability))
-    return copied, pipeline.vote_shares(counts, len(means))
+    return copied, options, facts | pipeline.vote_shares(counts, changed, len(means))
 
 
 def build_field_distributed(

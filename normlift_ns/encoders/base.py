@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from normlift_ns.core.arguments import as_tensor
@@ -193,6 +193,9 @@ class RegionFeatures:
 
     regions: Regions
     encoder: Encoder
+    filled: Callable[[str, int, int], Bool[Tensor, "h w"]] | None = None
+    """Function of the name, height and width of an image that returns True at pixels with a color; None if all have
+    one. Other pixels belong to no region."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -238,10 +241,23 @@ class RegionFeatures:
         if len(chosen) == 0 or max(chosen) >= len(maps):
             origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
             raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; select one with --level")
-        return image, maps
+        return image, maps if self.filled is None else _limit_regions(maps, self.filled(name, *image.shape[:2]))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
+
+
+def _limit_regions(
+    maps: Int32[Tensor, "levels depth h w"], kept: Bool[Tensor, "h w"]
+) -> Int32[Tensor, "levels depth h w"]:
+    """Set other pixels than `kept` to -1, and renumber the regions that remain on each level."""
+    if bool(kept.all()):
+        return maps
+    levels = []
+    for level in maps.where(kept.to(maps.device), -1):
+        ids, labels = level.unique(return_inverse=True)
+        levels.append((labels - int(ids[0] == -1)).int())
+    return torch.stack(levels)
 
 
 def drop_zero_rows(
@@ -288,8 +304,9 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
     Args:
         maps: Region of each pixel in each level, or -1 for none.
     Returns:
-        The cell of each pixel, with consecutive ids 0..C-1, or -1 if the pixel is unlabeled in all levels; and the
-        region of each cell in each level, or -1 for none. For one level with consecutive ids, cells equal regions.
+        The cell of each pixel, and the region of each cell in each level. Cells have consecutive ids 0..C-1. Pixels
+        that are unlabeled in all levels have the cell -1, and cells without a region in a level have -1. For one level
+        with consecutive ids, cells equal regions.
     """
     key = torch.zeros_like(maps[0], dtype=torch.int64)
     key_count = 1
@@ -381,7 +398,7 @@ class PatchFeatures:
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the image is invalid, or the weight file is damaged or of another architecture.
+            ValueError: If the image is invalid, or the weight file is damaged or of a different architecture.
             MemoryError: If the image does not fit into the memory of the device.
         """
         check_image(image, name)

@@ -175,7 +175,7 @@ def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
     """Read and check a model folder, without reading its weights and vocabulary.
 
     Raises:
-        InputError: If the folder is incomplete, damaged or of another architecture.
+        InputError: If the folder is incomplete, damaged or of a different architecture.
     """
     remedy = f"set --encoder-model to a folder of a {family.title} network or to a name such as {family.default_model}"
     try:
@@ -351,7 +351,7 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
 
     Raises:
         InputError: If packages are missing or too old, an option applies only to another encoder, or the folder has
-            another architecture.
+            a different architecture.
         FileNotFoundError: If the folder does not exist, or the network cannot be downloaded.
     """
     check_transformers_version(family)
@@ -394,7 +394,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 
     Raises:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
-        InputError: If the network has another architecture.
+        InputError: If the network has a different architecture.
     """
     local = find_local_model(model)
     if local is not None:

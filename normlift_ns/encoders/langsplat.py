@@ -55,7 +55,7 @@ def open_segment_map(path: Path) -> np.ndarray:
     """Open a segment map, [C, H, W], as a memory map without checking its values.
 
     Raises:
-        FileNotFoundError, ValueError: If the file does not exist, is damaged, or has another type or shape.
+        FileNotFoundError, ValueError: If the file does not exist, is damaged, or has the wrong type or shape.
     """
     segments = read_npy(path, "segment map")
     segments = segments[None] if segments.ndim == 2 else segments
@@ -227,8 +227,8 @@ class LangSplat:
 
         Raises:
             FileNotFoundError: If an image has no features, or, with `missing="skip"`, if no image has features.
-            ValueError: If a file is damaged or has another shape, tables have rows of different lengths, or two images
-                share their files.
+            ValueError: If a file is damaged or has the wrong shape, tables have rows of different lengths, or two
+                images share their files.
         """
         files_of: dict[str, _Files] = {}
         for name in names:
@@ -319,7 +319,7 @@ class LangSplat:
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return whether a map can show the same image at another resolution.
+    """Return whether a map can show the same image at a different resolution.
 
     The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
     within 2 % of each other must be equal, because a small difference is probably a crop.

@@ -251,7 +251,7 @@ class TextTower:
 def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
     """Load the plain text tower of an OpenCLIP model, or return None if this is not possible.
 
-    The result is None if the tower is of another kind, its weights are not on this machine, or loading fails.
+    The result is None if the tower is of a different kind, its weights are not on this machine, or loading fails.
     `OpenClipEncoder` then loads the model, or reports the error.
     """
     try:

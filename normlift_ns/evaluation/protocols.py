@@ -57,7 +57,7 @@ def read_names(path: Path) -> Names:
 
     Raises:
         FileNotFoundError: if the file does not exist.
-        ValueError: if the file has another format.
+        ValueError: if the file has the wrong format.
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
@@ -83,7 +83,7 @@ def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width:
     """Return the class of every pixel of an image, or -1 for pixels to ignore.
 
     Raises:
-        FileNotFoundError, ValueError: if the mask is missing, is damaged, or has another size. The message names the
+        FileNotFoundError, ValueError: if the mask is missing, is damaged, or has the wrong size. The message names the
             file.
     """
     values = masks.values(name)

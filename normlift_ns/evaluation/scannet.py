@@ -194,7 +194,7 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
     """Run protocol scannet with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: if labels are missing or damaged, or have another number of vertices.
+        FileNotFoundError, ValueError: if labels are missing or damaged, or have the wrong number of vertices.
     """
     truths = [read_labels(path) for path in labels]
     inputs = zip(runs, scene_names(labels), labels, truths)

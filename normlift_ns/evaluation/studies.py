@@ -184,10 +184,11 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
 def voting_scalars(field: SemanticField) -> Scalars:
     """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is replaced by the value before the consensus, which R was computed from.
+    With consensus, ||f|| is the value before the consensus, from which the paper's R was computed. Other kinds of R do
+    not give this value, and the vote then reads ||f|| and R as they are stored.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})
-    if not options.get("consensus", False):
+    if not options.get("consensus", False) or options.get("reliability", "paper") != "paper":
         return scalars
     support = reliability(1.0, scalars.n_eff, options.get("reliability_beta", BETA))
     return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))

@@ -300,7 +300,7 @@ def atomic_files(
         own: Skip the checks of inputs and kinds, for files of runs and caches that this package wrote itself.
     Raises:
         FileExistsError: A path exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind. No file has changed.
+        ValueError: The errors of `refuse_inputs`, or an existing file is of a different kind. No file has changed.
         NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
 
     >>> import tempfile
@@ -403,7 +403,9 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
             if file.relative_to(new).as_posix() in replaced or (keep_new and os.path.lexists(file)):
                 continue
             if os.path.lexists(file):
-                raise InputError(f"{source / name} is not part of the old run, but of the new one; move it elsewhere")
+                raise InputError(
+                    f"{source / name} is not a file of the old lift, but the new one writes it; move it elsewhere"
+                )
             try:
                 os.link(source / name, file, follow_symlinks=False)
             except OSError:
@@ -554,7 +556,7 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
         flags: Flags for choosing another path, quoted in the error message.
     Raises:
         FileExistsError: One of the paths exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`, or an existing file is of another kind than its suffix.
+        ValueError: The errors of `refuse_inputs`, or the content of an existing file does not match its suffix.
     """
     refuse_inputs(paths, instead=flags)
     for folder in {path.parent for path in paths}:

@@ -39,7 +39,7 @@ class RowArrays(NamedTuple):
             name: Name of the matrix, for the error message.
             num_columns: Number of columns of the matrix.
         Raises:
-            ValueError: An array has another type or shape, a column is out of range, or a weight is negative or not
+            ValueError: An array has the wrong type or shape, a column is out of range, or a weight is negative or not
                 finite.
         """
         weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"

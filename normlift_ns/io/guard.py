@@ -140,7 +140,7 @@ def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callabl
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
-    """Yield the kind, folder and pattern of entries of each run and data set that contains a folder."""
+    """Yield each run and data set that contains `folder`, as its kind, its path and a pattern of its entries."""
     for parent in (folder, *map(str, Path(folder).parents)):
         for kind, markers, names in _OWNERS:
             if all(os.path.exists(os.path.join(parent, marker)) for marker in markers):
@@ -164,7 +164,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
         kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
         flags: Flags for choosing the output, quoted in the error message.
     Raises:
-        ValueError: `path` is a folder, a pipe, a device or a broken link, or its content is of another kind.
+        ValueError: `path` is a folder, a pipe, a device or a broken link, or its content is of a different kind.
     """
     if not os.path.lexists(path):
         return

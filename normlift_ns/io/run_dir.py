@@ -335,6 +335,6 @@ def check_file_digests(folder: Path) -> None:
         actual = file_digest(path)
         if actual != expected:
             raise InputError(
-                f"{path} is damaged or from another run than {folder}: its content has digest {actual}, expected "
+                f"{path} is damaged or from a different run than {folder}: its content has digest {actual}, expected "
                 f"{expected}; copy the whole run again, or {LIFT_AGAIN}"
             )

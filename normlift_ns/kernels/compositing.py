@@ -75,7 +75,7 @@ def _pairs(
     TILE: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, CULL: tl.constexpr, WRITE: tl.constexpr,
     SPLAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Count the cells of every splat, or write them. At most as many are written as were counted."""
+    """Count the cells of every splat, or write at most as many cells as were counted."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < entries
     e = tl.load(order + i, mask=valid, other=0)

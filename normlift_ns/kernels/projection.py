@@ -96,7 +96,7 @@ def _covariance(quats, scales, i, valid):
 
 @triton.jit
 def _row_times(a, b, c, xx, xy, xz, yy, yz, zz):
-    """Return a row of the pose times the covariance; the last entry is summed in another order, as in gsplat."""
+    """Return a row of the pose times the covariance; the last entry is summed in a different order, as in gsplat."""
     return dot(a, b, c, xx, xy, xz), dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
 
 

@@ -17,10 +17,9 @@ from torch import Tensor
 from normlift_ns.kernels.projection import CAMERA, ProjectedSplats, camera_axis, dot
 
 SPLAT_2D = 16
-"""Number of values per splat, read as seven pairs and padded with two zeros.
-
-These are the center u, v in pixels; the first row of the transform; the opacity; half width and half height of the
-square; the other two rows of the transform. See `rasterization.projection.ProjectedGaussians2D`.
+"""Number of values per splat, read as seven pairs and padded with two zeros. The first values are the center u, v in
+pixels, the first row of the transform and the opacity. Half width and half height of the square and the other two rows
+of the transform follow. See `rasterization.projection.ProjectedGaussians2D`.
 """
 _BLOCK = 128
 _LEAST_EXTENT = tl.constexpr(1e-4)

@@ -187,7 +187,7 @@ class PanelWidgets(ActionWidgets):
             )
             self._button(Action.SUGGESTED, hint="Use the threshold suggested by the histogram (dashed line).")
             self._group("Selection", (Action.HIDE, Action.SHOW_ONLY, Action.SHOW_ALL))
-            self._button(Action.SELECT_FLOATERS, hint="Select Gaussians that float free. Check before hiding them.")
+            self._button(Action.SELECT_FLOATERS, hint="Select likely floaters. Check them before you hide them.")
             self.prompt_table = gui.add_markdown("")
             self.histograms = gui.add_markdown("")
             self.rows = ObjectRows(gui, act)

@@ -120,7 +120,7 @@ class QuickRun:
             texts: prompts.
             rules: keyword arguments of `make_query`.
         Raises:
-            ValueError: for the reasons of `make_query`.
+            ValueError: as in `make_query`.
         """
         question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE, gaussian_relevancy, top_values
@@ -223,14 +223,14 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        A prompt that selects one or more Gaussians is a weak match or found.
+        The verdict on a prompt that selects Gaussians is weak match or found.
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it ignores no words except articles."""
+        """Words of the prompt that the encoder uses; None if it ignores at most articles."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -334,7 +334,7 @@ def _judge_all(field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: 
 
 
 def apply_threshold(answer: Answer, question: Query) -> Answer:
-    """Return the answer to a query with the same embeddings but another threshold or minimum reliability.
+    """Return the answer to a query with the same embeddings but a different threshold or minimum reliability.
 
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
     """
@@ -421,15 +421,21 @@ def relevancy_histogram(
         threshold: relevancy above which a Gaussian is selected.
         positions: result of `suggested_range`.
     """
-    values = relevancy[valid].astype(np.float64)
+    values = _ascending(relevancy[valid])
     if len(values) == 0:
         return None
-    low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
+    low, high = min(float(values[0]), threshold), max(float(values[-1]), threshold)
     if high - low < _EPSILON:
         low, high = low - _EPSILON / 2, high + _EPSILON / 2
-    counts, edges = np.histogram(values, HISTOGRAM_BINS, (low, high))
+    edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
+    counts = np.diff(np.searchsorted(values, edges[1:-1]), prepend=0, append=len(values))
     median, top = _median_and_top(values)
     return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(values, median, top, positions))
+
+
+def _ascending(values: Float[np.ndarray, "..."]) -> Float64[np.ndarray, " n"]:
+    """Return the values in ascending order, so that counts and quantiles are fast."""
+    return np.sort(values, axis=None).astype(np.float64)
 
 
 def draw_histogram(
@@ -467,21 +473,20 @@ def suggest_threshold(
     >>> suggest_threshold(np.ones((3, 1)), np.ones(3, bool), (0.4, 0.8)) < 1  # all alike: all are selected
     True
     """
-    values = relevancy[valid].astype(np.float64).ravel()
+    values = _ascending(relevancy[valid])
     return None if len(values) == 0 else _suggest(values, *_median_and_top(values), positions)
 
 
 def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[float, float]) -> float:
-    """Return the threshold at which the selection is most stable, for M >= 1 relevancies."""
+    """Return the threshold at which the selection is most stable, for M >= 1 relevancies in ascending order."""
     if top <= 0:
         return top  # if nothing is relevant, select nothing
     rank = min(_SMALLEST_OBJECT, len(values) // 1000)
-    upper = float(np.partition(values, len(values) - 1 - rank)[len(values) - 1 - rank])
+    upper = float(values[len(values) - 1 - rank])
     if upper - median < _EPSILON:
         return upper - _EPSILON
-    counts, edges = np.histogram(values, _STEPS, (median, upper))
-    higher = (values > upper).sum() + counts[::-1].cumsum()[::-1]
-    above = np.log([*higher, (values >= upper).sum()])  # log N at every edge
+    edges = np.linspace(median, upper, _STEPS + 1)
+    above = np.log(len(values) - np.searchsorted(values, edges))  # log N at every edge
     first, last = (round(_STEPS * position) for position in positions)
     reach = round(_STEPS * _STABLE_OVER)
     steps = np.arange(first, last + 1)
@@ -492,7 +497,10 @@ def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[flo
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:
-    """Return median and top; if the median is at the top, return the minimum instead of the median."""
-    median, top = np.quantile(values, (0.5, TOP_QUANTILE)).tolist()
-    least = float(values.min())
+    """Return median and top of values in ascending order; if the median is at the top, return the minimum instead of
+    the median.
+    """
+    places = [share * (len(values) - 1) for share in (0.5, TOP_QUANTILE)]
+    median, top = (float(np.quantile(values[int(x) : int(x) + 2], x - int(x))) for x in places)
+    least = float(values[0])
     return (least if top - median < _AT_TOP * (top - least) else median), top

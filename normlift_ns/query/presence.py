@@ -17,8 +17,8 @@ from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.options import RelevancyRule
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""found: the prompt matches better than almost all unrelated words. probably not here: it matches no better than many
-of them."""
+"""Presence of a prompt. found: it matches better than almost all unrelated words. probably not here: it matches no
+better than many of them."""
 _FOUND_RANK, _WEAK_RANK = 0.95, 0.8
 """Minimum ranks of a prompt for the verdicts "found" and "weak match"."""
 _FEWEST = 100

@@ -87,7 +87,7 @@ def make_query(
             empty, and lerf otherwise.
         threshold: relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
             None is the threshold of the encoder for its own rule, and otherwise that of `RELEVANCY_RULES`. For the rule
-            cosine with an encoder of another rule, None is "auto", because no threshold suits all encoders.
+            cosine with an encoder that has a different rule, None is "auto", because no threshold suits all encoders.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:

@@ -164,7 +164,7 @@ class SegmentationResult(NamedTuple):
     """Minimum R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Return the mask of reliable enough Gaussians with more than half of their weight inside the masks."""
+        """Return the mask of sufficiently reliable Gaussians with more than half of their weight inside the masks."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 

@@ -97,7 +97,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
 
     Args:
         device: device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
-        cache: folder for a cache of embeddings; None: no cache.
+        cache: folder for a cache of embeddings; None for no cache.
     Raises:
         ValueError: the encoder is unknown, or its weights or the text embeddings are not those of the lift.
         FileNotFoundError: the weights or text embeddings no longer exist.
@@ -220,8 +220,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level. Without it, the rule is cosine for an unknown encoder or a file
-    of text embeddings without the default negatives, and otherwise that of the encoder.
+    The rule is contrast for a field with a null level. Without it, the rule is that of the encoder. The exceptions are
+    unknown encoders and files of text embeddings without the default negatives, which use cosine.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

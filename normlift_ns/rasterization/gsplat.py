@@ -117,7 +117,7 @@ def _project_enormous(
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not float32 on a GPU, or needs other constants than the installed gsplat has."""
+    """Raise ValueError if a scene is not float32 on a GPU, or its constants differ from those of installed gsplat."""
     check_gpu("gsplat", job)
     if job.is_2d:
         raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')

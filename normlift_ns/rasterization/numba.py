@@ -96,7 +96,7 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
 
 
 _STRETCH = 0.1
-"""Relative growth of the covariance of an ellipse that is to contain the same ellipse around another center."""
+"""Relative growth of the covariance of a bounding ellipse with a different center than the ellipse that it bounds."""
 
 
 def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:

@@ -100,7 +100,7 @@ _ROUNDINGS = 4
 
 @kernel
 def _axis(reach, own, mixed, other):  # pragma: no cover (compiled)
-    """Return the parameters of `ellipse_extent` for s in the ellipse own s^2 + 2 mixed s t + other t^2 <= reach.
+    """Return the parameters for `ellipse_extent`. The ellipse is own s^2 + 2 mixed s t + other t^2 <= reach.
 
     The extent is infinite if rounding makes the ellipse degenerate.
     """

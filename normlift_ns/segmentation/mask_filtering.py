@@ -22,7 +22,7 @@ _MIN_KEPT = 3
 class Suppression:
     """Thresholds of LangSplat's mask suppression. The defaults are its settings.
 
-    A mask is inside another mask if it covers less than `outer` of that mask, which covers at least `inner` of it.
+    Mask A is inside mask B if A covers less than `outer` of B, and B covers at least `inner` of A.
     Masks inside other masks are dropped, whatever their score is.
     """
 
@@ -96,8 +96,9 @@ def mask_nms(
 def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
     """Convert masks to a stack of label maps.
 
-    The first map has the index of the last mask of each pixel, and each further map that of the mask before. Remaining
-    entries are -1. The depth of the stack is the largest number of masks that share a pixel, at least 1.
+    At each pixel, the first map has the index of the last mask that covers it, and each further map the index of the
+    previous one. Remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at
+    least 1.
     """
     flat = masks.flatten(1)
     depth = max(1, int(flat.sum(dim=0).max()))
@@ -238,8 +239,8 @@ class _Grid(NamedTuple):
     def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
         """Return the first position of rows, and the position after their last pixel.
 
-        If a row has at least `least` pixels, components that contain a whole row are large. Only rows with edges and
-        the rows above and below them are returned in this case, otherwise all rows.
+        If a row has at least `least` pixels, components that contain a whole row are large. The result then has only
+        rows with edges and the rows above and below them. Otherwise, it has all rows.
         """
         near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True

@@ -154,7 +154,7 @@ class LabelFiles(RegionDefaults):
     level: int | None = None
     """Index of the selected level in NPY files [levels, H, W], or None for files [H, W]."""
     resample: bool = False
-    """True to resize maps of another size by nearest-neighbor interpolation, False to raise an error."""
+    """True to resize maps of a different size by nearest-neighbor interpolation, False to raise an error."""
     divisor: int = 1
     """Factor by which images were downscaled (`lift_downscale`). Maps of full-size images are downscaled to match."""
     undistort: Callable[[str, np.ndarray], np.ndarray] | None = None
@@ -222,7 +222,7 @@ class LabelFiles(RegionDefaults):
         Raises:
             FileNotFoundError: If the label map does not exist.
             ValueError: If a map cannot be read, or has color channels or fractional values.
-            ValueError: If a map has another size than the image, and `resample` is False.
+            ValueError: If a map and its image differ in size, and `resample` is False.
         """
         path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
@@ -232,7 +232,7 @@ class LabelFiles(RegionDefaults):
                 raise InputError(
                     f"{self.description} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image "
                     f"{name} is {width}x{height}{downscaled}. Make {self.description}s of the size of the image, which "
-                    "undistortion can crop, or resize them with --regions-resample True"
+                    "undistortion may have cropped, or resize them with --regions-resample True"
                 )
             maps = resample_nearest(maps, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]

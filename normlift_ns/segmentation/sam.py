@@ -27,6 +27,7 @@ from normlift_ns.segmentation.checkpoint import (
     check_sam_checkpoint,
     import_transformers,
     load_sam_checkpoint,
+    resolve_precision,
     sam_identity,
 )
 from normlift_ns.segmentation.regions import RegionDefaults
@@ -264,12 +265,6 @@ _MEAN = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
 _STD = torch.tensor([58.395, 57.12, 57.375])[:, None, None]
 _BATCHES = {"cuda": (5, 256, 64), "cpu": (1, 16, 16)}
 """Numbers of images, prompts and masks per batch, by device type."""
-
-
-def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
-    """Return the precision of a network on a device, with "auto" replaced by the default of the device."""
-    default: SamPrecision = "float16" if torch.device(device).type == "cuda" else "float32"
-    return default if precision == "auto" else precision
 
 
 class PromptedNetwork(ABC):

@@ -26,11 +26,11 @@ from normlift_ns.segmentation.checkpoint import (
     load_pretrained_sam,
     locate_sam,
     read_sam_family,
+    resolve_precision,
     transformers_folder,
 )
 from normlift_ns.segmentation.mask_filtering import stack_masks
 from normlift_ns.segmentation.regions import RegionDefaults
-from normlift_ns.segmentation.sam import resolve_precision
 
 SCORE_THRESHOLD = 0.5
 """Largest score of masks that are dropped, as in the model card.

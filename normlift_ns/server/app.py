@@ -166,7 +166,7 @@ def _limited(receive: Receive) -> Receive:
 
 
 def _accepts_gzip(header: str) -> bool:
-    """Return True if a header Accept-Encoding names gzip, and not with the weight 0.
+    """Return True if an Accept-Encoding header lists gzip with a weight above 0.
 
     >>> [_accepts_gzip(one) for one in ("br, gzip;q=0.8", "GZIP", "gzip;q=0", "gzip; q=0.0", "br", "")]
     [True, True, False, False, False, False]
@@ -245,7 +245,7 @@ class WarmServer:
         """Call `work` in a thread, and return its result.
 
         Args:
-            slow: use the threads for slow work; False: use those for queries.
+            slow: True to use the threads for slow work, False to use those for queries.
         """
         limiter = self.limits.slow if slow else self.limits.asking
         result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)

@@ -111,7 +111,7 @@ def render(served: ServedRun, request: schema.RenderRequest) -> Content:
 
 
 def actions_mode(state: State, mode: str) -> State:
-    """Return the state with another color mode."""
+    """Return the state with a different color mode."""
     return schema.replace(state, color_mode=mode)
 
 

@@ -36,7 +36,7 @@ from normlift_ns.server.runs import ServedRun, without_paths
 
 _INSTRUCTIONS = """Search trained 3D scenes (Gaussian splats with semantics) by text.
 Start with list_runs. Prompts are short nouns such as "red mug". Some encoders accept only certain words; the error for
-another prompt lists the unknown words. The verdict on a prompt is found, weak match or probably not here. list_objects
+other prompts lists the unknown words. The verdict on a prompt is found, weak match or probably not here. list_objects
 counts and locates objects, render draws them, and explain returns the training images that support a match. Positions
 are in scene units."""
 _READS = ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
@@ -47,7 +47,7 @@ _MAX_RESULT = 60_000
 Run = Annotated[str, Field(description="Id of the run, from list_runs")]
 Prompts = Annotated[list[str], Field(description="Short nouns or phrases to search for", max_length=16)]
 ObjectNumber = Annotated[int | None, Field(description="Number of an object from list_objects with the same prompts")]
-Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+Coordinates = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class Tools:
@@ -109,7 +109,7 @@ class Tools:
         of a surface."""
         return _text(http_api.floaters(self._run(run), {}))
 
-    def measure(self, run: Run, start: Point, end: Point) -> str:
+    def measure(self, run: Run, start: Coordinates, end: Coordinates) -> str:
         """Measure the distance between two positions in scene units and in units of the original capture. Use positions
         from the centers and boxes of list_objects."""
         distance = float(np.linalg.norm(np.subtract(start, end)))
@@ -153,7 +153,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
     """Return an MCP server for the runs of a server.
 
     Args:
-        export_dir: folder that the tool export writes to; None: do not offer this tool.
+        export_dir: folder that the tool export writes to; None to omit this tool.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
     tools = Tools(server, export_dir)

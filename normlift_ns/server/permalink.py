@@ -20,16 +20,16 @@ from normlift_ns.session.state import State
 MAX_LINK_LENGTH = 6000
 """Maximum number of characters in a link; web servers reject request lines longer than 8 KB."""
 Finite = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
-Place = tuple[Finite, Finite, Finite]
+Vector = tuple[Finite, Finite, Finite]
 Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 
 
 class PageView(msgspec.Struct, frozen=True):
     """Camera of a page, in scene units."""
 
-    position: Place
-    look_at: Place
-    up: Place
+    position: Vector
+    look_at: Vector
+    up: Vector
     fov: Annotated[float, msgspec.Meta(gt=0, lt=3.14)]
     """Vertical field of view in radians."""
     width: Side = 1280
@@ -72,7 +72,6 @@ class Greeting(msgspec.Struct, frozen=True):
     """Random text stored in the browser tab; it identifies the session after a reload."""
     link: Annotated[str, msgspec.Meta(max_length=MAX_LINK_LENGTH)] = ""
     """Query string of the page's URL, with or without the question mark."""
-    webgl: bool = True
     access: Annotated[str, msgspec.Meta(max_length=200)] = ""
     """Access token for writing; see `app.ServerOptions`."""
 

@@ -12,14 +12,14 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
 from normlift_ns.rendering.colors import Colormap
 from normlift_ns.server.coloring import ColorMode
-from normlift_ns.server.permalink import Finite, Greeting, PageView, Place, Side
+from normlift_ns.server.permalink import Finite, Greeting, PageView, Side, Vector
 
 Text = Annotated[str, msgspec.Meta(max_length=4000)]
 Texts = Annotated[list[Text], msgspec.Meta(max_length=64)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
 Mode = Literal["select", "add", "remove"]
 Points = Annotated[list[tuple[Finite, Finite]], msgspec.Meta(min_length=1, max_length=4000)]
-Row = tuple[Finite, Finite, Finite, Finite]
+MatrixRow = tuple[Finite, Finite, Finite, Finite]
 
 
 class Message(msgspec.Struct, frozen=True):
@@ -41,8 +41,8 @@ class Ask(msgspec.Struct, frozen=True):
 class CameraValue(msgspec.Struct, frozen=True):
     """Camera of a view, as in `core.gaussians.Camera`."""
 
-    K: tuple[Place, Place, Place]
-    world_to_camera: tuple[Row, Row, Row, Row]
+    K: tuple[Vector, Vector, Vector]
+    world_to_camera: tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
     width: Side
     height: Side
 
@@ -54,8 +54,8 @@ class CameraValue(msgspec.Struct, frozen=True):
 class Ray(msgspec.Struct, frozen=True):
     """Ray in scene units."""
 
-    origin: Place
-    direction: Place
+    origin: Vector
+    direction: Vector
 
 
 class Pick(Ray, frozen=True):
@@ -92,7 +92,7 @@ class Target(msgspec.Struct, frozen=True):
     """Object or position to look at."""
 
     id: Count | None = None
-    position: Place | None = None
+    position: Vector | None = None
 
 
 class Save(msgspec.Struct, frozen=True):

@@ -203,7 +203,7 @@ class ExplainResult(msgspec.Struct, frozen=True):
 MAX_OBJECTS = 64
 
 
-def make_query(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], Query]:
+def encode_question(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], Query]:
     """Encode a question, and return its prompts and the query.
 
     Raises:
@@ -220,7 +220,7 @@ def make_query(served: ServedRun, question: Question) -> tuple[tuple[Any, ...], 
 
 def answer(served: ServedRun, question: Question) -> Answer:
     """Return the answer to a question."""
-    return served.space.answer(make_query(served, question)[1])
+    return served.space.answer(encode_question(served, question)[1])
 
 
 def answered(served: ServedRun, question: Question) -> tuple[Answer, QueryResult]:
@@ -252,7 +252,7 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
-        state = actions.ask(state, *make_query(served, selection.question))
+        state = actions.ask(state, *encode_question(served, selection.question))
         state = actions.show_prompt(state, selection.prompt)
     if selection.object is not None:
         state = actions.select(state, find_object(state, selection.object).mask)

@@ -400,7 +400,7 @@ class PageSession:
         row = None if value.object is None else self._object(value.object)
         mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
         if not bool(mask.any()):
-            raise InputError("Nothing is selected. Select Gaussians to export first.")
+            raise InputError("Nothing is selected. First select the Gaussians to export.")
 
         async def work() -> None:
             try:
@@ -460,7 +460,7 @@ class PageSession:
             await self._ask_line(seq, threshold=link.threshold)
 
     async def _follow(self, greeting: Greeting, seq: int) -> Link | None:
-        """Apply clicks, camera and color mode from the link in the page's URL, unless the page opened it before."""
+        """Apply clicks, camera and color mode from the link in the page's URL, unless the page has already used it."""
         memory, link = self._memory, None
         try:
             link = read_link(greeting.link) if greeting.link != memory.link else None

@@ -82,7 +82,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    If `question` uses the suggested threshold, it keeps it unless the user chose the previous threshold.
+    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose that one.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -128,7 +128,7 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
-    """Apply a query with the same prompts but another rule or other features. Clicked selections are kept."""
+    """Apply a query with the same prompts but a different rule or different features. Clicked selections are kept."""
     return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
@@ -279,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
+    """Add Gaussians to the selection. After growing or shrinking, it no longer depends on prompts."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -288,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. Prompts and thresholds stay in effect unless it was grown or shrunk."""
+    """Remove Gaussians from the selection. After growing or shrinking, it no longer depends on prompts."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)
@@ -330,7 +330,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to hide first.")
+        raise InputError("Nothing is selected. First select the Gaussians to hide.")
     hidden = chosen if state.hidden is None else state.hidden | chosen
     return replace(state, hidden=hidden, action=f"Hide {int(chosen.sum()):,}")
 
@@ -345,7 +345,7 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to isolate first.")
+        raise InputError("Nothing is selected. First select the Gaussians to isolate.")
     return replace(state, hidden=~chosen, action=f"Only {int(chosen.sum()):,}")
 
 

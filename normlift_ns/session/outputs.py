@@ -27,9 +27,9 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
 
     Args:
         folder: folder of the field.
-        replaces: delete the prompts that the run already stores; False: keep them.
+        replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
-        ValueError: there is no query or no folder, or for the reasons of `merge_queries`.
+        ValueError: there is no query or no folder, or as in `merge_queries`.
     """
     if query is None or folder is None:
         raise InputError("There is no query yet, so there are no prompts to save. Type a prompt and press Ask.")
@@ -62,7 +62,7 @@ def selection_bytes(
         ValueError: the mask has no Gaussian that a renderer draws, or the exporter does not exist.
     """
     if not bool(mask.any()):
-        raise InputError("Nothing is selected. Select the Gaussians to export first.")
+        raise InputError("Nothing is selected. First select the Gaussians to export.")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / safe_file_name(name)
         if kind == "masks":

@@ -20,7 +20,7 @@ CLICK_THRESHOLD = 0.9
 """Minimum cosine between the directions of a clicked Gaussian and a similar one."""
 _PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
-_CLICK_RULE = "Clicks need the rule cosine. Choose the rule cosine, or ask clicks without other prompts."
+_CLICK_RULE = "Clicks need the rule cosine. Choose the rule cosine, or ask for clicks without other prompts."
 EncodeTexts = Callable[[Sequence[str]], Any]
 """Function from texts to vectors [Q, D], such as an encoder's `rows`. It raises ValueError if it cannot encode a text.
 """
@@ -151,7 +151,7 @@ def build_query(
     Returns:
         The rows, with an error for each click if the rule is not cosine, and their query.
     Raises:
-        ValueError: no row has a vector, or for the reasons of `make_query`.
+        ValueError: no row has a vector, or as in `make_query`.
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]

@@ -118,7 +118,7 @@ def _send_in_order(connection: Any) -> None:
 def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
     """Add a row of buttons to a panel; an empty label takes no space.
 
-    This function works around an error in viser 0.2.7, which ignores the button of a group that was pressed last, and
+    This function works around an error in viser 0.2.7. viser ignores the button of a group that was pressed last, and
     the first button before any press.
 
     Args:

@@ -401,7 +401,7 @@ class Explanation:
         """Compute the explanation of a selection. This can take seconds, so call it without a lock, from any thread.
 
         Raises:
-            ValueError, FileNotFoundError: for the reasons of `explanation_mdx`, unless the request is stale.
+            ValueError, FileNotFoundError: as in `explanation_mdx`, unless the request is stale.
         """
         content = ""
         try:

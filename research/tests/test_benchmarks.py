@@ -1,6 +1,22 @@
 """The benchmarks run and report what they promise, and the errors beside the times are small."""
 
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from normlift_ns import Evidence, lift
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.metrics import class_scores, classify, confusion
+from normlift_ns.core.sparse import SparseRows
+from research.coverage import Outcome, Sums
+from research.damage import Observed
+from research.documents import documents
+from research.hard_case import QUANTITIES, Case, Setting
+from research.numerics import CASES, main
 from research.tests import quick
+from research.variants import lifted_scores
 from tests.captures import needs_shared
 
 
@@ -28,3 +44,63 @@ def test_quick_front_ends_benchmark(tmp_path):
     bounds |= dict.fromkeys(("encode_10_s", "patches_s", "sam_encoder_s", "sam2_encoder_s"), 1e-5)
     for key, most in (bounds | dict.fromkeys(("sam_decoder_s", "sam2_decoder_s"), 1e-4)).items():
         assert metrics[key]["error"] <= most, key
+
+
+GAUSSIANS, VIEWS, REGIONS, CLASSES = 40, 14, 5, 3
+
+
+def observed(seed: int = 0) -> tuple[Any, Any, Observed, SparseRows]:
+    """A world without geometry: random evidence of regions, each nearly of one class."""
+    g = torch.Generator().manual_seed(seed)
+    words = torch.nn.functional.normalize(torch.randn(CLASSES, 8, generator=g), dim=1)
+    truth = torch.randint(0, CLASSES, (GAUSSIANS,), generator=g)
+    parts = []
+    for _ in range(VIEWS):
+        rows = (torch.rand(GAUSSIANS, generator=g) < 0.3).nonzero().squeeze(1)
+        column = 1 + truth[rows] + torch.randint(0, 2, (len(rows),), generator=g)
+        parts.append(Entries(rows, column, torch.rand(len(rows), generator=g), num_regions=(REGIONS,)))
+    evidence = Evidence.from_entries(parts, GAUSSIANS)
+    shown = torch.arange(VIEWS * REGIONS) % REGIONS % CLASSES
+    noise = 0.7 * torch.randn(VIEWS * REGIONS, 8, generator=g)
+    features = torch.nn.functional.normalize(words[shown] + noise, dim=1)
+    world = SimpleNamespace(truth=truth, classes=CLASSES, cameras=[None] * VIEWS)
+    seen = evidence.view_weights()
+    return world, SimpleNamespace(classes=words), Observed(evidence, features, torch.zeros(1, 0), []), seen
+
+
+@pytest.mark.parametrize("views", [[0], [1, 2, 7], list(range(VIEWS))])
+def test_sums_answer_as_the_lift_does(views):
+    world, words, found, _ = observed()
+    evidence = found.evidence.select_views(views)
+    scores = lifted_scores(lift(evidence, found.features[found.evidence.columns_of(views)]), words.classes)
+    answer = classify(scores.cosine, scores.valid)
+    expected = 100 * class_scores(confusion(world.truth, answer, CLASSES)).miou
+    assert Sums(world, words, found, torch.arange(GAUSSIANS)).miou(views) == pytest.approx(expected)
+    assert 0 < expected < 100
+
+
+def test_percentile_counts_ties_half():
+    assert Outcome(0.0, 3.0, [1.0, 2.0, 3.0, 4.0], 5.0).percentile == 62.5
+
+
+def test_recorded_errors_are_those_of_the_cases_and_within_their_bounds():
+    assert len({case.key for case in CASES}) == len(CASES)
+    for case in CASES:
+        errors = case.measure(Setting(small=True))
+        for name in ("numerics", "numerics_gpu"):
+            values = documents()[name].values
+            recorded = {key.split(".")[1]: x for key, x in values.items() if key.split(".")[0] == case.key}
+            assert set(recorded) == (set(errors) if len(values) > 0 else set()), case.key  # else measure again
+            assert case.failures(recorded) == []
+
+
+def test_what_is_not_a_number_fails_and_a_run_that_fails_says_where(monkeypatch, tmp_path):
+    case = Case("some", "", "", "", lambda setting: {}, {"direction": 1.0})
+    assert case.failures({"direction": 0.5, "scalars": 1e-6, "wrong": 0}) == []
+    errors = {"direction": float("nan"), "scalars": 1e-4, "wrong": 1}
+    assert [line.split(" ")[1] for line in case.failures(errors)] == list(errors)
+    assert all(quantity.bound <= 1e-4 for quantity in QUANTITIES.values())
+    monkeypatch.setattr("research.numerics.CASES", (Case("some", "", "", "", lambda setting: {"wrong": 2}),))
+    with pytest.raises(SystemExit, match=r"some: wrong 2\.0e\+00, at most 0"):
+        main("cpu", tmp_path)
+    assert (tmp_path / "numerics.json").exists()

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.evaluation.studies import variant_source
-from research.batched_votes import _parts, voters_of
+from research.batched_votes import parts, voters_of
 from research.candidates import Candidate
 from research.damage import GROUP, LADDER, Damage, observe
 from research.documents import read
@@ -80,7 +80,7 @@ def test_votes_are_those_of_refine(world):
     observed = observe(world, WORDS, LADDER["hard"], 0)
     lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
     voters = voters_of(neighbors, world.truth, CLASSES)
-    (part,) = _parts(lifted, voters, cosines=True)
+    (part,) = parts(lifted, voters, cosines=True)
     for name in ("plain_knn", "norm_only", "support_only", "paper", "posterior"):
         for delta in (0.0, 0.1):
             vote = "posterior" if name == "posterior" else "paper"
@@ -104,8 +104,8 @@ def test_quick_grid(tmp_path):
 
 def test_real_features_have_the_cosines_of_the_fox():
     values = {key.removeprefix("fox."): x for key, x in read(RESULTS / "geometry.json").values.items()}
-    paired = {"two_things": "two_things.two_views", "two_parts": "thing.two_views",
-              "two_parts_one_view": "thing.one_view"}  # fmt: skip
+    paired = {"two_things": "two_things.two_views", "twoparts": "thing.two_views",
+              "twoparts_one_view": "thing.one_view"}  # fmt: skip
     measured = {key: values[paired.get(key, key)] for key in vars(FOX)}
     assert measured == pytest.approx(vars(FOX), abs=5.1e-4, rel=2e-3)
     things, views, words = 12, 40, orthogonal_words(12)
@@ -128,7 +128,7 @@ def test_real_features_have_the_cosines_of_the_fox():
     assert float(wrong.mean()) == pytest.approx(FOX.wrong, abs=0.04) and bool((wrong > 0.02).all())
 
 
-def test_regions_of_real_features_are_parts_of_things(room):
+def test_regions_of_real_features_areparts_of_things(room):
     plain, real = (observe(room, orthogonal_words(16), Damage(noise=0.0), 0, like) for like in (None, FOX))
     alike = (real.features @ real.features.T > 1 - 1e-5).unique(dim=0)
     assert 2 * 16 < len(alike) <= 16 * PARTS

@@ -90,6 +90,7 @@ def test_things_of_a_room_are_listed_with_boxes_and_names(inventory: Inventory, 
     assert 0 < max(inventory.catalog.objects[best - 1].capture.box.size) < 2
 
 
+@pytest.mark.slow
 def test_command_writes_a_list_and_a_picture(inventory, lifted, tmp_path, monkeypatch, capsys) -> None:
     words, picture, table = tmp_path / "words.txt", tmp_path / "room.png", tmp_path / "room.json"
     words.write_text("black\n\n yellow \nred\n", encoding="utf8")

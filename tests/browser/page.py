@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator
 
 _BARE = ".bare #stage > :not(#canvas, #still), .bare #toasts, .bare #tip { visibility: hidden; }"
-_CALM = """() => {
+CALM = """() => {
   const {scene, revision} = page;
+  if (!page.started) return false;
   if (!scene) return !document.querySelector("#still").hidden && !page.stills.waiting;
   const {splats, busy, waiting, coarse, plain, spark} = scene;
   return splats && spark.activeSplats > 0 && !(busy || waiting || coarse || plain || spark.sorting) && revision > 0;
@@ -96,7 +97,7 @@ class OnPage(Person):
         self.calm()
 
     def calm(self) -> None:
-        self.until(lambda: self.page.evaluate(_CALM), "the scene is drawn")
+        self.until(lambda: self.page.evaluate(CALM), "the scene is drawn")
 
     def state(self, name: str) -> Any:
         return self.page.evaluate(f"page.state.{name}")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tests.browser.person import COARSE, Person, coloured, draw_in_software
-from tests.browser.server import STOCK, Server
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator
@@ -19,12 +15,6 @@ TITLE = 52
 """Height of the title bar in pixels."""
 HIDDEN = "Gaussians are hidden"
 """What the panel says while something is."""
-
-
-@contextmanager
-def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
-    with Server(STOCK, config, log, cwd=cwd).running() as address:
-        yield address
 
 
 class Tab(Person):

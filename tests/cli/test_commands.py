@@ -151,6 +151,7 @@ def clip(tmp_path_factory) -> tuple[object, ...]:
     return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check-alignment", "False")
 
 
+@pytest.mark.slow
 def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path, monkeypatch, capsys):
     flags = ("--load-config", little, *clip, "--output-dir", tmp_path, "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
@@ -274,6 +275,7 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
     assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} < set(frame)
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
     columns, splat = ply_columns(random_splat(5)), ply_columns(SplatParameters(**open_scene(little).parameters))
     write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})

@@ -20,6 +20,8 @@ from normlift_ns.evaluation.studies import Variant
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from tests.cli.conftest import run_entry, said
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def capture(little_lifted: Path) -> Path:
@@ -37,7 +39,6 @@ def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     return score
 
 
-@pytest.mark.slow
 def test_coverage_needs_no_truth(little_lifted, tmp_path, monkeypatch, capsys):
     flags = ("--load-config", little_lifted, "--study", "coverage", "--output-path", tmp_path / "next.json")
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0
@@ -104,7 +105,6 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     assert min(row["miou_3d"] for row in rows.values()) > 0.2
 
 
-@pytest.mark.slow
 def test_scannet_with_stand_in_names(scored, little_room, tmp_path):
     ids = list(NYU40)[: len(little_room.names)]
     vertices = np.zeros(len(little_room.labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u2")])
@@ -143,7 +143,6 @@ def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted:
 WANTED = ("sky blue", "bright blue", "dark green")
 
 
-@pytest.mark.slow
 def test_lerf_with_stand_in_words(scored, little_lifted, little_room, capture, tmp_path, monkeypatch, capsys):
     labels = tmp_path / "label" / "room"
     for stem in ("0000", "0006"):  # a training view and a held-out one

@@ -73,7 +73,7 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int) ->
         np.save(folder / f"{path.stem}_f.npy", table.astype(np.float16).astype(np.float32))
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes."""
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415

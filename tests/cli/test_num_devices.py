@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,21 +58,10 @@ def field_of(output: Path) -> dict[str, bytes]:
     return files | {"manifest": json.dumps(facts, sort_keys=True).replace(str(output), "").encode()}
 
 
-def check_same(outputs: Sequence[Path]) -> None:
-    first, *others = (field_of(output) for output in outputs)
-    assert "field.safetensors" in first
-    for found in others:
-        assert found.keys() == first.keys()
-        assert [name for name in first if found[name] != first[name]] == []
-
-
-def test_two_and_three_processes_write_the_files_of_one(trained, alone, tmp_path):
-    for count in (2, 3):
-        done = lifted(*words(trained, tmp_path / str(count), count))
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.count("ns-normlift-query") == 1  # one process speaks
-    check_same([alone, *(tmp_path / str(count) for count in (2, 3))])
-    assert list(tmp_path.glob("**/team-*")) == []
+def check_same(*outputs: Path) -> None:
+    first, found = map(field_of, outputs)
+    assert "field.safetensors" in first and found.keys() == first.keys()
+    assert [name for name in first if found[name] != first[name]] == []
 
 
 def children(pid: int) -> list[int]:
@@ -82,7 +70,7 @@ def children(pid: int) -> list[int]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("rank", [1, pytest.param(0, marks=pytest.mark.extra)])
-def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained, alone, tmp_path):
+def test_a_process_that_is_killed_ends_all_and_three_write_the_files_of_one(rank, trained, alone, tmp_path):
     command, output = words(trained, tmp_path / "killed", 2), tmp_path / "killed"
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     until(lambda: len(children(process.pid)) == 2)
@@ -95,9 +83,11 @@ def test_a_process_that_is_killed_ends_all_and_a_rerun_is_the_same(rank, trained
     if killed:
         assert process.returncode == 1
         assert f"Process {rank} (of 0..1)" in said and "SIGKILL" in said and "Traceback" not in said
-    again = lifted(*words(trained, output, 2, "--overwrite", "True"))
+    again = lifted(*words(trained, output, 3, "--overwrite", "True"))
     assert again.returncode == 0, again.stderr
-    check_same([alone, output])
+    assert again.stdout.count("ns-normlift-query") == 1  # one process speaks
+    check_same(alone, output)
+    assert list(tmp_path.glob("**/team-*")) == []
 
 
 def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trained, tmp_path):
@@ -121,6 +111,7 @@ def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trai
         assert not any("Traceback" in text or "bug in normlift_ns" in text for text in said), said
 
 
+@pytest.mark.extra
 def test_one_process_tells_of_a_mistake(trained, tmp_path):
     done = lifted(*words(trained, tmp_path / "x", 2, "--regions", "files", "--regions-dir", str(tmp_path)))
     assert done.returncode == 1 and "Traceback" not in done.stderr

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import InputError, RefineConfig, lift, nearest_neighbors, refine, refine_variant, unsupported
-from normlift_ns.core.refine import clamp_k
+from normlift_ns.core.refine import clamp_k, labeled_share
 from normlift_ns.evaluation.studies import Variant, recorded_vote
 from normlift_ns.options import VOTE_DEFAULTS, VoteParameters
 from tests.examples import examples
@@ -194,6 +194,20 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
             assert int(found) == (0 if kind == "paper" and delta > 0 else winner)
 
 
+def test_gaussians_outside_of_regions_keep_their_direction():
+    means, u, r = scene(4)
+    labeled, own = torch.rand(60, generator=generator(5), dtype=torch.float64), 5 * r
+    free = refine(means, u, r, RefineConfig(k=12), own=own)
+    held = refine(means, u, r, RefineConfig(k=12, min_labeled=0.5), own=own, labeled=labeled)
+    itself = torch.arange(60, dtype=torch.int32)
+    assert torch.equal(held, torch.where(labeled >= 0.5, free, itself)) and not torch.equal(held, free)
+    assert torch.equal(refine(means, u, r, RefineConfig(k=12, min_labeled=0.0), own=own, labeled=labeled), free)
+    evidence = random_evidence(40, [2, 3], 0, fill=0.3)
+    whole = evidence.rows.row_sums() + evidence.unlabeled.row_sums()
+    expected = torch.where(whole > 0, evidence.rows.row_sums() / whole, 1.0)
+    assert torch.equal(labeled_share(evidence), expected) and bool((whole == 0).any())
+
+
 def test_coincident_gaussians_copy_the_most_reliable():
     means = torch.zeros(6, 3, dtype=torch.float64)
     u = unit_rows(1, 8, 0).repeat(6, 1)
@@ -225,22 +239,27 @@ def test_defaults_are_those_of_the_kind_of_vote():
     """A number given counts for either kind."""
     assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTE_DEFAULTS["posterior"]._replace(tau=0.5)
     assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
-    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0)
-    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
+    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0, 0.2)
+    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0, 0.0) and RefineConfig().vote == "posterior"
 
 
 def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
-    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0))
+    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0, 0.0))
     manifest = {
         "options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "reliability_beta": 2.0}
     }
     own = recorded_vote(manifest)
-    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1))
+    assert (own.variant, own.config.vote, own.config.numbers) == (
+        "paper",
+        "paper",
+        VoteParameters(2.5, 0.9, 0.4, 0.1, 0.0),
+    )
     assert recorded_vote({}).config == RefineConfig()
-    told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
-    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.05, "sigma_d": 2.0, "tau": 0.5}
+    told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # gamma may still be measured
+    numbers = {"k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5, "min_labeled": 0.2}
+    assert told == {"vote": "posterior", **numbers}
     assert recorded_vote({"options": {"vote": told}}).variant == "posterior"
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new

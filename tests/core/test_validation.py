@@ -65,16 +65,6 @@ def test_a_vote_refuses_directions_that_are_none():
         refine(**given, config=RefineConfig(k=5))
 
 
-def test_a_vote_takes_arrays_of_every_library_and_names_what_is_none(unchecked):
-    expected = refine(**voters(), config=RefineConfig(k=5))
-    for name, value in voters().items():
-        for same in (value.numpy(), value.tolist()):
-            assert torch.equal(refine(**{**voters(), name: same}, config=RefineConfig(k=5)), expected)
-        for wrong in ("x", 5, [["a"]], value.int(), value[0], {}):
-            with pytest.raises(TypeError, match=f"^{name} must be "):
-                refine(**{**voters(), name: wrong}, config=RefineConfig(k=5))
-
-
 def test_a_vote_of_nobody_says_so():
     for n in (0, 1):
         with pytest.warns(UserWarning, match=f"{n} Gaussian"):

@@ -26,6 +26,7 @@ NUMBERS = {
     "FULL_OPENCV": 6,
 }
 NUMBERS |= {"SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10}
+NUMBERS |= {"SIMPLE_FISHEYE": 14, "FISHEYE": 15}
 
 
 def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> SplatParameters:
@@ -126,6 +127,8 @@ def camera_parameters(model: str, c: Intrinsics) -> list[float]:
         "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.k3, c.k4],
         "SIMPLE_RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1],
         "RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1, c.k2],
+        "SIMPLE_FISHEYE": [c.fx, c.cx, c.cy],
+        "FISHEYE": [c.fx, c.fy, c.cx, c.cy],
         "THIN_PRISM_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, 0.0, 0.0, c.k3, c.k4, 0.0, 0.0],
     }[model]
 

@@ -158,7 +158,7 @@ def test_cameras_and_images_of_another_scene_are_refused(scene) -> None:
     upside_down = Changed(scene, lambda view: view._replace(image=255 - view.image.flip(0)))
     match = measure_alignment(upside_down)
     assert match.margin < 3
-    with pytest.raises(InputError, match="does not show"):
+    with pytest.raises(InputError, match="does not match its images"):
         alignment_warning(match, trained_cameras=False)
     warning = alignment_warning(match, trained_cameras=True)  # a run that was hardly trained can be lifted
     assert "stopped early" in str(warning)

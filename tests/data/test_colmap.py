@@ -108,6 +108,7 @@ def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
         ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0 0", (0, 0, 0, 0, 0)),
         ("FOV 640 480 500 501 320 240 0", (0, 0, 0, 0, 0)),
         ("OPENCV 640 480 500 501 320 240 0 0 0 0", (0, 0, 0, 0, 0)),
+        ("DIVISION 640 480 500 501 320 240 0", (0, 0, 0, 0, 0)),
     ):
         folder = find_colmap_model(write_colmap(tmp_path / line, frames(1), "PINHOLE", binary=False))
         (folder / "cameras.txt").write_text(f"1 {line}\n")
@@ -117,6 +118,8 @@ def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
         ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"FULL_OPENCV, k4 = 0, k5 = 0\.1"),
         ("FOV 640 480 500 501 320 240 0.5", r"FOV, omega = 0\.5"),
         ("THIN_PRISM_FISHEYE 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"THIN_PRISM_FISHEYE, .*sx1 = 0\.1"),
+        ("SIMPLE_DIVISION 640 480 500 320 240 -0.1", r"SIMPLE_DIVISION, k = -0\.1"),
+        ("EUCM 640 480 500 501 320 240 0.5 1", "EUCM"),
     ):
         (folder / "cameras.txt").write_text(f"1 {line}\n")
         with pytest.raises(InputError, match=f"{message}.*colmap image_undistorter .*--input_path") as caught:

@@ -121,8 +121,8 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     assert float(angles(old.splat.quats, splat.quats).median()) < 0.02
 
     document, binary = _glb(encode_glb(splat, {}, {}))
-    document["buffers"][0]["uri"] = "scene.bin"
-    (tmp_path / "scene.bin").write_bytes(binary)
+    document["buffers"][0]["uri"] = "my%20scene.bin"
+    (tmp_path / "my scene.bin").write_bytes(binary)
     path = tmp_path / "scene.gltf"
     path.write_text(json.dumps(document))
     plain = _read(path).splat
@@ -258,7 +258,12 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.spz", spz[:-30], "truncated or damaged"),
         ("a.spz", changed(spz4, 15, b"\3"), "table of 3 streams"),
         ("a.spz", changed(spz4, 40, b"\xff\xff"), "stream 0 declares"),
-        ("a.spz", spz4[:-9], "truncated or damaged"),
+        ("a.spz", spz4[:-9], r"damaged: its stream 5 ends after"),
+        ("a.spz", spz4[:8], "header ends after 8 of"),
+        ("a.spz", b"<!DOCTYPE html><html>", "HTML page.*Download"),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        ("a.gltf", b'{"lodLevels": 2}', "schema of glTF.*asset"),
+        ("a.glb", _with_glb(lambda d: d["accessors"][2].update(sparse={"count": 1})), "ROTATION in a sparse"),
         ("a.glb", _with_glb(lambda d: _primitive(d)["extensions"].clear()), "0 splats .* among its 1 prim.*not a mesh"),
         ("a.glb", _with_glb(lambda d: d["meshes"].append(d["meshes"][0])), "2 splats"),
         ("a.glb", _with_glb(lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"])), "EXT_meshopt"),
@@ -273,14 +278,16 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(scale=[1e300] * 3)), "not finite"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0])), "rotation of a node is zero"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(matrix=[1] * 12)), "nodes.*matrix"),
-        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(children=[0])), "their own parents"),
-        ("a.glb", _with_glb(lambda d: d["nodes"].append({"mesh": 0})), "several times"),
-        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})), "several t"),
+        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(children=[0])), "its own parent"),
+        ("a.glb", _with_glb(lambda d: d["nodes"].append({"mesh": 0})), "several instances"),
+        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})), "instances"),
         ("a.glb", b"glTF" + bytes(8), "header does not match"),
         ("a.splat", bytes(33), "33 bytes, expected a multiple of 32"),
         ("a.splat", np.full(16, -1, "<f4").tobytes(), "negative scales"),
         ("a.ksplat", bytes(4096), "KSPLAT file.*npx @playcanvas/splat-transform a.ksplat a.ply"),
         ("a.lcc", b"{}", "LCC file.*npx @playcanvas/splat-transform a.lcc a.ply"),
+        ("lod-meta.json", b"{}", "streamed SOG file.*Export a PLY file"),
+        ("a.sog", b"PK\3\4", "SOG file.*npx"),
         ("meta.json", b"{}", "SOG file.*npx @playcanvas/splat-transform meta.json meta.ply"),
         ("a.usdc", b"PXR-USDC", "USDC file.*Export a PLY file"),
     ):  # fmt: skip

@@ -10,9 +10,11 @@ import torch
 from PIL import Image
 
 import normlift_ns as nl
+from normlift_ns.core.evidence import MASKED
 from normlift_ns.data.cameras import read_camera_file
+from normlift_ns.data.fisheye import kept_share, undistort_labels
 from normlift_ns.data.frames import Frame, Intrinsics, check_frames
-from normlift_ns.data.images import ImageViews, kept_share, label_undistortion, undistort_labels
+from normlift_ns.data.images import ImageViews, label_undistortion
 from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.transforms import read_transforms, write_transforms
 from normlift_ns.encoders.base import RegionFeatures
@@ -20,15 +22,19 @@ from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import observe_views
 from normlift_ns.options import SplatOptions
-from normlift_ns.segmentation.regions import LabelFiles
+from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.data.scene_files import ply_columns, random_splat, saved_run, write_colmap, write_ply
 
 LENS = Intrinsics(150.0, 152.0, 104.0, 77.0, 200, 160, k1=0.03, k2=-0.01, k3=0.004, k4=-0.001, fisheye=True)
+WIDE = LENS._replace(fx=100.0, fy=100.0, k1=0.0)
+"""A lens of 115 by 92 degrees."""
 MODELS = {
     "OPENCV_FISHEYE": LENS,
     "THIN_PRISM_FISHEYE": LENS,
     "RADIAL_FISHEYE": LENS._replace(fy=150.0, k3=0.0, k4=0.0),
     "SIMPLE_RADIAL_FISHEYE": LENS._replace(fy=150.0, k2=0.0, k3=0.0, k4=0.0),
+    "SIMPLE_FISHEYE": LENS._replace(fy=150.0, k1=1e-12, k2=0.0, k3=0.0, k4=0.0),
+    "FISHEYE": LENS._replace(k1=1e-12, k2=0.0, k3=0.0, k4=0.0),
 }
 POINTS = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.35], [0.5, 0.4], [-0.55, -0.42]])
 """Tangents x/z and y/z of points in front of the camera."""
@@ -86,7 +92,7 @@ def test_a_point_lands_where_a_pinhole_shows_it(tmp_path: Path, model: str) -> N
     Image.fromarray(blobs(lens, expected, matrix)).convert("RGB").save(file)
     view = views[0]
     assert view.image.shape == (160, 200, 3)
-    assert view.mask is None  # no pixel lies outside of the image
+    assert view.mask is None or view.mask.float().mean() > 0.99
     image = view.image[:, :, 0].double().numpy()
     for x, y in expected:
         rows, columns = slice(int(y) - 9, int(y) + 10), slice(int(x) - 9, int(x) + 10)
@@ -104,7 +110,7 @@ def test_labels_and_masks_are_undistorted_without_interpolation(tmp_path: Path) 
     np.save(maps / "a.npy", labels)
     Image.fromarray(rng.integers(0, 255, (160, 200, 3), np.uint8)).save(file)
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    lens = LENS._replace(k1=0.5, k2=0.5)  # magnifies the rim, so that corners lie outside of the original image
+    lens = WIDE._replace(cy=70.0, k1=0.01)  # the upper and lower rim lie outside of the original image
     for name in (tmp_path / "mask.png", None):
         views = ImageViews([Frame(file, "a.png", np.eye(4)[:3], lens, name)], torch.zeros(3))
         matrix = views.cameras[0].K.double().numpy()
@@ -133,16 +139,71 @@ def test_labels_and_masks_are_undistorted_without_interpolation(tmp_path: Path) 
     )
 
 
-def test_the_share_of_kept_pixels_and_lenses_that_no_pinhole_shows(tmp_path: Path) -> None:
-    for lens in (LENS, LENS._replace(fx=400.0, fy=400.0), LENS._replace(fx=100.0, fy=100.0, k1=0.0)):
-        matrix = ImageViews([Frame(tmp_path, "a", np.eye(4)[:3], lens)], torch.zeros(3)).cameras[0].K.double().numpy()
-        pixels = unproject(lens) * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
-        inside = ((pixels > 0) & (pixels < [200, 160])).all(-1)
-        assert kept_share(lens) == pytest.approx(inside.mean(), abs=0.01)
-    for wrong in (LENS._replace(fx=50.0, fy=50.0), LENS._replace(k1=-0.9)):
-        views = ImageViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], wrong)], torch.zeros(3))
-        with pytest.raises(InputError, match=r"a\.png .*too wide .*colmap image_undistorter"):
-            _ = views.cameras
+@pytest.mark.parametrize(
+    "lens",
+    [
+        LENS,
+        LENS._replace(fx=400.0, fy=400.0),
+        LENS._replace(k1=0.5, k2=0.5),
+        WIDE,
+        WIDE._replace(cx=90.0, cy=90.0, k1=-0.05),
+        LENS._replace(width=220, height=90),
+    ],
+)
+def test_the_longest_focal_length_that_keeps_nine_tenths(tmp_path: Path, lens: Intrinsics) -> None:
+    views = ImageViews([Frame(tmp_path, "a", np.eye(4)[:3], lens)], torch.zeros(3))
+    matrix, tangents = views.cameras[0].K.double().numpy(), unproject(lens)
+    assert np.allclose(matrix[:2, 2], lens[2:4])
+    assert matrix[0, 0] / matrix[1, 1] == pytest.approx(lens.fx / lens.fy)
+
+    def kept(factor: float) -> float:
+        pixels = tangents * matrix[[0, 1], [0, 1]] * factor + matrix[:2, 2]
+        return ((pixels > 0) & (pixels < lens[4:6])).all(-1).mean()
+
+    assert kept(1.02) < 0.9 <= kept(1) < 0.92
+    assert kept_share(lens) == pytest.approx(kept(1), abs=5e-3)
+
+
+def test_pixels_that_no_pinhole_shows_are_named(tmp_path: Path) -> None:
+    """A lens of 230 by 184 degrees: all pixels within 80 degrees are kept."""
+    Image.new("RGB", (200, 160)).save(tmp_path / "a.png")
+    splat = write_ply(tmp_path / "a.ply", ply_columns(random_splat(50)))
+
+    def opened(lens: Intrinsics) -> list[str]:
+        said: list[str] = []
+        path = transforms(tmp_path, lens, {"camera_model": "OPENCV_FISHEYE"}, file_path="a.png")
+        nl.open_splat(splat, nl.SplatOptions(transforms=path, world_transform=None), say=said.append)
+        return said
+
+    lens = LENS._replace(fx=50.0, fy=50.0, cx=100.0, cy=80.0, k1=0.0, k2=0.0, k3=0.0, k4=0.0)
+    y, x = np.mgrid[:160, :200] + 0.5
+    seen = (np.hypot(x - 100, y - 80) / 50 < np.radians(80)).mean()
+    assert kept_share(lens) == pytest.approx(seen, abs=5e-3)
+    assert any(f"{kept_share(lens):.0%}" in text and "80 degrees" in text for text in opened(lens))
+    with pytest.raises(InputError, match=r"a\.png .*fx 10.*colmap image_undistorter"):
+        opened(LENS._replace(fx=10.0, fy=10.0))
+
+
+def test_pixels_that_the_image_does_not_show_have_no_region_and_no_color(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (200, 160), (180, 40, 30)).save(tmp_path / "images" / "a.png")
+    write_colmap(tmp_path, [Frame(tmp_path / "a.png", "images/a.png", np.eye(4)[:3], WIDE)], "OPENCV_FISHEYE")
+    splat = write_ply(tmp_path / "a.ply", ply_columns(random_splat(50)))
+    scene = nl.open_splat(splat, nl.SplatOptions(colmap=tmp_path, world_transform=None, gsplat_normalize=False))
+    view = scene.train[0]
+    assert view.mask is not None
+    assert 0.8 < view.mask.float().mean() < 0.99
+    assert (view.image[~view.mask] == 0).all()
+    assert (view.image[view.mask] == torch.tensor([180, 40, 30], dtype=torch.uint8)).all()  # at its rim too
+    source = RegionFeatures(Grid(30), ColorEncoder())
+    for downscale in (1, 2):
+        block = observe_views(scene, [0], source, render_settings=None, downscale=downscale)
+        mask = view.downscaled(160 // downscale, 200 // downscale).mask
+        assert torch.equal(block.labels[0] == MASKED, ~mask)
+        labels = block.labels[0][mask]
+        assert set(labels.unique().tolist()) - {-1} <= set(range(len(block.features[0])))
+        assert (labels == -1).float().mean() <= 0.02 * (downscale - 1)
+        assert (block.features[0] @ block.features[0].T).min() > 0.999  # no black is mixed into them
 
 
 def test_fisheye_cameras_are_stored_for_nerfstudio(tmp_path: Path) -> None:
@@ -189,6 +250,7 @@ def test_a_splat_is_opened_with_fisheye_images(tmp_path: Path) -> None:
         for downscale in (1, 2):
             block = observe_views(scene, [1], source, render_settings=None, downscale=downscale)
             undistorted = undistort_labels(labels[None], LENS)[0]
-            step = block.labels[0][:, 100 // downscale].numpy()
-            assert np.abs(step - undistorted[downscale // 2 :: downscale, 100]).max() <= downscale - 1
-            assert np.abs(undistorted[:, 100] - labels[:, 100]).max() == 1  # the map is not that of the file
+            step, expected = block.labels[0][:, 100 // downscale].numpy(), undistorted[downscale // 2 :: downscale, 100]
+            assert np.abs(step - expected)[step >= 0].max() <= downscale - 1
+            assert (step >= 0).mean() > 0.9
+            assert (undistorted[:, 100] != labels[:, 100]).any()  # the map is not that of the file

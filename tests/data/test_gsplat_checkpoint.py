@@ -15,7 +15,7 @@ from tests.data.scene_files import ply_columns, random_splat, rows_of, write_gsp
 
 def test_one_file_and_its_ranks_are_read_alike(tmp_path: Path) -> None:
     splat = random_splat(101)
-    alone = read_gsplat_checkpoint(write_gsplat(tmp_path / "alone.pt", splat))
+    alone = read_gsplat_checkpoint(write_gsplat(tmp_path / "alone.pt", splat, step=np.int64(29999)))
     for rank in range(12):  # in the order of numbers, not of names
         rows = slice(8 * rank, 8 * rank + 8 if rank < 11 else None)
         write_gsplat(tmp_path / f"ckpt_29999_rank{rank}.pt", rows_of(splat, rows))
@@ -51,6 +51,7 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
     for content, message in (
         ({"step": 1, "pipeline": {}}, "config.yml with --load-config"),
         ([1, 2], "`splats`, found list"),
+        (((torch.zeros(3),), 30000), "found tuple.*Inria.*--load-ply"),
         ({"splats": {"means": torch.zeros(2, 3)}}, "quats, scales, opacities, sh0, shN"),
         ({"splats": {"means": _Payload()}}, "Python objects"),
     ):
@@ -74,6 +75,11 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
         with pytest.raises(InputError, match=message):
             read_gsplat_checkpoint(path)
     assert "run" not in capfd.readouterr().out
+    content = torch.load(write_gsplat(path, random_splat()))
+    content["splats"]["uncertainty"] = torch.zeros(200)
+    torch.save(content, path)
+    assert "ignored" in read_gsplat_checkpoint(path).remarks[0]
+    assert "uncertainty" in read_gsplat_checkpoint(path).remarks[0]
 
 
 def test_moved_poses_are_read_or_refused(tmp_path: Path) -> None:

@@ -221,8 +221,8 @@ def test_settings_of_inrias_trainer_are_used(frames: list[Frame], tmp_path: Path
     config = tmp_path / "output" / "cfg_args"
     write_colmap(tmp_path, frames, "PINHOLE")
     write_transforms(tmp_path / "transforms.json", frames, [])
-    colmap = SplatOptions(colmap=tmp_path)
-    transforms = SplatOptions(transforms=tmp_path / "transforms.json")
+    colmap = SplatOptions(colmap=tmp_path, world_transform=None)  # no world is searched
+    transforms = SplatOptions(transforms=tmp_path / "transforms.json", world_transform=None)
     plain = open_splat(path, colmap)
     assert (plain.background_name, len(plain.held_out)) == ("black", 0)
     config.write_text(CFG_ARGS)

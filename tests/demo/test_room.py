@@ -1,9 +1,15 @@
+import json
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from normlift_ns import render
-from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels
+from normlift_ns.demo import shapes
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
 from normlift_ns.demo.room import DemoRoom, demo_room, shade
 
 
@@ -89,3 +95,76 @@ def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
     assert sizes == [(24, 400, 300), (4, 400, 300)]
     empty = DemoRoom(room.scene, room.colors, torch.full_like(room.labels, -1), room.names)
     assert not view_labels(empty, held_out[0]).any()
+
+
+LOW, HIGH = np.full(3, -1.0), np.full(3, 1.0)
+
+
+def solids() -> dict[str, tuple[shapes.Distance, float]]:
+    return {
+        "sphere": (shapes.sphere(0.5), math.pi),
+        "box": (shapes.box(1.0, 0.8, 0.6), 2 * (0.8 + 0.6 + 0.48)),
+        "cylinder": (shapes.cone(0.3, 0.3, 1.0), math.pi * (0.6 + 2 * 0.09)),
+        "frustum": (shapes.cone(0.4, 0.1, 0.4), math.pi * (0.5 * 0.5 + 0.16 + 0.01)),
+        "torus": (shapes.torus(0.5, 0.1), 4 * math.pi**2 * 0.05),
+        "capsule": (shapes.capsule((0, 0, 0), (0.5, 0, 0), 0.2), math.pi * 0.4 * 0.9),
+        "moved": (shapes.place(shapes.box(1.0, 0.8, 0.6), 0.1, -0.2, 0.05, 30), 2 * (0.8 + 0.6 + 0.48)),
+        "apart": (shapes.union(shapes.sphere(0.25), shapes.place(shapes.sphere(0.25), 0.6, 0, 0)), math.pi / 2),
+    }
+
+
+def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
+    near = shapes.sample_near_surface(shape, LOW, HIGH, density, np.random.default_rng(0))
+    return shapes.project_to_surface(shape, near, LOW, HIGH)
+
+
+def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
+    for name, (shape, area) in solids().items():
+        points = sampled(shape, 5000)
+        assert np.abs(shape(points)).max() < shapes.ON_SURFACE, name
+        assert len(points) == pytest.approx(5000 * area, rel=0.05), name
+        points = sampled(shape, 500)
+        normals = shapes.normals(shape, points)
+        assert np.linalg.norm(normals, axis=1) == pytest.approx(1), name
+        outward, inward = shape(points + 0.01 * normals), shape(points - 0.01 * normals)
+        assert (outward > 0.009).mean() > 0.99, name
+        assert (inward < -0.009).mean() > 0.85, name  # not near sharp edges
+
+
+def test_distances():
+    origin = np.zeros((1, 3))
+    assert shapes.sphere(2)(origin) == pytest.approx(-2)
+    assert shapes.cavity(shapes.sphere(2))(origin) == pytest.approx(2)
+    assert shapes.box(2, 4, 6)(np.array([[4.0, 6, 0]])) == pytest.approx(5)
+    assert shapes.box(2, 4, 6, 0.5)(np.array([[1.5, 0, 0]])) == pytest.approx(0.5)
+    assert shapes.cone(1, 1, 2)(np.array([[0, 0, 3.0]])) == pytest.approx(2)
+    assert shapes.torus(2, 0.5)(np.array([[0, 1.0, 0]])) == pytest.approx(math.hypot(2, 1) - 0.5)
+    assert shapes.place(shapes.box(2, 1, 1), 5, 0, 0, 90)(np.array([[5.0, 1, 0]])) == pytest.approx(0)
+
+
+def test_cover_tiles_a_plane_with_equal_round_patches():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(0, 1, (24_000, 2)), np.zeros((24_000, 1))], axis=1)
+    surfels = shapes.fit_surfels(lambda p: p[:, 2], points, rng.choice(len(points), 1000, replace=False))
+    assert surfels.normals == pytest.approx(np.tile([0, 0, 1], (1000, 1)))
+    assert surfels.means[:, 2] == pytest.approx(0)
+    patch_radius = math.sqrt(1 / 1000 / math.pi)
+    assert np.median(surfels.radii) == pytest.approx(2.6 * patch_radius / 2, rel=0.1)  # a disc's deviation: radius / 2
+    assert np.quantile(surfels.radii, [0.02, 0.98]) == pytest.approx(np.median(surfels.radii), rel=0.4)
+    assert surfels.thickness == pytest.approx(1e-3)
+
+
+def test_images_and_masks_are_the_views_and_labels_name_their_values(tmp_path: Path):
+    from tests.plain_room import plain_room  # noqa: PLC0415
+
+    small, folder = plain_room(2000), tmp_path / "room"
+    write_capture(small, folder, views=2, held_out=2, width=60, height=44)
+    cameras = [*demo_cameras(2, 60, 44), *held_out_cameras(2, 60, 44)]
+    for kind, mode, view in (("images", "RGB", view_image), ("instance", "L", view_labels)):
+        assert sorted(path.name for path in (folder / kind).iterdir()) == [f"{i:04d}.png" for i in range(4)]
+        for i, camera in enumerate(cameras):
+            with Image.open(folder / kind / f"{i:04d}.png") as image:
+                assert (image.size, image.mode) == ((60, 44), mode)
+                assert np.array_equal(np.asarray(image), view(small, camera).numpy())
+    names = {str(i): name for i, name in enumerate(small.names, 1)}
+    assert json.loads((folder / "labels.json").read_text()) == {"labels": names, "background": 0}

@@ -27,7 +27,8 @@ def test_the_demo_room(tmp_path: Path) -> None:
 
 
 @needs_shared
-@pytest.mark.parametrize("scene", ["fox", pytest.param("tabletop", marks=pytest.mark.extra)])
+@pytest.mark.extra
+@pytest.mark.parametrize("scene", ["fox", "tabletop"])
 def test_real_captures(scene: str, tmp_path: Path) -> None:
     config = SHARED / "captures" / "outputs" / scene / "splatfacto" / "run" / "config.yml"
     assert differences_from_golden(scene, config, tmp_path) == []

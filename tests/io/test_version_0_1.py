@@ -16,11 +16,12 @@ from tests.cli.conftest import run_entry
 from tests.golden.summary import differences, single_colors, without_news
 from tests.nerfstudio_plugin.stock_run import relocate_config
 
+pytestmark = pytest.mark.slow
 QUERIES = {"lifted": ("red", "sky blue", "--threshold", 0.4), "trained": ("red", "--threshold", 0.5)}
 STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
 
 
-@pytest.fixture(params=[pytest.param("lifted", marks=pytest.mark.slow), "trained"])
+@pytest.fixture(params=["lifted", "trained"])
 def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     shutil.copytree(Path(__file__).with_name("version_0_1"), tmp_path / "old")
     return tmp_path / "old" / "runs" / "scene" / "normlift" / request.param / "config.yml"

@@ -13,6 +13,7 @@ from tests.captures import SHARED, needs_shared
 
 PROGRAM = """
 import json, sys, time
+from dataclasses import replace
 from pathlib import Path
 import torch
 from normlift_ns import LiftOptions, SourceOptions, open_scene
@@ -22,7 +23,7 @@ from normlift_ns.planning import measure_capture, time_kernel_loading
 from normlift_ns.planning import make_plan
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
-source, options = make_source(SourceOptions(encoder="color")), LiftOptions(max_views=9)
+source, options = make_source(SourceOptions(encoder="color")), LiftOptions(max_views=5)
 time_kernel_loading(scene, options)
 found = []
 for _ in range(2):
@@ -31,6 +32,7 @@ for _ in range(2):
     result = lift_scene(scene, source, options, cache, encoder={})
     found.append({"told": plan.to_json(), "taken": time.process_time() - start, "stages": result.seconds,
                   "gib": result.field.manifest["cost"].get("memory_gib")})
+    options = replace(options, refine=False)
 print(json.dumps(found))
 """
 
@@ -47,7 +49,7 @@ def test_the_seconds_are_within_a_factor_of_two(tmp_path: Path) -> None:
     for state in (first, again):
         assert 0.5 < state["told"]["total_s"] / state["taken"] < 2, state
     assert first["told"]["features_kept"] == first["told"]["evidence_kept"] == 0
-    assert again["told"]["features_kept"] == again["told"]["evidence_kept"] == 9
+    assert again["told"]["features_kept"] == again["told"]["evidence_kept"] == 5
     assert 0.5 < first["told"]["host_bytes"] / 2**30 / first["gib"] < 2
     files = sum(path.stat().st_size for path in tmp_path.rglob("*.safetensors"))
     written = first["told"]["disk_bytes"] - again["told"]["disk_bytes"]

@@ -153,14 +153,13 @@ def test_regions_of_another_algorithm_are_not_reused(monkeypatch, tmp_path):
 @pytest.mark.usefixtures("trained_weights")
 def test_trained_weights():
     image = capture("fox").train[0].image
-    crop = image[300:460, 100:301]
+    crop = image[300:396, 100:229]
     source = EdgeRegions()
     error = np.abs(source.network(crop).numpy() - edge_probability(EDGES.read(), crop.numpy())).max()
     assert error <= 1e-4
     labels = source.labels(image, "a.png")
     assert [int(level.max()) + 1 for level in labels] == list(EDGE_COUNTS)
     assert_nested(labels[:, 0].numpy())
-    assert torch.equal(labels, EdgeRegions().labels(image, "a.png"))
 
 
 @needs_cuda

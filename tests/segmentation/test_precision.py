@@ -7,8 +7,8 @@ import torch
 
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.options import SourceOptions
-from normlift_ns.segmentation.checkpoint import load_sam_checkpoint
-from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, load_sam_network, resolve_precision
+from normlift_ns.segmentation.checkpoint import load_sam_checkpoint, resolve_precision
+from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, load_sam_network
 from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE

@@ -14,7 +14,7 @@ from normlift_ns.server import runs
 from normlift_ns.server.permalink import read_link
 from tests.server.pages import client_of, make_served, make_server, opened
 from tests.session.worlds import BLOCK, read, rows
-from tests.viewer.test_reasons import FakeVotes
+from tests.viewer.test_widgets import FakeVotes
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ import { Connection } from "./connection.js";
 import { $, fixed, h, saveBlob, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 import { button, Panel } from "./panel.js";
-import { hasWebGL, SceneRenderer } from "./scene.js";
+import { createRenderer, isSoftware, SceneRenderer } from "./scene.js";
 import { Search } from "./search.js";
 import { startShortcuts } from "./shortcuts.js";
 import { startTooltips, toast } from "./notices.js";
@@ -22,7 +22,8 @@ const MODES = [
   ["pca", "Features", "Show three principal components of the features as colors."],
 ];
 const OUTLINED = ["overlay", "prompts"];
-const COARSE_TOO_SLOW = 800;
+/** Milliseconds to wait for the first image from the server before the scene is loaded. */
+const STILL_WAIT = 2500;
 const parameters = new URLSearchParams(location.search);
 
 /** @returns {Promise<any[]>} */
@@ -53,16 +54,20 @@ class Page {
     /** @type {Map<number, (position: number[] | null) => void>} */
     this.probes = new Map();
     this.silent = new Set();
-    this.webgl = hasWebGL();
+    /** True until a frame at full resolution has the current colors. */
+    this.unfinished = true;
     this.act = this.act.bind(this);
     this.stale = false;
     this.view = new View3D($("canvas"), run.up, run.radius);
-    this.connection = new Connection(run.id, () => ({ ...this.greeting(), webgl: this.webgl }));
-    this.scene = this.webgl ? new SceneRenderer($("canvas"), this.view) : null;
+    /** Renderer of the page; null before it has started, and without WebGL 2. @type {SceneRenderer | null} */
+    this.scene = null;
+    this.started = this.software = false;
+    this.connection = new Connection(run.id, () => this.greeting());
     this.stills = new Stills(
       this.view,
       (value) => this.connection.send("still", value),
       () => this.sendCamera(),
+      () => this.changed(false),
     );
     this.search = new Search(this.act, run);
     this.panel = new Panel(this.act, run, {
@@ -76,7 +81,6 @@ class Page {
     this.settled = throttled(() => this.remember(), 700);
     this.build();
     this.listen();
-    this.open();
   }
 
   /**
@@ -204,7 +208,6 @@ class Page {
       }),
       tool("Help", "help", "List all shortcuts.", "?", () => $("help").showModal(), { id: "do-help" }),
     );
-    if (!this.webgl) $("blend").hidden = $("do-compare").hidden = true;
     this.setTheme(
       localStorage.getItem("normlift:theme") ??
         (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"),
@@ -261,7 +264,7 @@ class Page {
     on("state", (state) => this.show(state));
     on("codes", (header, { payload }) => this.paint(header, payload));
     on("still", (header, { payload }) => {
-      if (header.revision >= this.revision && (!this.scene || this.painted)) this.stills.show(payload);
+      if (header.revision >= this.revision && (!this.scene || this.unfinished)) this.stills.show(payload);
     });
     on("busy", ({ text }) => this.search.setBusy(text));
     on("message", ({ text, kind, seq }) => {
@@ -291,8 +294,8 @@ class Page {
     this.view.addEventListener("move", () => {
       $("hover").hidden = true;
       rest();
-      if (this.webgl) this.stills.hide();
-      else this.stills.request(true);
+      if (this.scene && (this.scene.finished || !this.software)) this.stills.hide();
+      else if (this.home) this.stills.request(true);
     });
     new ResizeObserver(() => this.view.resize()).observe($("stage"));
     $("canvas").addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => this.steer(event));
@@ -300,22 +303,31 @@ class Page {
       this.pointer = [event.clientX, event.clientY];
     });
     this.listenDivider();
-    this.scene?.addEventListener("frame", (/** @type {any} */ event) => this.drawn(event.full));
-    this.scene?.addEventListener("lost", () => {
-      toast("The graphics driver has stopped. Reload the page to see the scene again.", { kind: "error", seconds: 60 });
-    });
-  }
-
-  async open() {
     fetch(`/api/runs/${encodeURIComponent(this.run.id)}/cameras`)
       .then((answer) => answer.json())
       .then(({ cameras }) => {
         this.cameras = this.panel.scene.cameras = cameras;
       });
-    if (!this.scene) {
+  }
+
+  /** Start the renderer, while the server renders the first image. */
+  async start() {
+    this.started = true;
+    const renderer = createRenderer($("canvas"));
+    if (!renderer) {
       $("loading").querySelector("p").textContent = "This browser has no WebGL 2, so the server renders the scene.";
-      return;
+      $("blend").hidden = $("do-compare").hidden = this.stills.fine = true;
+      return this.stills.request(false);
     }
+    this.scene = new SceneRenderer(renderer, this.view, () => this.stills.shown);
+    this.scene.addEventListener("frame", (/** @type {any} */ event) => this.drawn(event.full));
+    this.scene.addEventListener("lost", () => {
+      toast("The graphics driver has stopped. Reload the page to see the scene again.", { kind: "error", seconds: 60 });
+    });
+    this.showBackground();
+    this.software = isSoftware(renderer);
+    document.documentElement.classList.toggle("software", this.software);
+    if (this.software) await this.firstStill();
     const digest = this.run.digest ? `?digest=${encodeURIComponent(this.run.digest)}` : "";
     try {
       await this.scene.load(`/api/runs/${encodeURIComponent(this.run.id)}/geometry${digest}`, (share) => {
@@ -329,15 +341,28 @@ class Page {
     if (this.waiting) this.scene.paint(this.waiting.payload, this.waiting.palette);
   }
 
+  /** Wait a moment for an image from the server, which a software renderer would slow down. */
+  firstStill() {
+    return new Promise((resolve) => {
+      $("still").addEventListener("load", resolve, { once: true });
+      setTimeout(resolve, STILL_WAIT);
+    });
+  }
+
   /** @param {boolean} full */
   drawn(full) {
     if (!this.scene?.spark.activeSplats) return;
     $("canvas").classList.add("ready");
     $("loading").hidden = true;
     if (full) this.stills.hide();
-    const press = performance.getEntriesByName("press").at(-1);
-    if (press && this.painted) performance.measure(full ? "picture" : "coarse", { start: press.startTime });
-    this.painted &&= !full;
+    this.changed(full);
+  }
+
+  /** Measure the time since the last press, or since the page was opened. @param {boolean} full */
+  changed(full) {
+    const start = performance.getEntriesByName("press").at(-1)?.startTime ?? 0;
+    if (this.unfinished) performance.measure(full ? "picture" : "coarse", { start });
+    this.unfinished &&= !full;
   }
 
   /** @param {any} header @param {Uint8Array} payload */
@@ -347,8 +372,9 @@ class Page {
     else this.waiting = { payload: payload.slice(), palette: header.palette };
     const press = performance.getEntriesByName("press").at(-1);
     if (press) performance.measure("colors", { start: press.startTime });
-    this.painted = true;
-    if (!this.scene || this.scene.costs.coarse > COARSE_TOO_SLOW) this.stills.request(false);
+    this.unfinished = true;
+    if (!this.started) this.start();
+    else if (!this.scene || (this.software && this.scene.needsStill)) this.stills.request(false);
   }
 
   /** @param {any} state */
@@ -526,6 +552,10 @@ class Page {
   /** @param {string} theme */
   setTheme(theme) {
     document.documentElement.dataset.theme = theme;
+    this.showBackground();
+  }
+
+  showBackground() {
     const background = getComputedStyle(document.documentElement).getPropertyValue("--scene").trim();
     this.scene?.setBackground(background);
     this.stills.setBackground(background);

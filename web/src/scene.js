@@ -30,21 +30,35 @@ function drawn(renderer) {
   });
 }
 
-/** @returns {boolean} True if this browser supports WebGL 2. */
-export function hasWebGL() {
-  const gl = document.createElement("canvas").getContext("webgl2");
-  gl?.getExtension("WEBGL_lose_context")?.loseContext();
-  return gl !== null;
+/** @param {HTMLCanvasElement} canvas @returns {THREE.WebGLRenderer | null} Null without WebGL 2. */
+export function createRenderer(canvas) {
+  try {
+    return new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+  } catch {
+    return null;
+  }
+}
+
+/** @param {THREE.WebGLRenderer} renderer @returns {boolean} True if WebGL draws on the CPU. */
+export function isSoftware(renderer) {
+  const gl = renderer.getContext();
+  const name = gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER);
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 
 /** WebGL renderer of a scene. It dispatches `frame` events with `full` and `milliseconds`. */
 export class SceneRenderer extends EventTarget {
-  /** @param {HTMLCanvasElement} canvas @param {import("./view.js").View3D} view */
-  constructor(canvas, view) {
+  /**
+   * @param {THREE.WebGLRenderer} renderer
+   * @param {import("./view.js").View3D} view
+   * @param {() => boolean} covered True while an image from the server covers the canvas.
+   */
+  constructor(renderer, view, covered) {
     super();
-    this.canvas = canvas;
+    this.covered = covered;
+    this.canvas = renderer.domElement;
     this.view = view;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+    this.renderer = renderer;
     this.scene = new THREE.Scene();
     this.spark = new SparkRenderer({
       renderer: this.renderer,
@@ -63,9 +77,11 @@ export class SceneRenderer extends EventTarget {
     this.coarseRatio = 0.5;
     this.changed = { what: "order", when: 0 };
     this.busy = this.waiting = this.coarse = this.plain = false;
+    /** True after the first frame at full resolution. */
+    this.finished = false;
     this.timer = 0;
     this.frames = 0;
-    canvas.addEventListener("webglcontextlost", () => this.dispatchEvent(new Event("lost")));
+    this.canvas.addEventListener("webglcontextlost", () => this.dispatchEvent(new Event("lost")));
     view.addEventListener("move", () => this.invalidate("camera"));
   }
 
@@ -119,6 +135,11 @@ export class SceneRenderer extends EventTarget {
     return this.costs.full > SLOW;
   }
 
+  /** True if an image from the server will show new colors sooner than a frame. */
+  get needsStill() {
+    return !this.finished || (this.costs.full > VERY_SLOW && !this.preview.ready);
+  }
+
   /** Schedule a new frame. @param {"camera" | "colors" | "order"} what Part of the scene that has changed. */
   invalidate(what) {
     this.changed = { what, when: performance.now() };
@@ -139,11 +160,12 @@ export class SceneRenderer extends EventTarget {
     const still = performance.now() - this.changed.when > REST || this.changed.what !== "camera";
     const known = this.frames > 0; // the first frame is coarse because it may take long
     const quick = this.costs.full < VERY_SLOW && !this.preview.ready;
-    const full = known && (!this.slow || (still && (quick || this.coarse)));
+    const full = this.covered() || (known && (!this.slow || (still && (quick || this.coarse))));
     const milliseconds = await (this.preview.ready && !full ? this.renderPreview() : this.render(full));
     this.coarse = !full;
+    this.finished ||= full && this.spark.activeSplats > 0;
     this.busy = false;
-    this.dispatchEvent(Object.assign(new Event("frame"), { full, milliseconds }));
+    this.dispatchEvent(Object.assign(new Event("frame"), { full: full && !this.waiting, milliseconds }));
     if (this.waiting) requestAnimationFrame(() => this.draw());
     else if (!full) this.timer = setTimeout(() => this.finish(), this.changed.what === "camera" ? REST : 0);
     else if (this.slow) this.timer = setTimeout(() => this.rest(), LONG_REST);

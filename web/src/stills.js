@@ -1,7 +1,7 @@
 /** Images rendered by the server, for browsers that are slow or do not support WebGL 2. */
 import { $ } from "./dom.js";
 
-const COARSE = 480;
+const COARSE = 640;
 const FINE = 1280;
 const REST = 350;
 
@@ -10,11 +10,15 @@ export class Stills {
    * @param {import("./view.js").View3D} view
    * @param {(value: any) => number} send Request an image.
    * @param {() => void} place Send the camera to the server.
+   * @param {() => void} shown Called for each image that is shown.
    */
-  constructor(view, send, place) {
+  constructor(view, send, place, shown) {
     this.view = view;
     this.send = send;
     this.place = place;
+    this.whenShown = shown;
+    /** True to request large images too, if there is no other renderer. */
+    this.fine = false;
     this.background = [0, 0, 0];
     this.waiting = false;
     this.again = false;
@@ -31,12 +35,17 @@ export class Stills {
   /** @param {boolean} moving True for a small image, followed by a large one. */
   request(moving) {
     clearTimeout(this.timer);
-    if (moving) this.timer = setTimeout(() => this.request(false), REST);
+    if (moving && this.fine) this.timer = setTimeout(() => this.request(false), REST);
     if (this.waiting && moving) return;
-    this.waiting = true;
     this.place();
     const most = Math.min(2048, Math.round(Math.max(this.view.width, this.view.height)));
-    this.send({ max_size: Math.max(16, Math.min(most, moving ? COARSE : FINE)), background: this.background });
+    const size = moving || !this.fine ? COARSE : FINE;
+    const value = { max_size: Math.max(16, Math.min(most, size)), background: this.background };
+    this.waiting = this.send(value) >= 0;
+  }
+
+  get shown() {
+    return !$("still").hidden;
   }
 
   /** @param {Uint8Array} bytes */
@@ -50,6 +59,7 @@ export class Stills {
       image.hidden = false;
       $("loading").hidden = true;
       if (old) URL.revokeObjectURL(old);
+      this.whenShown();
     };
     image.src = this.url;
   }

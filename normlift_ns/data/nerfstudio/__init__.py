@@ -1,1 +1,1 @@
-"""Readers and writers for nerfstudio's splatfacto runs, mostly without an import of nerfstudio."""
+"""Readers and writers for nerfstudio's splatfacto runs, mostly without importing nerfstudio."""

@@ -125,7 +125,7 @@ class ConfigPaths:
 
 
 def read_config_paths(path: Path) -> ConfigPaths:
-    """Read names and paths from the YAML of a config.yml, without the construction of the config.
+    """Read names and paths from the YAML of a config.yml, without constructing the config.
 
     Raises:
         FileNotFoundError, OSError, ValueError: The errors of `compose_config`.
@@ -227,7 +227,7 @@ def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> li
 
 
 def _strip_tail(path: Path, tail: Path) -> Path | None:
-    """Return `path` without the relative path `tail` at its end, or None if it has another end."""
+    """Return `path` without the relative path `tail` at its end, or None if it does not end with `tail`."""
     count = len(path.parts) - len(tail.parts)
     return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
 
@@ -453,7 +453,7 @@ def check_config_values(config: Any, path: Path, say: Callable[[str], None] = la
             part, _, field = name.rpartition(".")
             owner: Any = attrgetter(part)(config)
             setattr(owner, field, next(item.default for item in fields(owner) if item.name == field))
-            say(f"{path}: {name} is {_format(value)}, which is ignored, because it does not affect a lift.")
+            say(f"{path}: {name} is {_format(value)}. This value is ignored, because it does not affect a lift.")
             continue
         raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
     pipeline: Any = config.pipeline
@@ -465,7 +465,8 @@ def check_components(config: Any, path: Path) -> None:
     """Raise if the pipeline, data manager, data parser or model of a config is not supported.
 
     Raises:
-        ValueError: One of them is an instance of another class. The message gives its class and the expected classes.
+        ValueError: One of them is an instance of a different class. The message gives its class and the expected
+            classes.
     """
     for name, classes in _PARTS.items():
         cls = type(attrgetter(name)(config))

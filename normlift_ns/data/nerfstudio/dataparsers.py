@@ -280,8 +280,8 @@ def split_files(
     validation list, which ns-train evaluates on.
 
     Raises:
-        ValueError: There are lists, but no list of training images, or a listed file is missing. Also if eval_mode
-            is filename and a file name contains neither train nor eval.
+        ValueError: There are lists, but no list of training images, or a listed file is missing. With eval_mode
+            filename, a file name contains neither train nor eval.
     """
     if any(names is not None for names in lists.values()):
         held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]

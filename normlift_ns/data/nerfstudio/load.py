@@ -269,7 +269,7 @@ def load_nerfstudio_scene(
 def _check_transform(
     transform: Float[Tensor, "3 4"], scale: float, location: RunLocation, advice: str
 ) -> tuple[str, ...]:
-    """Raise InputError if the dataset gives another world than the training.
+    """Raise InputError if the worlds of the dataset and of the training differ.
 
     nerfstudio computes the world of the Gaussians from all poses, so a changed dataset leads to another world.
 

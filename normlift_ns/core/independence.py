@@ -1,0 +1,79 @@
+"""Reliabilities that count pairs of views, and views by how much they differ in direction.
+
+Features of one Gaussian in two views drift apart with the angle between the views, so views from nearby repeat each
+other's mistakes. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and w::
+
+    s_vw = exp(-theta_vw / 21.7 degrees)
+    N_j  = N_eff                                              pairs
+    N_j  = W_j ** 2 / sum_vw W_jv W_jw s_vw                   angular; it equals N_eff if s_vw = 0 for v != w
+    R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
+
+For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is their mean cosine over pairs of views.
+One view has no pair, so a Gaussian of one view has R = r, and not the R of views that agree.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from normlift_ns.core.sparse import SparseRows
+
+DRIFT = 21.7
+"""Angle in degrees over which the correlation of features of one part falls to 1/e, measured on photographs."""
+LEAST_RELIABILITY = 0.02
+"""R of a Gaussian without any pair of agreeing views. It is positive, because R = 0 means no evidence."""
+_CHUNK_ELEMENTS = 2**22
+
+
+def independent_views(
+    view_weights: SparseRows, means: Float[Tensor, "n 3"], centers: Float[Tensor, "v 3"], drift: float = DRIFT
+) -> Float64[Tensor, " n"]:
+    """Return N_j, in 1..N_eff, or 0 without weight.
+
+    Args:
+        view_weights: W_jv, [N, views].
+        centers: camera centers of the views.
+        drift: degrees.
+    """
+    count = view_weights.offsets.diff()
+    out = torch.zeros(len(view_weights), dtype=torch.float64, device=means.device)
+    order = count.argsort(stable=True)  # rows of similar length are padded together
+    order = order[count[order] > 0]
+    while len(order) > 0:
+        width = int(count[order[-1]])
+        step = max(1, _CHUNK_ELEMENTS // (width * width))
+        rows, order = order[-step:], order[:-step]
+        part = view_weights.select_rows(rows)
+        row = part.row_index()
+        slot = torch.arange(len(row), device=row.device) - part.offsets[row]
+        weight = means.new_zeros(len(rows), width)
+        weight[row, slot] = part.weight.to(weight)
+        weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-30)
+        toward = means.new_zeros(len(rows), width, 3)
+        toward[row, slot] = torch.nn.functional.normalize(
+            centers.to(means)[part.column.long()] - means[rows[row]], dim=1
+        )
+        angle = torch.rad2deg((toward @ toward.transpose(1, 2)).clamp(-1, 1).acos())
+        repeated = torch.exp(-angle / drift)
+        repeated.diagonal(dim1=1, dim2=2).fill_(1.0)
+        shared = ((weight[:, :, None] * repeated).sum(1) * weight).sum(1).double()
+        out[rows] = torch.where(shared > 0, 1 / shared, 0.0)
+    return out
+
+
+def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
+    """Return R_j by the formula at the top of this module, or 0 without evidence.
+
+    Args:
+        norm: ||f_j||.
+        views: N_j, from `Scalars.n_eff` or `independent_views`.
+        beta: prior strength, in views, >= 0.
+
+    >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
+    tensor([0.0200, 0.5100, 0.0000])
+    """
+    agreed = (views * norm**2 - 1).clamp(min=0) + beta * LEAST_RELIABILITY
+    value = agreed / (views - 1 + beta).clamp(min=1e-6)
+    return torch.where((norm > 0) & (views > 0), value.clamp(max=1), 0.0)

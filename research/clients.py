@@ -1,0 +1,134 @@
+"""Many clients of ns-normlift-view at once: errors, latencies and memory.
+
+    python -m research.clients               lifts the fox capture first
+    python -m research.clients --load-config outputs/room/normlift/demo/config.yml
+
+64 clients ask one question every 2 s over HTTP for 60 s. Half of the questions are prompts that have been asked before,
+half are new. Every answer has the relevancies and the mask of all Gaussians. The clients run in one process on the
+cores of the server; their share of the processor time is reported. Prompts are names of colors, for the encoder color.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import random
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import cycle, permutations
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+
+import normlift_ns
+from research.report import RESULTS, Report
+from research.view import COLOURS, ViewServer, fox_run, served
+
+XKCD = Path(normlift_ns.__file__).parent / "encoders" / "xkcd.json"
+CLIENTS, PERIOD, SECONDS, SETTLED = 64, 2.0, 60.0, 10.0
+
+
+@dataclass
+class Log:
+    """What the clients have seen."""
+
+    seconds: list[float] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    received: int = 0
+
+
+async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: str, prompt: str) -> tuple[int, int]:
+    """Send one question over an open connection; its status and the number of bytes of the answer."""
+    body = json.dumps({"texts": [prompt], "arrays": "safetensors"}).encode()
+    writer.write(f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+    head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+    length = int(head.partition("content-length:")[2].split()[0])
+    await reader.readexactly(length)
+    return int(head.split()[1]), length
+
+
+async def client(port: int, path: str, prompts: Iterator[str], log: Log, delay: float) -> None:
+    """Ask one question every `PERIOD` seconds, the first after a delay."""
+    start = time.perf_counter() + delay
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**20)
+    for number in range(int(SECONDS / PERIOD)):
+        await asyncio.sleep(max(0.0, start + number * PERIOD - time.perf_counter()))
+        asked = time.perf_counter()
+        try:
+            status, length = await ask(reader, writer, path, next(prompts))
+        except (OSError, EOFError) as error:
+            log.errors.append(repr(error))
+            reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**20)
+            continue
+        log.seconds.append(time.perf_counter() - asked)
+        log.received += length
+        if status != 200:
+            log.errors.append(f"status {status}")
+    writer.close()
+
+
+def questions() -> Iterator[str]:
+    """In turns a known prompt and a new one, which names two colors."""
+    names = [*json.loads(XKCD.read_text())]
+    pairs = list(permutations(range(len(names)), 2))
+    random.Random(0).shuffle(pairs)
+    for known, (one, other) in zip(cycle(COLOURS), pairs):
+        yield known
+        yield f"{names[one]} {names[other]}"
+
+
+async def ask_all(server: ViewServer, run: str, log: Log) -> tuple[int, int]:
+    """Let all clients ask; bytes of memory that the server holds after `SETTLED` seconds, and at the end."""
+    prompts, path = questions(), f"/api/runs/{run}/query"
+    delays = [PERIOD * number / CLIENTS for number in range(CLIENTS)]
+    tasks = [asyncio.create_task(client(server.port, path, prompts, log, delay)) for delay in delays]
+    await asyncio.sleep(SETTLED)
+    settled = server.resident()
+    await asyncio.gather(*tasks)
+    return settled, server.resident()
+
+
+def add_clients(report: Report, config: Path) -> None:
+    """Adds the metrics of a lifted run, with the encoder color."""
+    log = Log()
+    with served(config) as server:
+        run = server.run()
+        for prompt in COLOURS:
+            urlopen(f"http://127.0.0.1:{server.port}/api/runs/{run}/query", json.dumps({"texts": [prompt]}).encode())
+        start, worked, own = time.perf_counter(), server.worked(), time.process_time()
+        settled, end = asyncio.run(ask_all(server, run, log))
+        wall = time.perf_counter() - start
+        share = (time.process_time() - own) / (wall * len(os.sched_getaffinity(0)))
+        used = server.worked() - worked
+    for error in sorted(set(log.errors)):
+        print(f"{log.errors.count(error)} times: {error}")
+    report.add("answers", len(log.seconds), f"answers to {CLIENTS} clients in {wall:.1f} s")
+    report.add("errors", len(log.errors), "errors")
+    for name, percent in (("median", 50), ("p99", 99), ("most", 100)):
+        report.add(f"answer_{name}_s", np.percentile(log.seconds, percent), "s")
+    report.add("server_s_per_answer", used / len(log.seconds), "s of processor time of the server per answer")
+    report.add("received_bytes_per_s", log.received / wall, "bytes of relevancies and masks per s")
+    report.add("clients_share", share, "share of all processor time that the clients take")
+    report.add(
+        "server_share",
+        used / (wall * len(os.sched_getaffinity(0))),
+        "share of all processor time that the server takes",
+    )
+    report.add("resident_settled_bytes", settled, f"bytes of memory of the server after {SETTLED:.0f} s")
+    report.add("resident_growth_bytes", end - settled, "bytes of memory more at the end")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    arguments = parser.parse_args()
+    found = Report("clients")
+    with tempfile.TemporaryDirectory() as folder:
+        add_clients(found, arguments.load_config or fox_run(Path(folder)))
+    found.write(arguments.output)
