@@ -238,8 +238,8 @@ class Instances:
     class_id: Int32[Tensor, " n"]
     """Class of each Gaussian, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
     instance_id: Int32[Tensor, " n"]
-    """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0
-    for Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
+    """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0 for
+    Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
     selection, so further prompts change no number.
     """
     classes: tuple[int, ...]
