@@ -208,10 +208,10 @@ def run_lift(request: LiftRequest) -> LiftedRun:
     refuse_small_memory(len(prepared.scene.gaussians), max((c.width * c.height for c in cameras), default=0))
     check_target(prepared)
     announce(prepared)
-    check_alignment(prepared, stages)
     result = lift_scene(
         prepared.scene, prepared.source, prepared.lift, cache_folder(prepared.run_dir), device=prepared.device,
         encoder=prepared.encoder, export=request.export, report=request.report,
+        check=partial(check_alignment, prepared, stages),
     )  # fmt: skip
     return write_lifted_run(prepared, result, stages)
 

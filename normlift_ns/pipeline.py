@@ -30,7 +30,7 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     with_original_reliability,
 )
-from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.evidence import Entries, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -87,6 +87,7 @@ def lift_scene(
     encoder: Mapping[str, Any],
     export: FeatureExport | None = None,
     report: ProgressCallback = lambda stage, done, total: None,
+    check: Callable[[], None] = lambda: None,
 ) -> LiftResult:
     """Lift 2D features onto the Gaussians of a trained scene.
 
@@ -96,6 +97,7 @@ def lift_scene(
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
         export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
+        check: function that raises if the scene must not be lifted. It runs while kernels are compiled.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
@@ -104,6 +106,7 @@ def lift_scene(
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
     options, means = collection.options, collection.gaussians.means
     wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
+    check()
     views = collection.collect(stages, wait_for_kernels)
     table = views.features
     if options.consensus:
@@ -472,30 +475,51 @@ def start_kernel_warm_up(
         return compile_kernels(config.dtype).join
     if config.backend != "triton" or len(scene.train) == 0:
         return lambda: None
-    return warm_up_kernels(gaussians, scene.train.cameras[0], options, config).join
+    threads = warm_up_kernels(gaussians, scene.train.cameras[0], options, config)
+
+    def wait() -> None:
+        for thread in threads:
+            thread.join()
+
+    return wait
 
 
-def warm_up_kernels(gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig) -> Thread:
-    """Compile or load kernels in a thread that lifts dummy features onto some Gaussians and discards the result.
+def warm_up_kernels(
+    gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig
+) -> list[Thread]:
+    """Compile or load kernels in threads that each run a stage of the lift on some Gaussians and discard the result.
 
-    The thread suppresses errors, because the lift itself raises them again.
+    The threads suppress errors, because the lift itself raises them again.
     """
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
     sample = gaussians.select(slice(_WARM_UP_GAUSSIANS))
+    means, regions = sample.means, _WARM_UP_REGIONS
+    features = torch.eye(regions, _WARM_UP_DIMENSION, dtype=config.dtype, device=means.device)
 
-    def work() -> None:
+    def rasterize() -> None:
+        rasterize_evidence(sample, [camera], [labels], num_regions=[regions], **config.options)
+
+    def lift_sample() -> None:
+        gaussian = torch.arange(len(sample), dtype=torch.int32, device=means.device)
+        entries = Entries(gaussian, gaussian % regions + 1, means.new_ones(len(sample), dtype=config.dtype), (regions,))
+        evidence = Evidence.from_entries([entries], len(sample))
+        if options.consensus:
+            consensus(evidence, features)
+        lift(evidence, features, beta=options.reliability_beta, unlabeled=options.unlabeled).directions()
+
+    def vote() -> None:
+        if options.refine and len(sample) > options.vote.k:
+            rows, ones = features[torch.arange(len(sample)) % regions], means.new_ones(len(sample))
+            refine(means, rows, ones, options.vote, own=ones, neighbors=nearest_neighbors(means, options.vote.k))
+
+    def run(stage: Callable[[], None]) -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
-            evidence = rasterize_evidence(sample, [camera], [labels], num_regions=[_WARM_UP_REGIONS], **config.options)
-            features = torch.eye(_WARM_UP_REGIONS, _WARM_UP_DIMENSION, dtype=config.dtype, device=sample.means.device)
-            if options.consensus:
-                consensus(evidence, features)
-            lifted = lift(evidence, features, beta=options.reliability_beta, unlabeled=options.unlabeled)
-            if options.refine and len(sample) > options.vote.k:
-                neighbors = nearest_neighbors(sample.means, options.vote.k)
-                own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-                refine(sample.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
+            stage()
 
-    thread = Thread(target=work, name="kernel warm-up", daemon=True)
-    thread.start()
-    return thread
+    threads = [
+        Thread(target=run, args=(x,), name="kernel warm-up", daemon=True) for x in (rasterize, lift_sample, vote)
+    ]
+    for thread in threads:
+        thread.start()
+    return threads

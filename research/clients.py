@@ -117,7 +117,7 @@ def add_clients(report: Report, config: Path) -> None:
     report.add(
         "server_share",
         used / (wall * len(os.sched_getaffinity(0))),
-        "share of all processor time that the server takes",
+        "share that the server takes",
     )
     report.add("resident_settled_bytes", settled, f"bytes of memory of the server after {SETTLED:.0f} s")
     report.add("resident_growth_bytes", end - settled, "bytes of memory more at the end")

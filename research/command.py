@@ -3,11 +3,17 @@
     python -m research.command             questions and help (5 runs each), on a machine with a GPU lifts
     python -m research.command --quick     fewer runs
     python -m research.command --config outputs/.../config.yml      a run of your own in place of the fox
+    python -m research.command --before ../before   what is waited for with colors, beside another checkout, in turns
 
 CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts are of patches: a first one with empty
 caches of kernels and bytecode, first ones with those filled (median of 3; pip leaves packages with their bytecode), and
 ones with every stage cached (median of 3). The error of a new text is that of its vector against open_clip in float64.
 What the file holds of the other kind of machine stays.
+
+With --before: lifts by colors with empty caches of kernels and bytecode (once), with those filled (cache of features
+empty), with every stage cached, and on two cores without the GPU; --render-dir with one prompt and three views, and
+with five prompts and all views; a thousand names of colors, vectors given, in a warm process on the GPU, and on two
+cores. --quick leaves out the slowest cases of the other checkout.
 """
 
 from __future__ import annotations
@@ -60,18 +66,62 @@ start.lift()
 """
 
 
-def lifted(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
-    """Lifts into folder/NAME, kernels cached in folder/kernels; seconds of every stage, and `wall` of the process."""
-    seconds, kernels = folder / "seconds.json", folder / "kernels"
-    environment = {
-        "SECONDS_FILE": str(seconds),
-        "TRITON_CACHE_DIR": f"{kernels}/triton",
-        "NUMBA_CACHE_DIR": f"{kernels}/numba",
-        "PYTHONPYCACHEPREFIX": f"{kernels}/python",
+def caches(folder: Path) -> dict[str, str]:
+    """Environment with the caches of kernels and bytecode in folder/kernels."""
+    return {
+        "TRITON_CACHE_DIR": f"{folder}/kernels/triton",
+        "NUMBA_CACHE_DIR": f"{folder}/kernels/numba",
+        "PYTHONPYCACHEPREFIX": f"{folder}/kernels/python",
         "PYTHONDONTWRITEBYTECODE": "",
+        "PYTHONWARNINGS": "ignore",
     }
+
+
+TWO_CORES = "import os; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])"
+PROMPTS = """
+import json, sys, time
+if sys.argv[4] == "cpu":
+    import os; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+import torch
+from normlift_ns import open_run
+from normlift_ns.encoders.registry import encoder_kind
+from normlift_ns.progress import peak_gib
+from normlift_ns.query import engine
+from normlift_ns.query.arrays import open_quick
+from normlift_ns.query.question import make_query
+config, data, file, device = sys.argv[1:]
+words = (2 * list(encoder_kind("color").words()))[:1000]
+from pathlib import Path
+found = {}
+def measure(kind, field, means, rows):
+    wait = torch.cuda.synchronize if device == "cuda" else (lambda: None)
+    for count in (1, 1, 1000):
+        question = make_query(field, rows, words[:count])
+        wait(); start = time.perf_counter()
+        answer = engine.run_query(field, means, question)
+        wait(); found[f"{kind}_{count}_prompts_s"] = time.perf_counter() - start
+        answer.to_json(); found[f"{kind}_{count}_prompts_summarized_s"] = time.perf_counter() - start
+    peak = torch.cuda.max_memory_allocated() / 2**30 if device == "cuda" else peak_gib()
+    found[f"{kind}_1000_prompts_peak_gib"] = peak
+if device == "cpu":
+    run = open_quick(Path(config))
+    measure("query", run.field, run.field.arrays["means"], run.text_encoder.rows)
+else:
+    run = open_run(config, data=data)
+    measure("ask", run.field.to(device), run.scene.gaussians.means.to(device), run.texts.rows)
+json.dump(found, open(file, "w"))
+"""
+FIVE = ("red", "green", "blue", "brown", "orange")
+
+
+def lifted(
+    trained: Path, folder: Path, name: str, *flags: object, checkout: Path = HERE, program: str = LIFT
+) -> dict[str, float]:
+    """Lifts into folder/NAME, kernels cached in folder/kernels; seconds of every stage, and `wall` of the process."""
+    seconds = folder / "seconds.json"
+    environment = {"SECONDS_FILE": str(seconds), **caches(folder)}
     given = ("--load-config", trained, "--output-dir", folder / name, *flags)
-    cost = run(HERE, "lift", *given, program=LIFT, environment=environment)
+    cost = run(checkout, "lift", *given, program=program, environment=environment)
     taken = {**json.loads(seconds.read_text()), "wall": cost.wall}
     print(name, *(f"{stage} {value:.2f}" for stage, value in taken.items()), flush=True)
     return taken
@@ -135,6 +185,66 @@ def add_lifts(report: Report, trained: Path, folder: Path, repeats: int) -> None
             add(f"{kind}.{stage}_s", [taken[stage] for taken in group])
 
 
+def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: bool) -> None:
+    """Add what a person waits for with colors, of this checkout and of another one, in turns."""
+    checkouts = {"now": HERE, "before": before}
+    folders = {name: folder / name for name in checkouts}
+    data = trained.parents[4] / trained.parents[2].name
+    source, repeats = ("--data", data, "--encoder", "color"), 1 if quick else 3
+    found: dict[str, list[float]] = {}
+
+    def note(name: str, seconds: float) -> None:
+        found.setdefault(name, []).append(seconds)
+        print(name, f"{seconds:.2f}", flush=True)
+
+    def lift(name: str, case: str, output: str, *flags: object, program: str = LIFT) -> Path:
+        given = (*source, "--timestamp", "run", "--overwrite", True, *flags)
+        taken = lifted(trained, folders[name], output, *given, checkout=checkouts[name], program=program)
+        note(f"{name}.{case}_lift_s", taken["wall"])
+        return next((folders[name] / output).glob("*/normlift/run/config.yml"))
+
+    def pictures(name: str, case: str, config: Path, *flags: object) -> None:
+        given = ("--load-config", config, "--data", data, "--render-dir", folders[name] / case, "--overwrite", True)
+        cost = run(checkouts[name], "query", *given, *flags, environment=caches(folders[name]))
+        note(f"{name}.{case}_s", cost.wall)
+
+    def prompts(name: str, device: str, config: Path) -> None:
+        file = folders[name] / "prompts.json"
+        run(checkouts[name], "", config, data, file, device, program=PROMPTS, environment=caches(folders[name]))
+        for key, value in json.loads(file.read_text()).items():
+            note(f"{name}.{key}_{device}", value)
+
+    gpu, configs = torch.cuda.is_available(), {}
+    for name in ("before", "now"):
+        configs[name] = lift(name, "cold", "cold")
+    for turn in range(repeats if gpu else 0):
+        for name in checkouts:
+            lift(name, "later", f"later{turn}")
+            lift(name, "cached", "cold")
+    for name in checkouts:
+        views = json.loads((configs[name].parent / "normlift" / "manifest.json").read_text())["views_lifted"]
+        all_views = ("--render-views", *(Path(view).stem for view in views))
+        for turn in range(repeats + 1):
+            pictures(name, "pictures_3_views" if turn > 0 else "first_pictures", configs[name], "--text", "red")
+        if name == "now" or not quick:
+            pictures(name, "pictures_45_views", configs[name], "--text", *FIVE, *all_views)
+    slow = ("now",) if quick else ("now", "before")
+    for name in slow if gpu else ():
+        prompts(name, "cuda", configs[name])
+    if gpu:  # two cores of this machine; without a GPU, the lifts above are those
+        for name in checkouts:
+            lift(name, "first_cpu", "some", "--device", "cpu", "--max-views", 2, program=TWO_CORES + LIFT)
+            lift(name, "cpu", "cpu", "--device", "cpu", program=TWO_CORES + LIFT)
+    for name in slow:
+        prompts(name, "cpu", configs[name])
+    for name, values in found.items():
+        report.add(
+            name,
+            statistics.median(values),
+            f"{'GiB' if 'gib' in name else 's'}, {min(values):.4g} to {max(values):.4g}",
+        )
+
+
 def joined(report: Report, file: Path) -> Report:
     """The report, every unit with its machine, and what a file of it holds besides."""
     here = [replace(metric, unit=f"{metric.unit}; {hardware()}") for metric in report.metrics]
@@ -145,10 +255,12 @@ def joined(report: Report, file: Path) -> Report:
     )
 
 
-def main(trained: Path, quick: bool, output: Path) -> None:
+def main(trained: Path, quick: bool, before: Path | None, output: Path) -> None:
     report = Report("command")
     with tempfile.TemporaryDirectory() as name:
-        if torch.cuda.is_available():
+        if before is not None:
+            add_waits(report, trained.absolute(), before.absolute(), Path(name), quick)
+        elif torch.cuda.is_available():
             add_lifts(report, trained.absolute(), Path(name), 2 if quick else 3)
         else:
             add_questions(report, trained.absolute(), Path(name), 3 if quick else 5)
@@ -159,6 +271,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=FOX, help="config.yml of a trained run; by default the fox")
     parser.add_argument("--quick", action="store_true", help="fewer runs")
+    parser.add_argument("--before", type=Path, help="another checkout, to compare what is waited for with colors")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
-    main(arguments.config, arguments.quick, arguments.output)
+    main(arguments.config, arguments.quick, arguments.before, arguments.output)

@@ -4,10 +4,10 @@
     python -m research.honest_answers --scenes demo
 
 Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
-scene's classes (in the plain room 13 names drawn at random), and four others as negatives. 60 names more, none closer
-to a class than a cosine of 0.9, are asked for as well and are in no scene. The colour encoder looks at pictures of
-the plain room, cut into superpixels and into squares; words that are not in the scene are all names of the XKCD
-survey whose cosine to every colour of the room is below 0.5.
+scene's classes (in the plain room 13 names drawn at random), four others as negatives, and 200 others as the unrelated
+words of rule contrast. 60 names more, none closer to a class than a cosine of 0.9, are asked for as well and are in no
+scene. The colour encoder looks at pictures of the plain room, cut into superpixels and into squares; words that are not
+in the scene are all names of the XKCD survey whose cosine to every colour of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
   iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
@@ -30,6 +30,8 @@ import torch
 from normlift_ns import nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import lift
+from normlift_ns.core.null_level import NULL_SHARE
+from normlift_ns.core.relevancy import relevancy, top_values
 from normlift_ns.demo.capture import demo_cameras, view_image
 from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
@@ -44,7 +46,7 @@ from research.synthetic_scenes import Words, World, demo, real_words, tabletop
 from tests.plain_room import plain_room
 
 DAMAGES = ("mild", "hard")
-OTHERS, NEAR = 60, 0.9
+OTHERS, NEAR, NULL_WORDS = 60, 0.9, 200
 NOT_A_COLOUR = 0.5
 _BINS = 128
 
@@ -88,12 +90,16 @@ def measure(
     truth: np.ndarray,
     rule: RelevancyRule,
     encoder: str,
+    cosines: tuple[np.ndarray, np.ndarray] | None = None,
+    null_tops: list[float] | None = None,
 ) -> None:
     """Adds the rows of one rule.
 
     Args:
         present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
         truth: [N] class, -1 where it is not known.
+        cosines: those of the classes and of the other words; by default, the relevancies are cosines.
+        null_tops: best cosines of the null words, in ascending order.
     """
     kind, valid = encoder_kind(encoder), np.ones(len(truth), bool)
     fixed = kind.threshold if kind.rule == rule and not isinstance(kind.threshold, str) else 0.5
@@ -114,8 +120,10 @@ def measure(
         found["best"].append(max(iou(x, y, t) for t in np.quantile(x, np.linspace(0, 0.9995, 200))))
     for key, values in found.items():
         report.add(f"{name}.{rule}.iou.{key}", float(np.mean(values)), "of 1")
-    for key, histograms in (("visible", there), ("absent", elsewhere)):
-        verdicts = [judge({}, encoder, rule, top_cosine=h.top, top=h.top) for h in histograms]
+    manifest = {"null_words": {"tops": null_tops or []}}
+    for key, histograms, cosine in zip(("visible", "absent"), (there, elsewhere), cosines or (present, absent)):
+        tops = zip(top_values(cosine), histograms)
+        verdicts = [judge(manifest, encoder, rule, top_cosine=best, top=h.top) for best, h in tops]
         for verdict in get_args(Verdict) if None not in verdicts else ():
             report.add(f"{name}.{rule}.{key}.{verdict}", 100 * verdicts.count(verdict) / len(verdicts), "%")
     for key, statistic in STATISTICS.items():
@@ -142,7 +150,7 @@ def clip_like(report: Report, world: World) -> None:
         words = Words(words.others[torch.randperm(len(words.others), generator=g)[: world.classes]], words.others)
     far = words.others[(words.others @ words.classes.T).amax(1) < NEAR]
     far = far[torch.randperm(len(far), generator=g)]
-    negatives, others = far[:4], far[4 : 4 + OTHERS]
+    negatives, others, null_vectors = far[:4], far[4 : 4 + OTHERS], far[4 + OTHERS :][:NULL_WORDS]
     for damage in DAMAGES:
         observed = observe(world, words, LADDER[damage], 0)
         directions, valid = refined_directions(world.scene.means, observed.evidence, observed.features)
@@ -150,8 +158,12 @@ def clip_like(report: Report, world: World) -> None:
         truth, rival = world.truth[valid].numpy(), rivals.max(1, keepdims=True)
         name = f"{world.name}.{damage}"
         measure(report, name, present, absent, truth, "cosine", "open_clip")
-        present, absent = (1 / (1 + np.exp(-10 * (x - rival))) for x in (present, absent))
+        cosines, null = (present, absent), directions @ null_vectors.T
+        level = null.topk(round(NULL_SHARE * len(null_vectors)), 1).values[:, -1:].numpy()
+        present, absent = (relevancy(x, rival, rule="lerf") for x in cosines)
         measure(report, name, present, absent, truth, "lerf", "open_clip")
+        present, absent = (relevancy(x, level, rule="contrast") for x in cosines)
+        measure(report, name, present, absent, truth, "contrast", "open_clip", cosines, sorted(top_values(null)))
 
 
 def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:

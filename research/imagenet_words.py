@@ -1,13 +1,16 @@
 """Words for the 1,000 classes of ImageNet, from WordNet 3.0: python -m research.imagenet_words /usr/share/wordnet
 
 Writes normlift_ns/encoders/imagenet_words.json. The folder is that of Debian's package wordnet-base: index.noun,
-data.noun and noun.exc of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids. The ids of the
-classes, in the order of the network's outputs, are those of the table itself, so no other source is needed.
+data.noun, noun.exc and cntlist.rev of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids.
+The ids of the classes, in the order of the network's outputs, are those of the table itself, so no other source is
+needed.
 
-A class has the lemmas of its synset as names. A hypernym is a synset above one or more classes, and at most half of
-them: "artifact" and "object" tell nothing apart. A lemma of several hypernyms belongs to the one whose sense WordNet
-lists first, so that "cat" means the domestic cat rather than the lion or the whip. It also belongs to later senses that
-occur in WordNet's annotated texts and have the same parent, as both kinds of furniture that "table" means.
+A class has the lemmas of its synset as names. A lemma after the first is left out if the annotated texts of WordNet use
+it ten times or more, but never for this synset: no one calls a promontory a head, or a lighter a light. A hypernym is a
+synset above one or more classes, and at most half of them: "artifact" and "object" tell nothing apart. A lemma of
+several hypernyms belongs to the one whose sense WordNet lists first, so that "cat" means the domestic cat rather than
+the lion or the whip. It also belongs to later senses that occur in WordNet's annotated texts and have the same parent,
+as both kinds of furniture that "table" means.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from pathlib import Path
 import normlift_ns
 
 TABLE = Path(normlift_ns.__file__).parent / "encoders" / "imagenet_words.json"
+MANY_USES = 10
+"""Number of uses from which a sense that never occurs is not meant."""
 SOURCE = "Made from WordNet 3.0 by research/imagenet_words.py; the license of WordNet:"
 
 
@@ -49,6 +54,17 @@ def read_senses(folder: Path) -> dict[str, tuple[list[str], int]]:
     return senses
 
 
+def read_uses(folder: Path) -> dict[str, int]:
+    """Return how often WordNet's annotated texts use every noun, in any sense."""
+    uses: dict[str, int] = {}
+    for line in (folder / "cntlist.rev").read_text("utf8").splitlines():
+        key, _, count = line.split()
+        word, _, sense = key.partition("%")
+        if sense.startswith("1:"):  # a noun
+            uses[word.replace("_", " ")] = uses.get(word.replace("_", " "), 0) + int(count)
+    return uses
+
+
 def ranges(numbers: list[int]) -> str:
     """Return ascending numbers as text.
 
@@ -62,7 +78,7 @@ def ranges(numbers: list[int]) -> str:
 def table(folder: Path, ids: list[str]) -> dict[str, object]:
     """Return the whole table for the synset ids of the classes."""
     lemmas, above, terms = read_synsets(folder)
-    senses = read_senses(folder)
+    senses, uses = read_senses(folder), read_uses(folder)
     below: dict[str, set[int]] = {}
     for number, name in enumerate(ids):
         waiting = list(above[name[1:]])
@@ -77,11 +93,18 @@ def table(folder: Path, ids: list[str]) -> dict[str, object]:
         first = next(offset for offset in offsets if offset in below)
         return [first, *(x for x in offsets[:attested] if x in below and x != first and above[x] == above[first])]
 
+    def means(word: str, offset: str) -> bool:
+        offsets, attested = senses[word.lower()]
+        return offset in offsets[:attested] or uses.get(word.lower(), 0) < MANY_USES
+
     kept: dict[str, set[int]] = {}
     for offset in sorted(below):
         words = ", ".join(word for word in lemmas[offset] if offset in owners(word))
         kept[words] = kept.get(words, set()) | below[offset]
-    classes = {name: ", ".join(lemmas[name[1:]]) for name in ids}
+    classes = {}
+    for name in ids:
+        first, *others = lemmas[name[1:]]
+        classes[name] = ", ".join([first, *(word for word in others if means(word, name[1:]))])
     hypernyms = {words: ranges(sorted(found)) for words, found in kept.items() if words != ""}
     known = {word.lower() for words in [*classes.values(), *hypernyms] for word in words.split(", ")}
     known |= {word.split()[-1] for word in known}

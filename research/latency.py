@@ -5,8 +5,8 @@
 
 The field has 144 grid regions per view and D = 512, in each of its forms: CLIP-like features that differ in every view
 (evidence, float16), and those of 32 classes without noise, which have a basis of rank 32 (low_rank). The question is
-one prompt against four negatives. Times are the least of 20: the machine may be doing other things. The keys view.* are
-those of `research.view` and panel.* those of `research.panel`, on a lift by colours; --quick leaves them out.
+one prompt against four negatives. Times are the least of 20: the machine may be doing other things. The keys panel.*
+are those of `research.panel`, on a lift by colours; --quick leaves them out. `research.view` measures the page.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from research.cpu import clip_like_table
 from research.gpu_cases import grid_labels
 from research.panel import add_fox_panel
 from research.report import RESULTS, Report
-from research.view import add_fox_view
 from tests.captures import SHARED, trained_scene, trained_state, training_cameras
 
 REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
@@ -163,7 +162,6 @@ def main(quick: bool, device: str, output: Path) -> None:
     model.show(None)
     report.add("fox_stock_ms", least(device, repeats, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
     if not quick:
-        add_fox_view(report)
         add_fox_panel(report)
     report.write(output)
 

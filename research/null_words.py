@@ -31,7 +31,7 @@ def main() -> None:
     """Write the file."""
     listed = listed_words()
     taken = {word for text in listed for word in text.lower().split()}
-    related: set[int] = set()
+    related = set(find_classes("promontory"))  # which "head" meant, of the fox head, when the words were drawn
     for text in listed:
         try:
             related.update(find_classes(text))

@@ -26,7 +26,7 @@ def measure(report: Report, capture: str, config: Path) -> None:
     encoder = str(run.field.manifest["encoder"]["encoder"]).replace("colour", "color")
     lists = table["captures"][capture][encoder]
     for name, words in {"absent": table.get(f"{encoder}_absent", []), **lists}.items():
-        found = {word: run.ask(word)[word].verdict for word in words}
+        found = {finding.text: finding.verdict for finding in run.ask(*words)}
         print(capture, encoder, name, found)
         counts = Counter(found.values())
         report.add(f"{capture}.{encoder}.{name}.words", len(words), "words")

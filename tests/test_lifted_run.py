@@ -263,6 +263,8 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
+    with pytest.raises(nl.InputError, match="valid file name"):
+        run.export("")
     for value in (object(), float("nan")):
         with pytest.raises(nl.InputError):
             run.export(tmp_path / "b.ply", objects={"a": value})

@@ -230,7 +230,8 @@ def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
 
     monkeypatch.setattr(nl.pipeline, "rasterize_evidence", watched)
     config = RasterConfig("1.4", "numba", torch.float32, "classic", 1)
-    nl.pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, nl.LiftOptions(), config).join()
+    for thread in nl.pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, nl.LiftOptions(), config):
+        thread.join()
     assert seen[0].shape == (HEIGHT, WIDTH)
     assert torch.bincount(seen[0].flatten()).tolist() == [HEIGHT * WIDTH // 4] * 4
 

@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import threading
+import time
 import warnings
 from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -280,6 +281,7 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
     and processes. A policy set by the user takes precedence.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
+    _process_starts.append(time.perf_counter() - _process_age())
     code: Any = 0
     try:
         run_command(command)
@@ -293,6 +295,23 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         _flush(stream, report=False)  # output of the exit functions
     os._exit(code)
+
+
+_process_starts: list[float] = []
+"""Start of the process of a command, as a value of `time.perf_counter`; empty if commands are called as functions."""
+
+
+def command_start() -> float:
+    """Return the start of the process of this command as a value of `time.perf_counter`, or else the current value."""
+    return _process_starts[-1] if len(_process_starts) > 0 else time.perf_counter()
+
+
+def _process_age() -> float:
+    """Return the seconds since the start of this process, or 0 if the system does not tell."""
+    with suppress(OSError, AttributeError, ValueError, IndexError):
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:

@@ -128,7 +128,7 @@ class NormLiftQuery(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder and the renders: auto, cpu or cuda."""
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows."""
@@ -209,13 +209,17 @@ class NormLiftQuery(CheckedOptions):
 
     def _prepare_renders(self, question: Query) -> Callable[[], list[Path]]:
         """Load everything that the renders need, and return a function that makes and saves them."""
+        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415
         from normlift_ns.rasterization.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_overlays, training_cameras  # noqa: PLC0415
 
+        device = choose_device(self.device)
+        init_cuda(device)
         scene, folder = self._run.scene, cast(Path, self.render_dir)
         cameras = training_cameras(scene, self.render_views)
         result, settings = self._answer_with_scene(question), RasterSettings.recorded(self._run.field.manifest)
-        return lambda: save_overlays(scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
+        shared = {"settings": settings, "device": device, "overwrite": self.overwrite}
+        return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Add an explanation to every row, write the images, and return a function that prints the explanations.

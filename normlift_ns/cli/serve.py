@@ -24,7 +24,9 @@ class NormLiftServe(ServeOptions):
     milliseconds.
     """
 
-    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN…")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN…", help_behavior_hint="(required)")
+    ]
     """Paths to the config.yml files of lifted runs."""
     mcp: bool = False
     """Also serve tools of the Model Context Protocol at /mcp. If standard input is a pipe, as when an agent starts this

@@ -30,7 +30,7 @@ from normlift_ns.core.lowrank import (
     store_directions,
 )
 from normlift_ns.core.partition import Partition, spatial_order
-from normlift_ns.core.relevancy import gaussian_relevancy
+from normlift_ns.core.relevancy import PROMPT_BLOCK, gaussian_relevancy
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
@@ -166,8 +166,11 @@ class SemanticField(TensorRecord):
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
             raise InputError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
-        cosine = self.store.products(vectors / length, self.scalars)
-        return cosine[self.source.long()] if refined else cosine
+        source = self.source.long() if refined else slice(None)
+        cosine = self.scalars.norm.new_empty(len(vectors), len(self), dtype=torch.float32)  # prompts first, in blocks
+        for block, rows in zip(cosine.split(PROMPT_BLOCK), (vectors / length).split(PROMPT_BLOCK)):
+            block.copy_(self.store.products(rows, self.scalars)[source].T)
+        return cosine.T
 
     @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:

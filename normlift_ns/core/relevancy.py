@@ -20,6 +20,10 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 """torch.Tensor or numpy.ndarray."""
 TEMPERATURE = 10.0
 """Factor of the cosines inside LERF's softmax."""
+PROMPT_BLOCK = 32
+"""Number of prompts that are compared with all Gaussians at a time, which bounds the memory of a query."""
+_SAMPLED = 16
+"""One of this number of values is in the sample of `_largest`."""
 TOP_QUANTILE = 0.999
 """Quantile over Gaussians that is the top relevancy of a prompt. Single outliers do not affect it."""
 _LARGEST_COSINE = 1.01
@@ -172,9 +176,20 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
     >>> top_values(np.arange(2001.0)[:, None])
     [1998.0]
     """
-    if isinstance(values, np.ndarray):
-        return np.quantile(values, TOP_QUANTILE, axis=0).tolist()
     place = TOP_QUANTILE * (len(values) - 1)
-    largest = values.topk(len(values) - math.floor(place), dim=0).values  # torch.quantile allows 16 million values
-    low, high = largest[-1].double(), largest[max(len(largest) - 2, 0)].double()
+    count = len(values) - math.floor(place)
+    if isinstance(values, np.ndarray):
+        largest = np.stack([_largest(column, count) for column in values.T], axis=1)
+        low, high = largest[0].astype(np.float64), largest[min(1, count - 1)].astype(np.float64)
+    else:
+        largest = values.topk(count, dim=0).values  # torch.quantile allows 16 million values
+        low, high = largest[-1].double(), largest[max(count - 2, 0)].double()
     return (low + (high - low) * (place - math.floor(place))).tolist()
+
+
+def _largest(values: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " count"]:
+    """Return the largest values in ascending order. A sample bounds them, so that only few values are sorted."""
+    sample = np.sort(values[::_SAMPLED])
+    bound = sample[-min(len(sample), 2 * count // _SAMPLED + 8)]
+    candidates = values[values >= bound]
+    return np.sort(candidates if len(candidates) >= count else values)[-count:]

@@ -30,7 +30,7 @@ class GsplatConfig(NamedTuple):
     test_every: int | None
     primitive: Primitive | None
     clip_planes: tuple[float, float] | None
-    """Near and far plane of a training of 2D Gaussians, in world units."""
+    """Near and far plane in world units."""
 
 
 def find_gsplat_config(splat: Path) -> GsplatConfig | None:
@@ -63,7 +63,8 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     antialiased = flags["antialiased"]
     mode = None if antialiased is None else "antialiased" if antialiased else "classic"
     primitive = cast("Primitive | None", texts["model_type"])
-    planes = (_number(path, root, "near_plane"), _number(path, root, "far_plane")) if primitive == "2dgs" else None
+    near, far = (_number(path, root, name) for name in ("near_plane", "far_plane"))
+    planes = None if near is None or far is None else (near, far)
     return GsplatConfig(
         path,
         "classic" if primitive == "2dgs" else mode,
@@ -74,14 +75,16 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     )
 
 
-def _number(path: Path, root: yaml.Node | None, name: str) -> float:
+def _number(path: Path, root: yaml.Node | None, name: str) -> float | None:
     text = config_string(root, name)
+    if text is None:
+        return None
     try:
-        number = float("" if text is None else text)
+        number = float(text)
     except ValueError:
         number = math.nan
     if not 0 < number < math.inf:
-        raise InputError(f"{path} has {name} {str(text)[:40]!r}, expected a number above 0. {_ADVICE}")
+        raise InputError(f"{path} has {name} {text[:40]!r}, expected a number above 0. {_ADVICE}")
     return number
 
 

@@ -21,6 +21,7 @@ class InriaConfig(NamedTuple):
     path: Path
     white_background: bool
     has_test_images: bool
+    antialiased: bool
 
 
 def find_inria_config(splat: Path) -> InriaConfig | None:
@@ -43,14 +44,14 @@ def find_inria_config(splat: Path) -> InriaConfig | None:
     if not isinstance(call, ast.Call):
         return None  # another program wrote the file
     flags = {item.arg: ast.unparse(item.value) for item in call.keywords}
-    for name in ("white_background", "eval"):
+    for name in ("white_background", "eval", "antialiasing"):
         if flags.get(name) not in (None, "True", "False"):
             raise _damaged(path, f"{name} is {flags[name][:40]}")
-    return InriaConfig(path, flags.get("white_background") == "True", flags.get("eval") == "True")
+    return InriaConfig(path, *(flags.get(name) == "True" for name in ("white_background", "eval", "antialiasing")))
 
 
 def _damaged(path: Path, problem: str) -> InputError:
     return InputError(
-        f"{path} is damaged ({problem}), expected Namespace(…) with True or False for white_background and eval. Copy "
-        "it from the training run again, or move the splat to a separate folder."
+        f"{path} is damaged ({problem}), expected Namespace(…) with True or False for white_background, eval and "
+        "antialiasing. Copy it from the training run again, or move the splat to a separate folder."
     )

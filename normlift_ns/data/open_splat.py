@@ -29,6 +29,7 @@ from normlift_ns.data.worlds import CandidateWorld, candidate_worlds
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import open_regular, protect_inputs
 from normlift_ns.options import Background, Primitive, SplatOptions
+from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.registry import Registry
 
 _MAX_STEP = 0.1
@@ -81,7 +82,7 @@ def open_splat(
 
     def scene_in(candidate: CandidateWorld) -> SplatScene:
         placed, world = candidate.place(cameras.frames), candidate.world
-        planes = candidate.clip_planes(file.clip_planes if file.primitive == "2dgs" else None)
+        planes = candidate.clip_planes(file.clip_planes)
         if file.pose_adjust is not None:
             placed = adjust_poses(placed, held_out, file.pose_adjust, path)
         train, rest = split_views(placed, held_out if options.views == "train" else frozenset(), background)
@@ -248,7 +249,8 @@ def _with_inria_config(file: SplatFile, path: Path, options: SplatOptions) -> tu
         return file, options.background or "black"
     test_every = TEST_EVERY if config.has_test_images and options.colmap is not None else None
     remarks = (*file.remarks, f"The settings of the training are those of {config.path}.")
-    file = file._replace(test_every=file.test_every or test_every, remarks=remarks)
+    mode = file.rasterize_mode or ("antialiased" if config.antialiased else None)
+    file = file._replace(rasterize_mode=mode, test_every=file.test_every or test_every, remarks=remarks)
     return file, options.background or ("white" if config.white_background else "black")
 
 
@@ -269,7 +271,8 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
             f"is {options.primitive}. Omit --primitive, or give the file of another training."
         )
     if (options.primitive or file.primitive or named) == "3dgs":
-        return file._replace(primitive="3dgs")
+        is_usual = file.clip_planes == (RasterSettings.near_plane, RasterSettings.far_plane)
+        return file._replace(primitive="3dgs", clip_planes=None if is_usual else file.clip_planes)
     if options.rasterize_mode == "antialiased":
         raise InputError(f"{path} holds 2D Gaussians, which have no antialiasing; omit --rasterize-mode antialiased.")
     near, far = planes = file.clip_planes or _CLIP_PLANES

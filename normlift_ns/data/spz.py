@@ -7,6 +7,7 @@ header, a table of sizes, and one zstd stream per attribute.
 from __future__ import annotations
 
 import gzip
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -56,7 +57,9 @@ class _Header(NamedTuple):
         return [self.gaussians * size for size in (9, 1, 3, 3, 3 if self.version == 2 else 4, harmonics)]
 
 
-def encode_spz(splat: SplatParameters, *, antialiased: bool = False, version: Literal[3, 4] = 3) -> bytes:
+def encode_spz(
+    splat: SplatParameters, *, antialiased: bool = False, version: Literal[3, 4] = 3, position_step: float = 0.0
+) -> bytes:
     """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
     Positions are rounded to the smallest power of two from 2^-23 to 1 for which all of them fit into 24 bits.
@@ -68,6 +71,7 @@ def encode_spz(splat: SplatParameters, *, antialiased: bool = False, version: Li
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
         version: Version of the format. More programs read version 3; version 4 is newer.
+        position_step: Positions may be rounded to steps of up to this length, which makes the file smaller.
     Raises:
         ValueError: A Gaussian that can be drawn is further than 8,388,607 from the origin along an axis.
     """
@@ -76,7 +80,7 @@ def encode_spz(splat: SplatParameters, *, antialiased: bool = False, version: Li
         torch.where(drawable.view(-1, *[1] * (value.ndim - 1)), value.detach().cpu().double(), 0.0).nan_to_num()
         for value in splat.parameters.values()
     )
-    bits = _fractional_bits(means)
+    bits = min(_fractional_bits(means), _bits_of_step(position_step))
     fixed = (means * 2**bits).round().to(torch.int32).numpy().astype("<i4")
     fields = (
         fixed.view(np.uint8).reshape(-1, 4)[:, :3],
@@ -240,6 +244,11 @@ def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
             "to the origin, or write a PLY file."
         )
     return next(bits for bits in range(_MAX_FRACTIONAL_BITS, -1, -1) if round(reach * 2**bits) <= _MAX_FIXED)
+
+
+def _bits_of_step(step: float) -> int:
+    """Return the smallest number of fractional bits with steps of at most this length."""
+    return min(_MAX_FRACTIONAL_BITS, max(0, math.ceil(-math.log2(step)))) if step > 0 else _MAX_FRACTIONAL_BITS
 
 
 def _floats(values: np.ndarray, *shape: int) -> Tensor:

@@ -584,7 +584,7 @@ def read_world_transform(
         values = _read_values(path)
         if not isinstance(values, dict):
             return decompose_similarity(np.array(values, dtype=float), str(path))
-    except InputError:
+    except (InputError, FileNotFoundError):
         raise
     except (TypeError, ValueError, EOFError, OverflowError, MemoryError, OSError, tokenize.TokenError) as error:
         raise InputError(f"{path} does not contain a transform ({error}). Expected {_EXPECTED_MATRIX}.") from error
@@ -605,8 +605,12 @@ def _read_values(path: Path) -> Any:
         raise InputError(
             f"{path} has {path.stat().st_size:,} bytes, too many for 4 x 4 numbers. Expected {_EXPECTED_MATRIX}."
         )
-    content = io.BytesIO(read_file(path))
-    return (np.load(content, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(content)).tolist()
+    content = read_file(path)
+    if path.suffix == ".npy":
+        return np.load(io.BytesIO(content), allow_pickle=False).tolist()
+    if content.strip() == b"":
+        raise InputError(f"{path} is empty. Expected {_EXPECTED_MATRIX}.")
+    return np.loadtxt(io.BytesIO(content.replace(b",", b" "))).tolist()
 
 
 def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> WorldTransform:

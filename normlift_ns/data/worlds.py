@@ -134,7 +134,7 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
     try:
         points = read_colmap_points(cameras.source)
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{error} gsplat's trainer normalized the world by points3D.") from error
+        raise FileNotFoundError(f"gsplat's trainer normalized the world by points3D. {error}") from error
     if len(points) < _MIN_POINTS:
         raise InputError(
             f"{cameras.source} has {len(points)} points, too few to recompute the normalization of gsplat's trainer. "

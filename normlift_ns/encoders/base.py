@@ -308,6 +308,10 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
         that are unlabeled in all levels have the cell -1, and cells without a region in a level have -1. For one level
         with consecutive ids, cells equal regions.
     """
+    if len(maps) == 1:
+        counts = torch.bincount(maps.flatten() + 1)
+        if bool(counts[1:].all()):
+            return maps[0].int(), torch.arange(len(counts) - 1, dtype=torch.int32, device=maps.device)[None]
     key = torch.zeros_like(maps[0], dtype=torch.int64)
     key_count = 1
     for labels in maps:

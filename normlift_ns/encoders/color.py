@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from normlift_ns.encoders.text_files import LazyTextEncoder, check_prompts
 from normlift_ns.errors import InputError, truncate_text
@@ -50,6 +51,8 @@ _OWN_SHARE = 0.2
 """Weight of a name's own color, with the rest for the mean of its shades. A smaller weight would move pure blue closer
 to purple than to blue."""
 _JITTER = 1e-10
+_THREADS = min(8, os.cpu_count() or 1)
+"""Number of images that are encoded concurrently."""
 _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
 """Words of the survey that are accepted in prompts but not suggested in messages."""
 
@@ -80,20 +83,43 @@ class ColorEncoder(LazyTextEncoder):
         return _normalized(np.stack(rows)).astype(np.float32)
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        import torch  # noqa: PLC0415 (queries can do without torch)
-        from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
-
-        labels = labels.cpu()
-        depth, y, x = (labels >= 0).nonzero(as_tuple=True)
-        lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
-        pixels = torch.bincount(region)
-        total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
-        return torch.from_numpy(embed_colors((total / pixels[:, None]).numpy())).float()
+        return next(self.encode_each([(image, labels)]))
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        return (self.encode(image, labels) for image, labels in views)
+        import torch  # noqa: PLC0415 (queries can do without torch)
+
+        from normlift_ns.core.device import prefetch_map  # noqa: PLC0415 (as above)
+
+        # Vectors are computed in one thread, because concurrent products round differently, and `_anchors` then fails.
+        means = prefetch_map(_mean_lab, views, _THREADS)
+        return (torch.from_numpy(embed_colors(mean)).float() for mean in means)
+
+
+def _mean_lab(view: tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]) -> Float64[np.ndarray, "r 3"]:
+    """Return the mean CIELAB color of every region."""
+    image, labels = view
+    region = labels.cpu().numpy().reshape(len(labels), -1)
+    lab, number = _unique_lab(image.numpy())
+    color, labeled = np.broadcast_to(number, region.shape), region >= 0
+    if not labeled.all():
+        region, color = region[labeled], color[labeled]
+    region, color = region.ravel(), color.ravel()
+    total = np.stack([np.bincount(region, channel[color]) for channel in lab.T], axis=1)
+    return total / np.bincount(region)[:, None]
+
+
+def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, "colors 3"], Int64[np.ndarray, " p"]]:
+    """Return the CIELAB colors of the distinct colors of an image, and the row of every pixel in row-major order.
+
+    An image has several pixels of each color, and the conversion takes most of the time of the encoder.
+    """
+    from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
+
+    red, green, blue = image.reshape(-1, 3).T.astype(np.int32)
+    codes, number = np.unique(red << 16 | green << 8 | blue, return_inverse=True)
+    return rgb2lab(np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)), number
 
 
 @cache

@@ -27,6 +27,8 @@ from normlift_ns.io.memory import check_free_memory
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number that a file may contain."""
+_BLOCK = 2**20
+"""Number of float16 numbers that are compared at a time."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
 _Array = Any
@@ -196,9 +198,32 @@ def check_array(
     """
     if array.dtype != dtype or array.shape != tuple(shape):
         raise InputError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}")
-    least, most = (array.min().item(), array.max().item()) if array.size > 0 else (low, low)
+    least, most = _extremes(array) if array.size > 0 else (low, low)
     if not low <= least <= most <= high:
         raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
+
+
+def _extremes(array: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest value of an array; one or both are NaN if it contains NaN.
+
+    NumPy compares float16 numbers one at a time. As integers, with the other bits of negative numbers inverted, their
+    bits have the same order and are compared twenty times as fast.
+
+    >>> _extremes(np.array([[0.5, -2], [-0.0, 3]], np.float16))
+    (-2.0, 3.0)
+    """
+    if array.dtype != np.float16:
+        return array.min().item(), array.max().item()
+    bits = array.reshape(-1).view(np.int16)
+    blocks = (bits[first : first + _BLOCK] for first in range(0, len(bits), _BLOCK))
+    ends = np.array([(order.min(), order.max()) for order in map(_flip_negative, blocks)])
+    least, most = _flip_negative(np.array([ends.min(), ends.max()])).view(np.float16).tolist()
+    return least, most
+
+
+def _flip_negative(bits: np.ndarray) -> np.ndarray:
+    """Invert all bits of negative int16 numbers except the sign; the inverse of itself."""
+    return bits ^ ((bits >> 15) & 0x7FFF)
 
 
 # NPY files: their size is compared with their header before NumPy allocates memory, and pickles are never loaded.

@@ -6,17 +6,19 @@ Cosines equal those of `SemanticField.query` up to rounding of float32 sums (1e-
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
+from normlift_ns.core.relevancy import PROMPT_BLOCK
 from normlift_ns.encoders.text_files import LazyTextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.io.field import SCALAR_NAMES, FieldArrays, read_field
@@ -25,6 +27,8 @@ from normlift_ns.query.engine import Answer, run_query
 from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
+_DIRECTION_BLOCK = 8 * PROMPT_BLOCK
+"""Number of prompts for which float16 directions are converted once. The conversion takes most of the time."""
 _BLOCK_ELEMENTS = 2**21
 """Number of elements to convert to float32 at a time, which fits into a processor's cache."""
 
@@ -63,22 +67,49 @@ class ArrayField(FieldArrays):
             )
         vectors = text_vectors.astype(np.float64)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        source = arrays["source"] if refined else np.arange(len(arrays["norm"]))
+        row = np.cumsum(arrays["norm"] > 0) - 1  # of every Gaussian among those with a direction
+        taken, missing = row[source].clip(min=0), np.flatnonzero(arrays["norm"][source] <= 0)
+        cosine = np.zeros((len(vectors), len(source)), np.float32)
+        if row[-1:].sum() < 0:
+            return cosine.T
+        products = self._evidence_products(vectors) if self.evidence is not None else self._direction_products(vectors)
+        size = PROMPT_BLOCK if self.evidence is not None else _DIRECTION_BLOCK
+
+        def fill(first: int) -> None:
+            block = slice(first, first + size)
+            product = products(block)
+            np.take(product.clip(-1, 1, out=product), taken, axis=1, out=cosine[block], mode="clip")
+            cosine[block, missing] = 0
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(fill, range(0, len(vectors), size)))
+        return cosine.T
+
+    def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
+        """Return a function that computes the cosines to some of the vectors, of the Gaussians with a direction."""
+        arrays, rows = self.arrays, cast(Any, self.evidence).rows
         valid = arrays["norm"] > 0
-        cosine = np.zeros((len(valid), len(vectors)), np.float32)
-        if self.evidence is not None:
-            rows = self.evidence.rows
-            table = arrays["features"].astype(np.float64) @ vectors.T
-            matrix = csr_array((rows.weight, rows.column, rows.offsets), shape=(len(valid), len(table)))
-            length = arrays["weight"].astype(np.float64) * arrays["norm"]
-            cosine[valid] = (matrix @ table)[valid] / length[valid, None]
-        else:
-            coordinates, basis = arrays["coordinates"], arrays.get("basis")
-            projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
-            step = max(1, _BLOCK_ELEMENTS // projected.shape[1])
-            blocks = (coordinates[i : i + step].astype(np.float32) for i in range(0, len(coordinates), step))
-            cosine[valid] = np.concatenate([block @ projected.T for block in blocks] or [cosine[:0]])
-        cosine = cosine.clip(-1, 1)
-        return cosine[arrays["source"]] if refined else cosine
+        table = arrays["features"].astype(np.float64) @ vectors.T
+        matrix = csr_array((rows.weight, rows.column, rows.offsets), shape=(len(valid), len(table)))
+        length = (arrays["weight"].astype(np.float64) * arrays["norm"])[valid, None]
+        return lambda block: ((matrix @ table[:, block])[valid] / length).T.astype(np.float32)
+
+    def _direction_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
+        """Return a function as `_evidence_products` does."""
+        coordinates, basis = self.arrays["coordinates"], self.arrays.get("basis")
+        projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
+        step = max(1, _BLOCK_ELEMENTS // projected.shape[1])
+
+        def products(block: slice) -> Float32[np.ndarray, "b m"]:
+            rows = projected[block]
+            product = np.empty((len(rows), len(coordinates)), np.float32)
+            for first in range(0, len(coordinates), step):
+                part = coordinates[first : first + step].astype(np.float32)
+                product[:, first : first + step] = rows @ part.T
+            return product
+
+        return products
 
 
 @dataclass(frozen=True, eq=False)

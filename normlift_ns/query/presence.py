@@ -1,7 +1,7 @@
 """Verdicts on the presence of prompts in a scene. This module does not need torch.
 
 The rank of a prompt is the fraction of the null vocabulary whose best cosine is lower than that of the prompt. The
-limits on the rank fix the rate of false positives: with every encoder, one unrelated word in twenty is "found". The
+limits on the rank fix the rate of false positives: with every encoder, one unrelated word in ten is "found". The
 color encoder has limits on the cosine instead. Without a null vocabulary of at least 100 words, the verdict depends on
 the relevancy, which compares the prompt with the negatives. docs/honest_answers.md has the counts.
 """
@@ -19,7 +19,7 @@ from normlift_ns.options import RelevancyRule
 Verdict = Literal["found", "weak match", "probably not here"]
 """Presence of a prompt. found: it matches better than almost all unrelated words. probably not here: it matches no
 better than many of them."""
-_FOUND_RANK, _WEAK_RANK = 0.95, 0.8
+_FOUND_RANK, _WEAK_RANK = 0.9, 0.7
 """Minimum ranks of a prompt for the verdicts "found" and "weak match"."""
 _FEWEST = 100
 """Minimum number of null words for a meaningful rank."""
@@ -29,6 +29,12 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
     """Return the fraction of null words with a lower best cosine, in 0..1; None if the field has too few null words."""
     tops = (manifest.get("null_words") or {}).get("tops", ())
     return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST else None
+
+
+def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
+    """Return whether `judge` uses cosines, with limits of the encoder or with null words, and not relevancies."""
+    kind = find_encoder_kind(encoder)
+    return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
 
 
 def judge(

@@ -283,11 +283,33 @@ def render_image(
     """
     if scene.renderer is not None:
         return scene.renderer(camera)
-    options = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
     gaussians = gaussians or scene.gaussians
-    color, alpha = render(gaussians, camera, scene.colors(camera).to(gaussians.means.device), **options)
-    color = color + (1 - alpha)[:, :, None] * scene.background.to(color)
-    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+    nothing = gaussians.means[:, :0]
+    return render_with_image(scene, camera, nothing, settings=settings, mode=mode, gaussians=gaussians)[0]
+
+
+def render_with_image(
+    scene: Scene,
+    camera: Camera,
+    values: Float[Tensor, "n c"],
+    *,
+    settings: RasterSettings | None = None,
+    mode: RasterizeMode | None = None,
+    gaussians: GaussianScene | None = None,
+) -> tuple[UInt8[Tensor, "h w 3"], Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Return the results of `render_image`, on the CPU, and of `render`, in one pass over the Gaussians.
+
+    Args:
+        values: Values per Gaussian, as in `render`, on the rendering device.
+        scene, camera, settings, mode, gaussians: As in `render_image`.
+    """
+    gaussians = gaussians or scene.gaussians
+    options = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
+    if scene.renderer is not None:
+        return scene.renderer(camera), *render(gaussians, camera, values, **options)
+    image, alpha = render(gaussians, camera, torch.cat([scene.colors(camera).to(values), values], dim=1), **options)
+    color = image[:, :, :3] + (1 - alpha)[:, :, None] * scene.background.to(image)
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu(), image[:, :, 3:], alpha
 
 
 def _job(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from normlift_ns.analysis.inventory import Inventory, as_instances
 from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color, view_shares
+from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.relevancy import RELEVANCY_RULES
@@ -27,7 +29,7 @@ from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, saf
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer, Finding
 from normlift_ns.query.presence import Verdict
-from normlift_ns.rasterization.rasterize import render, render_image
+from normlift_ns.rasterization.rasterize import render, render_image, render_with_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
 
@@ -334,18 +336,26 @@ def view_figure(
 
 
 def contact_sheet(
-    sheet: FigureStyle, header: FigureHeader, overlays: Sequence[tuple[str, Tensor, Tensor]]
+    sheet: FigureStyle, header: FigureHeader, panels: Sequence[Image.Image], views: Sequence[str]
 ) -> Image.Image:
     """Draw a figure of all views for one prompt.
 
     Args:
         header: title and summary above the figure.
-        overlays: name, overlay [H, W, 3] and mask of selected pixels [H, W] of each view.
+        panels: overlay of each view with an outline of the selection, of the width `_panel_width`.
+        views: names of the views.
     """
-    columns = len(overlays) if len(overlays) <= _MAX_SINGLE_ROW else math.ceil(math.sqrt(len(overlays)))
-    width = min(_THUMBNAIL_WIDTH, _MAX_WIDTH // columns)
-    panels = [_outlined(overlay, selected, width) for _, overlay, selected in overlays]
-    return _page(sheet, [header.title, header.summary], panels, [view for view, _, _ in overlays], columns)
+    return _page(sheet, [header.title, header.summary], panels, views, _columns(len(panels)))
+
+
+def _columns(panels: int) -> int:
+    """Return the number of columns of a contact sheet."""
+    return panels if panels <= _MAX_SINGLE_ROW else math.ceil(math.sqrt(panels))
+
+
+def _panel_width(panels: int) -> int:
+    """Return the width of each panel of a contact sheet, in pixels."""
+    return min(_THUMBNAIL_WIDTH, _MAX_WIDTH // _columns(panels))
 
 
 def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
@@ -417,6 +427,8 @@ def _draw_color_bar(
 
 CONTACT_SHEET_PREFIX = "contact_sheet"
 """Prefix of the file names of contact sheets; the prefix of other figures is the name of their view."""
+_THREADS = min(16, os.cpu_count() or 1)
+"""Number of views whose figures are drawn and saved concurrently."""
 _ZLIB_LEVEL = 4
 """Compression level of PNG files; PIL's default, 6, takes twice as long for files that are 6% smaller."""
 
@@ -428,6 +440,7 @@ def save_overlays(
     folder: Path,
     *,
     settings: RasterSettings | None = None,
+    device: str = "cpu",
     overwrite: bool = False,
 ) -> list[Path]:
     """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
@@ -438,6 +451,7 @@ def save_overlays(
     Args:
         cameras: training cameras by file name prefix, as from `training_cameras`.
         settings: rasterizer settings (default: those of gsplat 1.4).
+        device: torch device that renders.
         overwrite: replace existing files.
     Returns:
         Paths of the files.
@@ -453,35 +467,56 @@ def save_overlays(
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}. Render the views one at a time.")
     headers = [FigureHeader.of(finding) for finding in answer]
-    sheet = FigureStyle(colors.COLORMAPS[0], make_display(answer.field, answer).map_scale, answer.question.threshold)
-    paths, overlays = [], [[] for _ in answer.texts]
+    display = make_display(answer.field, answer)
+    sheet = FigureStyle(colors.COLORMAPS[0], display.map_scale, answer.question.threshold)
 
-    def save(prefix: str, q: int, picture: Image.Image) -> None:
-        paths.append(folder / f"{prefix}_{ends[q]}")
-        with atomic_file(paths[-1], overwrite=overwrite) as draft:
+    def save(prefix: str, q: int, picture: Image.Image) -> Path:
+        path = folder / f"{prefix}_{ends[q]}"
+        with atomic_file(path, overwrite=overwrite) as draft:
             picture.save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+        return path
 
-    for view, camera in cameras.items():
+    def draw(rendered: tuple[str, list[_Overlay]]) -> tuple[list[Path], list[Image.Image]]:
+        view, overlays = rendered
         image = _training_image(scene, view)
-        for q, overlay in enumerate(_overlays(scene, answer, camera, settings)):
-            overlays[q].append((view, *overlay))
-            save(view, q, view_figure(sheet, headers[q], view, image, *overlay))
-    for q in range(len(ends) if len(cameras) > 1 else 0):
-        save(CONTACT_SHEET_PREFIX, q, contact_sheet(sheet, headers[q], overlays[q]))
+        figures = (view_figure(sheet, header, view, image, *x) for header, x in zip(headers, overlays))
+        paths = [save(view, q, figure) for q, figure in enumerate(figures)]
+        return paths, [_outlined(*overlay, _panel_width(len(cameras))) for overlay in overlays]
+
+    drawn = list(prefetch_map(draw, _render_overlays(scene, answer, display, cameras, settings, device), _THREADS))
+    paths = [path for saved, _ in drawn for path in saved]
+    if len(cameras) > 1:
+        panels = ([panel[q] for _, panel in drawn] for q in range(len(ends)))
+        sheets = [contact_sheet(sheet, header, x, list(cameras)) for header, x in zip(headers, panels)]
+        paths += [save(CONTACT_SHEET_PREFIX, q, picture) for q, picture in enumerate(sheets)]
     return paths
 
 
-def _overlays(
-    scene: Scene, answer: Answer, camera: Camera, settings: RasterSettings | None
-) -> list[tuple[UInt8[Tensor, "h w 3"], Tensor]]:
-    """Return, for each prompt, its relevancy map and the mask [H, W] of the selected pixels."""
-    count, display = len(answer.texts), make_display(answer.field, answer)
-    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1)
-    image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
-    pixel = pixel_relevancy(image, alpha)
-    rgb = render_image(scene, camera, settings=settings).float() / 255
-    maps = [relevancy_map(display, rgb, pixel[:, :, q], alpha) for q in range(count)]
-    return [((map_ * 255).round().to(torch.uint8), pixel[:, :, count + q] > 0.5) for q, map_ in enumerate(maps)]
+class _Overlay(NamedTuple):
+    """Overlay of one prompt, on the CPU."""
+
+    image: UInt8[Tensor, "h w 3"]
+    selected: Bool[Tensor, "h w"]
+    """Mask of the selected pixels."""
+
+
+def _render_overlays(
+    scene: Scene,
+    answer: Answer,
+    display: Display,
+    cameras: Mapping[str, Camera],
+    settings: RasterSettings | None,
+    device: str,
+) -> Iterator[tuple[str, list[_Overlay]]]:
+    """Yield the name of every view with the overlays of all prompts, which are rendered at once."""
+    count, gaussians = len(answer.texts), scene.gaussians.to(device)
+    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
+    for name, camera in cameras.items():
+        rgb, image, alpha = render_with_image(scene, camera, values, settings=settings, gaussians=gaussians)
+        rgb, pixel = rgb.to(device).float() / 255, pixel_relevancy(image, alpha)
+        maps = [relevancy_map(display, rgb, pixel[:, :, q], alpha) for q in range(count)]
+        images = ((x * 255).round().to(torch.uint8).cpu() for x in maps)
+        yield name, list(map(_Overlay, images, (pixel[:, :, count:] > 0.5).cpu().unbind(2)))
 
 
 def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:

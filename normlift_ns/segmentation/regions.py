@@ -80,7 +80,7 @@ _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
 _COMPACTNESS = 10.0
 """Weight of spatial distance relative to color distance in superpixels. Larger values produce squarer regions."""
-_WORKERS = min(4, os.cpu_count() or 1)
+_WORKERS = min(8, os.cpu_count() or 1)
 """Number of images to segment concurrently. Superpixels need many times the memory of their image."""
 
 

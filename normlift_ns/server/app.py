@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ctypes
 import html
@@ -31,6 +32,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol, h11
 
 import normlift_ns
 from normlift_ns.errors import InputError, describe_error
@@ -54,7 +56,7 @@ MAX_PAGES = 64
 MAX_CONNECTIONS = 512
 REQUEST_TIMEOUT = 120.0
 """Maximum duration of a request in seconds; the server then responds with status 504."""
-_BODY_TIMEOUT = 20.0
+_HEADER_TIMEOUT, _BODY_TIMEOUT = 10.0, 20.0
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _QUICK_THREADS = 4
@@ -143,6 +145,38 @@ class Guard:
                     _HEADERS,
                 )(scope, receive, send)
         return None
+
+
+class _PromptProtocol(H11Protocol):
+    """HTTP protocol that closes connections whose requests do not arrive in time; uvicorn would wait for ever."""
+
+    _deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._watch()
+
+    def data_received(self, data: bytes) -> None:
+        """Handle data, and wait for the rest of a request."""
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop waiting."""
+        self._stop_watching()
+        super().connection_lost(exc)
+
+    def _watch(self) -> None:
+        if self.conn.their_state is not h11.IDLE:
+            self._stop_watching()
+        elif self._deadline is None:
+            self._deadline = self.loop.call_later(_HEADER_TIMEOUT, self.transport.close)
+
+    def _stop_watching(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
 
 
 def _limited(receive: Receive) -> Receive:
@@ -349,8 +383,9 @@ class WarmServer:
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
             self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
-            ws="websockets-sansio", ws_max_size=MAX_BODY, ws_per_message_deflate=False, ws_ping_interval=20.0,
-            timeout_keep_alive=20, timeout_graceful_shutdown=2, limit_concurrency=MAX_CONNECTIONS,
+            http=_PromptProtocol, ws="websockets-sansio", ws_max_size=MAX_BODY, ws_per_message_deflate=False,
+            ws_ping_interval=20.0, timeout_keep_alive=20, timeout_graceful_shutdown=2,
+            limit_concurrency=MAX_CONNECTIONS,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         threading.Thread(target=self._server.run, args=([listener],), daemon=True).start()

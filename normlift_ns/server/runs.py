@@ -22,6 +22,7 @@ from PIL import Image
 
 from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.gaussians import MIN_OPACITY, SH_C0, Camera, GaussianScene
+from normlift_ns.core.partition import spatial_order
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.spz import encode_spz
 from normlift_ns.errors import InputError
@@ -50,6 +51,8 @@ _BASIC_COLORS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "
 _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
 _JPEG_QUALITY = 85
+_POSITION_STEP = 2**-14
+"""Steps to which the positions on the page are rounded, as a fraction of the radius of the scene."""
 _MEMORY_SHARE = 0.5
 """Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()
@@ -109,12 +112,12 @@ class ServedRun:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Indices of the drawn Gaussians in the scene, in ascending order."""
+        """Indices of the drawn Gaussians in the scene, in spatial order, which compresses well."""
         gaussians, rows = self.run.scene.gaussians, self.visible.nonzero().squeeze(1)
         if len(rows) > self.max_gaussians:
             largest = gaussians.scales[rows].double().topk(2, dim=1).values.prod(dim=1)
             rows = rows[(gaussians.opacities[rows] * largest).topk(self.max_gaussians).indices].sort().values
-        return rows.cpu().numpy()
+        return rows[spatial_order(gaussians.means[rows])].cpu().numpy()
 
     @cached_property
     def drawn_scene(self) -> GaussianScene:
@@ -124,13 +127,14 @@ class ServedRun:
 
     @cached_property
     def geometry(self) -> tuple[bytes, str]:
-        """The drawn Gaussians as SPZ, and the digest of these bytes."""
+        """The drawn Gaussians as SPZ in the order of `rows`, and the digest of these bytes."""
         scene, rows = self.run.scene, torch.from_numpy(self.rows)
         values = {name: value.detach().float().cpu()[rows] for name, value in scene.parameters.items()}
         if not scene.has_harmonics:
             values["features_dc"] = (torch.sigmoid(values["features_dc"]) - 0.5) / SH_C0
             values["features_rest"] = values["features_rest"][:, :0]
-        content = encode_spz(SplatParameters(**values), antialiased=scene.rasterize_mode == "antialiased")
+        antialiased, step = scene.rasterize_mode == "antialiased", _POSITION_STEP * self.frame[2]
+        content = encode_spz(SplatParameters(**values), antialiased=antialiased, position_step=step)
         return content, xxhash.xxh3_128_hexdigest(content)
 
     @cached_property

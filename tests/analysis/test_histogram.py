@@ -35,6 +35,11 @@ def test_every_valid_gaussian_is_in_one_bin(values, threshold, seed):
         assert found is None
         return
     assert found.counts.sum() == valid.sum()
+    counts, edges = np.histogram(values[valid].astype(np.float64), HISTOGRAM_BINS, (found.edges[0], found.edges[-1]))
+    assert np.array_equal(found.counts, counts)
+    assert np.array_equal(found.edges, edges)
+    median, top = np.quantile(values[valid].astype(np.float64), (0.5, 0.999))
+    assert (found.top, found.median in (median, values[valid].min())) == (top, True)
     assert len(found.counts) == HISTOGRAM_BINS == len(found.edges) - 1
     assert found.edges[0] <= min(threshold, values[valid].min())
     assert found.edges[-1] >= max(threshold, values[valid].max())

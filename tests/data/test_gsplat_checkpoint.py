@@ -123,6 +123,8 @@ def test_settings_of_the_training_are_read(tmp_path: Path) -> None:
         assert (found.rasterize_mode, found.by_gsplat, found.test_every) == ("antialiased", False, 4)
         assert any("cfg.yml" in text for text in found.remarks)
     assert _read(other).test_every is None
+    config.write_text(f"{CONFIG}near_plane: 0.2\nfar_plane: 10000000000.0\n")
+    assert _read(ply).clip_planes == (0.2, 1e10)
     config.write_text(CONFIG.replace("true", "false").replace("space: false", "space: true"))
     assert (_read(ply).rasterize_mode, _read(ply).by_gsplat) == ("classic", True)
     config.write_text("antialiased: true\ntest_every: x\n")  # of another program

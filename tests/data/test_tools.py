@@ -235,6 +235,9 @@ def test_settings_of_inrias_trainer_are_used(frames: list[Frame], tmp_path: Path
         scene = open_splat(path, options)
         assert scene.background_name == background
         assert [Path(name).name for name in scene.held_out.names] == held_out
+    assert plain.rasterize_mode == "classic"
+    config.write_text(CFG_ARGS.replace("eval=True", "eval=True, antialiasing=True"))
+    assert open_splat(path, colmap).rasterize_mode == "antialiased"
     config.write_text(CFG_ARGS.replace("True", "False"))
     assert len(open_splat(path, colmap).held_out) == 0
     beside = write_plain_ply(tmp_path / "scene.ply", splat, comments, names)

@@ -17,6 +17,7 @@ def test_a_matrix_is_read_in_its_parts(tmp_path: Path) -> None:
     (tmp_path / "world.json").write_text(json.dumps(MATRIX.tolist()))
     np.save(tmp_path / "world.npy", MATRIX)
     np.savetxt(tmp_path / "world.txt", MATRIX)
+    np.savetxt(tmp_path / "commas.txt", MATRIX, delimiter=",")
     for path in tmp_path.iterdir():
         world = read_world_transform(path)
         assert world.scale == pytest.approx(2.5)

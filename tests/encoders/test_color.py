@@ -100,6 +100,21 @@ def test_a_region_is_its_mean_cielab_colour():
     assert COLOUR.encode(image, torch.full_like(labels, -1)).shape == (0, 343)
 
 
+def test_the_vectors_of_an_image_do_not_depend_on_others_that_are_read_at_once():
+    g = torch.Generator().manual_seed(0)
+    views = [
+        (
+            torch.randint(0, 256, (30, 40, 3), generator=g, dtype=torch.uint8),
+            torch.arange(40).expand(1, 30, 40).int() // 8,
+        )
+        for _ in range(20)
+    ]
+    space._anchors.cache_clear()
+    together = list(COLOUR.encode_each(iter(views)))
+    for (image, labels), rows in zip(views, together, strict=True):
+        assert torch.equal(rows, COLOUR.encode(image, labels))
+
+
 def test_basic_colours_are_found_in_shade(survey):
     names = ["red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "grey"]
     colour = torch.tensor([list(bytes.fromhex(survey[f"xkcd:{name}"][1:])) for name in names]) / 255

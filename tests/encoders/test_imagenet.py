@@ -48,7 +48,14 @@ def test_words_name_classes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("prompt", "near"), [("red foxx", "red fox"), ("furnitur", "furniture"), ("artifact", "--encoder"), ("!?", "dog")]
+    ("prompt", "near"),
+    [
+        ("red foxx", "red fox"),
+        ("furnitur", "furniture"),
+        ("artifact", "--encoder"),
+        ("!?", "dog"),
+        ("fox head", "red fox"),
+    ],
 )
 def test_words_that_mean_nothing_are_refused_with_the_nearest(prompt: str, near: str) -> None:
     refused(lambda: find_classes(prompt), repr(prompt), near)

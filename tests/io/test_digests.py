@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given
@@ -421,3 +422,15 @@ def test_a_large_checkpoint_without_its_end_is_refused_unread(tmp_path: Path) ->
     write_manifest(folder, example().manifest, {"../nerfstudio_models/step-1.ckpt": "0" * 16})
     with pytest.raises(InputError, match=r"step-1\.ckpt"):
         check_file_digests(folder)
+
+
+def test_range_of_half_precision_is_that_of_numpy():
+    numbers = np.arange(2**16, dtype=np.uint16).view(np.float16)
+    finite = numbers[np.isfinite(numbers)].reshape(-1, 2)
+    check_array("x", finite, "float16", finite.shape, float(finite.min()), float(finite.max()))
+    for low, high in ((-65503, 65504), (-65504, 65503)):
+        with pytest.raises(InputError, match=r"values in -65504\.0\.\.65504\.0"):
+            check_array("x", finite, "float16", finite.shape, low, high)
+    for number in numbers[~np.isfinite(numbers)][::97]:
+        with pytest.raises(InputError, match="x has values"):
+            check_array("x", np.append(finite, number), "float16", (finite.size + 1,), -70000, 70000)

@@ -52,9 +52,11 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     question = Query(
         ("a", "b", "c"), vectors, ("d", "e"), negatives, rule, 0.1, min_reliability=min_reliability, refined=refined
     )
-    expected = engine.run_query(field, means, question)
+    expected = engine.run_query(field, means, question)  # all prompts in one block
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(arrays, "_BLOCK_ELEMENTS", 100)  # rows are read in several blocks
+        for module in (arrays, engine):
+            patch.setattr(module, "PROMPT_BLOCK", 2)
         field.save(folder)
         stored = arrays.ArrayField(*read_field(Path(folder)))
         found = engine.run_query(stored, stored.arrays["means"], question)

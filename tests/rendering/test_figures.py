@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.query.engine import Answer
@@ -48,7 +49,8 @@ def test_a_text_is_drawn_as_it_is() -> None:
         image, selected = torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.bool)
         found = figures.FigureHeader(text, "x" * 300)
         assert figures.view_figure(SHEET, found, text, image, image, selected).size[0] > 500, text
-        assert figures.contact_sheet(SHEET, found, [(text, image, selected)] * 5).size[0] > 500, text
+        panel = Image.new("RGB", (size[1], size[0]))
+        assert figures.contact_sheet(SHEET, found, [panel] * 5, [text] * 5).size[0] > 500, text
 
 
 def test_the_outline_goes_around_what_is_selected_and_the_photograph_stands_beside_it() -> None:

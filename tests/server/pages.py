@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from starlette.testclient import TestClient
 
+from normlift_ns.core.partition import spatial_order
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.server.app import ServerOptions, WarmServer
 from normlift_ns.server.runs import ServedRun
@@ -104,8 +105,8 @@ class Page:
         return message["text"]
 
     def color(self, gaussian: int) -> list[float] | None:
-        """Entry of the palette of a Gaussian; None: it is not drawn."""
-        code = int(self.codes[gaussian])
+        """Entry of the palette of a Gaussian of the cubes, sent in spatial order; None: it is not drawn."""
+        code = int(self.codes[int((spatial_order(cubes().means) == gaussian).nonzero())])
         return None if code == 255 else self.palette[code]
 
 

@@ -268,3 +268,26 @@ def test_runs_are_closed_when_memory_is_scarce_but_not_those_with_pages(tmp_path
     with pytest.raises(InputError, match="fox-one, castle-one"):
         store.get("other")
     assert isinstance(first.space.field, SemanticField)
+
+
+def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr(app_module, "_HEADER_TIMEOUT", 0.3)
+    server = WarmServer(RunStore([], open_run), ServerOptions(port=0))
+    port = server.start()
+    request = b"GET /api/runs HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    try:
+        for first in (b"", request[:20], request + request[:20]):  # nothing, a part, a part after a whole one
+            with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
+                line.sendall(first)
+                received = b"".join(iter(lambda: line.recv(4096), b""))
+            assert received.count(b'{"runs":[]}') == (len(first) > len(request))
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
+            for _ in range(2):  # a connection may rest between requests
+                line.sendall(request)
+                received = b""
+                while not received.endswith(b'{"runs":[]}'):
+                    received += line.recv(4096)
+                    assert received.startswith(b"HTTP/1.1 200")
+                time.sleep(0.6)
+    finally:
+        server.stop()

@@ -39,7 +39,7 @@ def test_other_queries_are_none_or_an_error(text):
 
 def test_damaged_links_and_other_greetings_are_refused():
     for text in ("", "{}", "[]", '{"token": ""}', '{"token": 1}', '{"token": "' + "x" * 101 + '"}', "[" * 100_000,
-                 '{"token": null}', '{"token": "a", "webgl": "no"}'):  # fmt: skip
+                 '{"token": null}', '{"token": "a", "access": 1}'):  # fmt: skip
         with pytest.raises(InputError, match="not valid"):
             decode(text, Greeting)
     for link in (

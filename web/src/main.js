@@ -208,10 +208,7 @@ class Page {
       }),
       tool("Help", "help", "List all shortcuts.", "?", () => $("help").showModal(), { id: "do-help" }),
     );
-    this.setTheme(
-      localStorage.getItem("normlift:theme") ??
-        (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"),
-    );
+    this.showBackground();
     startTooltips();
     startShortcuts(this.shortcuts());
   }
@@ -546,11 +543,6 @@ class Page {
   switchTheme() {
     const theme = document.documentElement.dataset.theme === "light" ? "dark" : "light";
     localStorage.setItem("normlift:theme", theme);
-    this.setTheme(theme);
-  }
-
-  /** @param {string} theme */
-  setTheme(theme) {
     document.documentElement.dataset.theme = theme;
     this.showBackground();
   }
@@ -562,5 +554,7 @@ class Page {
   }
 }
 
+document.documentElement.dataset.theme =
+  localStorage.getItem("normlift:theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
 const runs = await fetchRuns();
 /** @type {any} */ (window).page = new Page(runs.find((one) => one.id === parameters.get("run")) ?? runs[0], runs);

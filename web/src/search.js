@@ -73,7 +73,10 @@ export class Search {
     else if (state.line !== this.line && box.value === this.line) box.value = state.line;
     this.line = state.line;
     if (state.busy !== undefined) this.setBusy(state.busy);
-    this.showExamples(state.prompts.length === 0 && !state.by_hand);
+    const problem = state.prompts.find((/** @type {any} */ one) => one.error)?.error ?? "";
+    $("problem").textContent = problem && `${problem[0].toUpperCase()}${problem.slice(1).replace(/\.$/, "")}.`;
+    $("problem").hidden = !problem;
+    this.showExamples(!state.by_hand && state.prompts.every((/** @type {any} */ one) => one.error));
     const shownTexts = state.prompts
       .filter((/** @type {any} */ one) => !one.error)
       .map((/** @type {any} */ one) => one.text);

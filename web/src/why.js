@@ -34,7 +34,7 @@ export function showExplanation(message, closed) {
 
 /** @param {any} entry @param {string} of */
 function figure(entry, of) {
-  const label = `${entry.name}, ${Math.round(100 * entry.share)} % of the weight`;
+  const label = `${entry.name}, ${Math.round(100 * entry.share)}\u00a0% of the weight`;
   const enlarge = () => {
     const dialog = h(
       "dialog",
