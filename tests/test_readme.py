@@ -129,6 +129,7 @@ def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
     made, shown, real = tables(documents()), README.split("## Accuracy")[1], documents()["grid_real"]
     header, *columns = [line.strip("| ").split(" | ") for line in made["grid-columns"].splitlines()]
     rows = [line for line in shown.splitlines() if line.startswith("| `--")]
+    shown = " ".join(shown.split())
     for row, kind in zip(rows, ("masks", "patches", "superpixels"), strict=True):
         cells = next(cells for cells in columns if cells[0] == f"kind: {kind}")
         wanted = " | ".join(cells[header.index(method)] for method in ("paper", DEFAULT))
