@@ -143,7 +143,7 @@ def test_features_by_name_and_without_texts(trained: Path, scene: nl.Scene, tmp_
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
     assert run.field.manifest["statistics"]["views"] == 4
     assert run.field.manifest["statistics"]["left_out"] == 8
-    assert list(run.seconds) == ["check", "features", "evidence", "consensus", "lift", "store", "write"]
+    assert list(run.seconds) == ["check", "features", "evidence", "consensus", "recognition", "lift", "store", "write"]
     assert min(run.seconds.values()) > 0
     with pytest.raises(ValueError, match="texts"):
         run.ask("left")

@@ -122,6 +122,7 @@ def _capture_key(command: NormLift) -> str:
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
     options["splat"] = _splat_options_of_0_2(options["splat"])
+    options["lift"] = _lift_options_of_0_2(options["lift"])
     files = [path for path in (command.load_ply, command.load_gsplat) if path is not None]
     if command.load_config is not None:
         step = "*" if command.load_step is None else f"{command.load_step:09d}"
@@ -140,6 +141,15 @@ def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
     world, background = values["world_transform"], values["background"] or "black"
     old = {name: value for name, value in values.items() if name != "primitive"}
     return {**old, "world_transform": None if world == "auto" else world, "background": background, **new}
+
+
+def _lift_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of lifts with the values that version 0.2 wrote into keys; new options only if they are set."""
+    old = {name: value for name, value in values.items() if name not in ("reliability", "recognition")}
+    if old["consensus_least"] is None:
+        old["consensus_least"] = 0.4
+    old["vote"] = {name: value for name, value in values["vote"].items() if name != "min_labeled" or value is not None}
+    return old if values["reliability"] == "paper" else {**old, "reliability": values["reliability"]}
 
 
 def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:

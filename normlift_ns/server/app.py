@@ -56,7 +56,7 @@ MAX_PAGES = 64
 MAX_CONNECTIONS = 512
 REQUEST_TIMEOUT = 120.0
 """Maximum duration of a request in seconds; the server then responds with status 504."""
-_HEADER_TIMEOUT, _BODY_TIMEOUT = 10.0, 20.0
+_HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _QUICK_THREADS = 4
@@ -385,7 +385,7 @@ class WarmServer:
         config = uvicorn.Config(
             self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
             http=_PromptProtocol, ws="websockets-sansio", ws_max_size=MAX_BODY, ws_per_message_deflate=False,
-            ws_ping_interval=20.0, timeout_keep_alive=20, timeout_graceful_shutdown=2,
+            ws_ping_interval=20.0, timeout_keep_alive=_KEEP_ALIVE, timeout_graceful_shutdown=2,
             limit_concurrency=MAX_CONNECTIONS,
         )  # fmt: skip
         self._server = uvicorn.Server(config)

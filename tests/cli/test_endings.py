@@ -128,7 +128,7 @@ def test_a_lift_that_cannot_fit_is_refused_with_the_estimate(monkeypatch):
     memory.refuse_small_memory(1_000_000, 10**6)
     with pytest.raises(MemoryError, match=r"at least 5\.59 GiB .* the cgroup leaves 1\.00 GiB"):
         memory.refuse_small_memory(10_000_000)
-    command = f"ulimit -v 300000; {' '.join(RUN)} --load-config /nowhere/config.yml --text a"
+    command = f"ulimit -v 250000; {' '.join(RUN)} --load-config /nowhere/config.yml --text a"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "ulimit -v" in done.stderr
     command = f"ulimit -v 1000000; {sys.executable} -m normlift_ns.cli.lift --load-config {__file__}"

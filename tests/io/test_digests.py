@@ -169,7 +169,7 @@ WRONG = {
     "short table": (with_table(lambda x: x[:-1]), rf"{TABLE} is .*, expected"),
     "narrow table": (with_table(lambda x: x[:, 1:]), rf"{TABLE} is .*, expected"),
     "wrong type": (with_table(lambda x: x.double()), rf"{TABLE} is float64 .*, expected"),
-    "NaN in the table": (with_table(lambda x: with_value(x, NAN)), rf"{TABLE} .* nan"),
+    "NaN in the table": (with_table(lambda x: with_value(x, NAN)), rf"{TABLE} .*nan"),
     "infinite table": (with_table(lambda x: with_value(x, INF)), rf"{TABLE} .*inf"),
 }
 WRONG_ROWS = {

@@ -194,7 +194,7 @@ def test_all_readers_use_the_one_opener() -> None:
     assert found == {
         "encoders/open_clip.py", "encoders/null_words.py", "encoders/color.py", "encoders/imagenet.py", "registry.py",
         "encoders/package_index.py", "progress.py", "server/client.py", "session/outputs.py", "io/arrays.py",
-        "io/memory.py", "io/file_lock.py", "cli/demo.py",
+        "io/memory.py", "io/file_lock.py", "cli/demo.py", "cli/common.py",
     }  # fmt: skip
 
 
@@ -204,6 +204,6 @@ def test_the_header_of_a_ply_file_is_bounded(tmp_path: Path) -> None:
         path.write_bytes(start + b"x" * 2**24)
         begin = time.process_time()
         for read in (read_ply, read_cloud):
-            with pytest.raises(InputError, match="end_header"):
+            with pytest.raises(InputError, match="header"):
                 read(path)
         assert time.process_time() - begin < 0.5  # 0.4 s per MB without the bound

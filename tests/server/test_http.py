@@ -273,6 +273,7 @@ def test_runs_are_closed_when_memory_is_scarce_but_not_those_with_pages(tmp_path
 
 def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(app_module, "_HEADER_TIMEOUT", 0.3)
+    monkeypatch.setattr(app_module, "_KEEP_ALIVE", 2)
     server = WarmServer(RunStore([], open_run), ServerOptions(port=0))
     port = server.start()
     request = b"GET /api/runs HTTP/1.1\r\nHost: localhost\r\n\r\n"
