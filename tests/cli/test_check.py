@@ -41,8 +41,8 @@ def test_a_capture_is_checked_and_lifted_as_planned(checked, trained, tmp_path, 
     plan = found["plan"]
     looked_at = min(6, max(4, 1 + 2 * Superpixels().at_once))
     assert (plan["views"], plan["looked_at"], plan["features_kept"], plan["evidence_kept"]) == (6, looked_at, 0, 0)
-    stages = ["start", "open", "kernels", "check", "features", "evidence", "consensus", "lift", "neighbors", "vote"]
-    assert list(plan["seconds"]) == [*stages, "store", "write"]
+    stages = ["start", "open", "kernels", "check", "features", "evidence", "consensus", "recognition", "lift"]
+    assert list(plan["seconds"]) == [*stages, "neighbors", "vote", "store", "write"]
     assert all(seconds >= 0 for seconds in plan["seconds"].values()) and plan["total_s"] > 0
     shown = said(capsys)
     assert f"estimated from {looked_at} views" in shown and "GiB of memory" in shown

@@ -92,7 +92,7 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     assert signals["seen.accuracy_refined"] == pytest.approx(results["accuracy_3d"], abs=1e-6)
     assert 0 <= signals["opacity.kendall_p"] <= 1 and signals["reliability.spearman_bins"] > 0.5
     (cost,) = tables["timing"]
-    stages = ("features_s", "evidence_s", "consensus_s", "lift_s", "neighbors_s", "vote_s", "store_s")
+    stages = ("features_s", "evidence_s", "consensus_s", "recognition_s", "lift_s", "neighbors_s", "vote_s", "store_s")
     assert cost["vote_s"] > 0 and cost["store_s"] > 0
     assert cost["total_s"] == pytest.approx(sum(cost[stage] for stage in stages))
     assert {p.name for p in tmp_path.glob("*.svg")} == {"s_sweeps.svg", "s_signals.svg"}

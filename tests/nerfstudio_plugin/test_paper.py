@@ -1,6 +1,7 @@
 """The steps of docs/paper.md on tiny made scenes in the formats of ScanNet and LERF-OVS."""
 
 import json
+import math
 import re
 import runpy
 from collections.abc import Callable
@@ -50,9 +51,11 @@ def trained(workspace: Path, scene: Path, method: str, features: Path) -> Path:
         config.pipeline.source = SourceOptions(features="langsplat", features_dir=features, text_embeddings=vectors)
 
     def prepare(trainer: Any) -> None:
-        """Put the Gaussians at the seed points, which splatfacto does on a GPU."""
+        """Put small Gaussians at the seed points, which splatfacto does on a GPU."""
         points = trainer.pipeline.datamanager.train_dataparser_outputs.metadata["points3D_xyz"]
-        trainer.pipeline.model.gauss_params["means"].data.copy_(points)
+        parameters = trainer.pipeline.model.gauss_params
+        parameters["means"].data.copy_(points)
+        parameters["scales"].data.fill_(math.log(0.05))  # those of random points are large, and hide others
 
     ours = getattr(entry, f"{method}_method").config
     how = {"method": ours, "configure": configure, "prepare": prepare, "steps": 2}
