@@ -81,7 +81,9 @@ def summarize(folder: Path) -> dict[str, Any]:
         "forms": {
             name: {k: v for k, v in way.items() if k != "bound_quantiles"} for name, way in manifest["forms"].items()
         },
-        "statistics": manifest["statistics"],
+        "statistics": {
+            name: x for name, x in manifest["statistics"].items() if name not in ("changed_share", "recognition")
+        },
         "answers": without_news(json.loads((folder / "answers.json").read_text())),
         "objects": without_numbers(json.loads((folder / "export" / "splat_objects.json").read_text())),
     }
