@@ -127,7 +127,7 @@ def lift_run(
     >>> import torch
     >>> left = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
     >>> run = lift_run(scene, features=left, texts={"left": torch.tensor([1.0, 0.0])}, output_dir=folder)
-    >>> 0.2 < run.ask("left")["left"].fraction < 0.8
+    >>> 0.1 < run.ask("left")["left"].fraction < 0.8
     True
     """
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
