@@ -207,7 +207,16 @@ def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, 
 @pytest.mark.slow
 def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
-    output = ("--load-config", little, "--vote-k", "12", "--consensus-min-agreement", "0.4", "--output-dir", tmp_path / "out")
+    output = (
+        "--load-config",
+        little,
+        "--vote-k",
+        "12",
+        "--consensus-min-agreement",
+        "0.4",
+        "--output-dir",
+        tmp_path / "out",
+    )
     exporting = ("--encoder", "color", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
     assert len(list((tmp_path / "features").iterdir())) == 2 * 6
