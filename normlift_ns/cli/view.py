@@ -119,7 +119,7 @@ def open_all(server: WarmServer) -> None:
     """Open the runs of a server, and start a thread for each that prepares the data of its first page."""
     runs = [server.runs.get(name) for name in server.runs.ids]
     for run in runs:
-        threading.Thread(target=run.warm_up, args=(server.wait_until_idle,), daemon=True).start()
+        threading.Thread(target=run.warm_up, daemon=True).start()
 
 
 def until_stopped() -> NoReturn:

@@ -59,7 +59,6 @@ REQUEST_TIMEOUT = 120.0
 _HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
-_IDLE_SECONDS = 0.5
 _QUICK_THREADS = 4
 _THREADS = max(2, (os.cpu_count() or 2) // 2)
 """Number of threads for queries, and of threads for slower work such as explanations; each uses several cores."""
@@ -239,7 +238,7 @@ class WarmServer:
         )
         self._opening = CapacityLimiter(MAX_PAGES)
         self._downloads: OrderedDict[str, tuple[str, bytes]] = OrderedDict()
-        self._pages, self._next_trim, self._last_request = 0, 0.0, 0.0
+        self._pages, self._next_trim = 0, 0.0
         self._server: uvicorn.Server | None = None
 
     def app(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> ASGIApp:
@@ -283,17 +282,12 @@ class WarmServer:
         Args:
             slow: True to use the threads for slow work, False to use those for queries.
         """
-        limiter, self._last_request = self.limits.slow if slow else self.limits.asking, time.monotonic()
+        limiter = self.limits.slow if slow else self.limits.asking
         result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
         if time.monotonic() > self._next_trim:
             self._next_trim = time.monotonic() + _TRIM_INTERVAL
             await anyio.to_thread.run_sync(_trim_memory, limiter=self.limits.slow, abandon_on_cancel=True)
         return result
-
-    def wait_until_idle(self) -> None:
-        """Wait until no request of the HTTP API has come for half a second."""
-        while time.monotonic() - self._last_request < _IDLE_SECONDS:
-            time.sleep(_IDLE_SECONDS / 5)
 
     def may_write(self, access: str) -> bool:
         """Return True if a request with the token `access` may write into a run."""

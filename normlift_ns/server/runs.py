@@ -332,22 +332,14 @@ class ServedRun:
                 del self._memories[old]
             return found, token
 
-    def warm_up(self, wait: Callable[[], None] = lambda: None) -> None:
-        """Compute in advance the data that the first page needs.
-
-        Args:
-            wait: called before each step. It returns when the step may take the processor.
-        """
-        wait()
-        _ = self.geometry, self.examples
-        wait()
-        view, _ = self.first_view, self.space.neighbor_pairs
+    def warm_up(self) -> None:
+        """Compute in advance the data that the first page needs."""
+        _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
+        view = self.first_view
         if view is not None:
-            wait()
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
             self.still(codes, view.camera(64))  # compiles the renderer
             self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
-        wait()
         _ = self.pca
 
     @property
