@@ -20,7 +20,7 @@ from dataclasses import fields, is_dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import IO, Annotated, Any, NamedTuple, NoReturn, Protocol, TextIO, TypeVar, cast, get_type_hints
 
 import docstring_parser
@@ -99,8 +99,6 @@ OUTPUT_FLAGS_HELP = (
     "Every command accepts --quiet (print results, warnings and errors, but no progress), --log-file FILE (append all "
     "output to this file, including the warnings of other packages) and --version."
 )
-_TYPEGUARD = ModuleType("typeguard")
-vars(_TYPEGUARD).update(check_type=lambda value, declared: value, TypeCheckError=TypeError)
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 """Terminal escape sequences that set colors or move the cursor."""
 
@@ -364,22 +362,8 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
     arguments = fill_boolean_values(rename_flags(arguments, renamed_flags(command)), boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
-    with _no_typeguard(), _legible_help() if prints_help else one_line_errors(name or sys.argv[0]):
+    with _legible_help() if prints_help else one_line_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=arguments, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
-
-
-@contextmanager
-def _no_typeguard() -> Iterator[None]:
-    """Replace the package typeguard, whose import takes a sixth of the start of a command, unless it is loaded.
-
-    tyro only checks with it whether the defaults of tuples have the declared type.
-    """
-    loaded = sys.modules.setdefault("typeguard", _TYPEGUARD)
-    try:
-        yield
-    finally:
-        if loaded is _TYPEGUARD:
-            del sys.modules["typeguard"]
 
 
 @contextmanager

@@ -101,9 +101,11 @@ def refine(
     if isinstance(directions, Tensor) and can_use_triton(means) and directions.dtype == torch.float32:
         directions = directions.__getitem__  # in blocks, because the kernel copies its rows
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
-    return refine_subset(
-        order, neighbors, directions, reliability, config, own=own, labeled=labeled, width=width, progress=progress
-    )
+    if labeled is not None:
+        if labeled.shape != reliability.shape:
+            raise InputError(f"labeled has shape {tuple(labeled.shape)}, expected {tuple(reliability.shape)}")
+        order = order[labeled[order] >= config.numbers.min_labeled]
+    return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
 
 
 def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
@@ -148,7 +150,6 @@ def refine_subset(
     *,
     own: Float[Tensor, " n"] | None,
     width: Float64[Tensor, ""],
-    labeled: Float[Tensor, " m"] | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
     """Run `refine` for some of the first m Gaussians. The other Gaussians only serve as neighbors.
@@ -159,7 +160,6 @@ def refine_subset(
         directions, reliability: as in `refine`, for all n Gaussians.
         own: as in `refine`, used for voters only, or None for the paper's vote.
         width: sigma_d, in the units of the distances.
-        labeled: as in `refine`, for the first m Gaussians.
         progress: as in `refine`.
     """
     n, device, on_gpu = len(reliability), reliability.device, can_use_triton(reliability)
@@ -167,8 +167,6 @@ def refine_subset(
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
     can_change = _any_reliable(neighbors, reliability)[voters]  # a neighbor that is not reliable cannot win
-    if labeled is not None:
-        can_change &= labeled[voters] >= config.numbers.min_labeled
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
@@ -194,7 +192,7 @@ def refine_subset(
         if len(block) > 0:
             retry_in_halves(vote, block, "run the vote on the CPU")
         done = min(done + size, len(voters))
-        if progress is not None:
+        if progress is not None and len(voters) > 0:
             progress(done, len(voters))
     return source
 

@@ -201,10 +201,11 @@ def vote_distributed(
         config = options.vote
         neighbors, reliability = halo.neighbors, portion.all_gather(lifted.scalars.reliability)[halo.gaussians]
         own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
+        voters = portion.curve_rows
+        voters = voters[labeled_share(lifted.evidence)[voters] >= config.numbers.min_labeled]
         rows = refine_subset(
-            portion.curve_rows, neighbors, halo.lifted.directions, reliability, config,
+            voters, neighbors, halo.lifted.directions, reliability, config,
             own=None if config.vote == "paper" else own,
-            labeled=labeled_share(lifted.evidence),
             width=decay_width(team.all_gather(neighbors.spacing), config),
             progress=partial(stages.report, "vote"),
         )  # fmt: skip

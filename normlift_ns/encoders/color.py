@@ -92,7 +92,7 @@ class ColorEncoder(LazyTextEncoder):
 
         from normlift_ns.core.device import prefetch_map  # noqa: PLC0415 (as above)
 
-        # Vectors are computed in one thread, because concurrent products round differently, and `_anchors` then fails.
+        # One thread computes the vectors: the factorization in `_anchors` once failed when 16 threads ran it at a time.
         means = prefetch_map(_mean_lab, views, _THREADS)
         return (torch.from_numpy(embed_colors(mean)).float() for mean in means)
 
