@@ -102,8 +102,6 @@ def refine(
         directions = directions.__getitem__  # in blocks, because the kernel copies its rows
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
     if labeled is not None:
-        if labeled.shape != reliability.shape:
-            raise InputError(f"labeled has shape {tuple(labeled.shape)}, expected {tuple(reliability.shape)}")
         order = order[labeled[order] >= config.numbers.min_labeled]
     return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
 

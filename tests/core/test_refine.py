@@ -233,6 +233,8 @@ def test_what_does_not_fit_is_named():
     for own, told in ((None, "own.*None"), (r[1:], r"n = 60.*\(59,\)")):
         with pytest.raises(InputError, match=told):
             refine(means, u, r, config, own=own)
+    with pytest.raises(InputError, match=r"n = 60.*\(59,\)"):
+        refine(means, u, r, config, own=r, labeled=r[1:])
 
 
 def test_defaults_are_those_of_the_kind_of_vote():
@@ -309,9 +311,3 @@ def test_unknown_variant():
     assert len(get_args(Variant)) == 7
     with pytest.raises(ValueError, match=f"variant.*{known}.*mean"):
         refine_variant("mean", torch.rand(5, 3), lifted)
-
-
-def test_shares_in_regions_of_the_wrong_length_are_refused() -> None:
-    means, directions = torch.rand(5, 3), torch.eye(5)
-    with pytest.raises(ValueError, match=r"labeled has shape \(4,\), expected \(5,\)"):
-        refine(means, directions, torch.ones(5), RefineConfig(k=2), own=torch.ones(5), labeled=torch.ones(4))
