@@ -48,7 +48,7 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
-    """Raise the errors of `open_regular`, before another library opens the file."""
+    """Raise the errors of `open_regular` if another library must not open the file."""
     open_regular(path, max_bytes=max_bytes).close()
 
 
@@ -184,7 +184,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
 def file_kind(path: Path) -> str:
     """Return the kind of a file by its content: a suffix such as ".ply", or "" for an empty file.
 
-    For kinds without a suffix here, return a description with the first column or the first bytes.
+    For other kinds, return a description, for instance with the first column of a table or the first bytes.
 
     Raises:
         OSError, ValueError: The file cannot be read, or is not a regular file.

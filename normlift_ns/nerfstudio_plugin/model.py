@@ -1,4 +1,4 @@
-"""splatfacto model with a semantic field, and an LPIPS metric that loads its weights at the first use."""
+"""splatfacto model with a semantic field, and an LPIPS metric that loads its weights on first use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from normlift_ns.rendering.figures import Display, render_outputs
 
 
 class LazyLpips(torch.nn.Module):
-    """Replacement of torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights at the first use.
+    """Replacement for torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights on first use.
 
     Args:
         options: keyword arguments of the metric.
@@ -89,7 +89,7 @@ class NormLiftModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Set up splatfacto's modules without CUDA and without downloads, and add the viewer panel."""
         if not torch.cuda.is_available():  # splatfacto moves the colors of seed points to CUDA
-            # without seed points, splatfacto would search neighbors of 50,000 random points, so pass four points
+            # without seed points, splatfacto would search for neighbors of 50,000 random points, so pass four points
             seeds = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
             self.seed_points = None if self.config.semantics is None else seeds  # until the checkpoint is loaded
         # the stock metric downloads AlexNet
@@ -140,7 +140,7 @@ class NormLiftModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Return the stock outputs (rgb, depth, accumulation, background), and with a field also `render_outputs`.
+        """Return the stock outputs (rgb, depth, accumulation, background), and those of `render_outputs` for a display.
 
         Args:
             camera: one camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.

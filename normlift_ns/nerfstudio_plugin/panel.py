@@ -77,7 +77,7 @@ class ClickListener:
         return self._armed is not None
 
     def arm(self, action: Action, client: Any) -> None:
-        """Expect a click in one browser, and no longer in another one."""
+        """Expect a click in one browser, and stop expecting one in any other browser."""
         self.disarm()
         client.scene.on_pointer_event("click")(self._clicked)
         self._armed = (action, client)
@@ -173,8 +173,8 @@ class PanelWidgets(ActionWidgets):
         super().__init__(gui, act, lock)
         with add_first_tab(gui, TAB_LABEL, "SEARCH"):
             self.prompts = gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
-            self.ask = self._button(Action.ASK, hint="Search for the prompts (Enter in the text field).")
-            self.cancel = self._button(Action.CANCEL, hint="Cancel the query or the pending click (Escape).")
+            self.ask = self._button(Action.ASK, hint="Search for the prompts (or press Enter in the text field).")
+            self.cancel = self._button(Action.CANCEL, hint="Cancel the query or the pending click (or press Escape).")
             self.cancel.visible = False
             self.status = gui.add_markdown("")
             self.remove_weak = self._button(Action.REMOVE_WEAK)
@@ -202,7 +202,7 @@ class PanelWidgets(ActionWidgets):
                 self.steps = self._slider(Action.GROW, numbers, "Grow (> 0) or shrink (< 0) the selection.")
             with gui.add_folder("Keep"):
                 self._button(Action.DOWNLOAD, hint="Download the selected Gaussians as a PLY file.")
-                self._button(Action.SAVE, hint="Add the prompts to those in the run, which ns-render draws.")
+                self._button(Action.SAVE, hint="Add the prompts to those stored in the run. ns-render draws them.")
                 self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
             with gui.add_folder("Advanced", expand_by_default=False):
@@ -262,6 +262,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
 
     Args:
         folder: folder of the semantic field, or None if the run is not stored yet.
+        field: semantic field of the run, or None if the run is not stored yet.
     """
 
     @cache
@@ -275,7 +276,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
 
 
 def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
-    """Move the camera of one browser to face an object, from the current side if the view is not blocked."""
+    """Move the camera of one browser to face an object, from the current side if nothing blocks the view there."""
     camera = client.camera
     view = (np.asarray(camera.position) / VISER_SCALE, camera.up_direction, float(camera.fov))
     position = unoccluded_viewpoint(target, scene, drawn, *view)
@@ -489,7 +490,7 @@ class SearchPanel(Controller):
             self._offer_to_replace(query is not None)
             raise
         self._offer_to_replace(False)
-        self.show_message(f"Saved. The run now stores {prompts}, which ns-render draws.")
+        self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
     def _offer_to_replace(self, visible: bool) -> None:
         if self._widgets is not None:
@@ -554,7 +555,7 @@ class SearchPanel(Controller):
                 output.value = "overlay"
 
     def _follow_outputs(self, control_panel: Any) -> None:
-        """Apply a pending switch to the overlay when the viewer lists it, which is after its first render."""
+        """Apply a pending switch to the overlay as soon as the viewer lists the overlay, after its first render."""
         update = control_panel.update_output_options
 
         def updated(names: list[str]) -> None:

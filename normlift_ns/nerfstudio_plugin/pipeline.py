@@ -118,7 +118,7 @@ def dataset_folder(config: TrainerConfig) -> Path:
 
 
 def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
-    """Make the feature source of a config. By default, LangSplat's features are read from the dataset.
+    """Make the feature source of a config. LangSplat's features are read from the dataset unless a folder is given.
 
     Raises:
         ValueError, FileNotFoundError: if `make_source` fails. The message names the options of ns-train.

@@ -30,7 +30,7 @@ from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 _DIRECTION_BLOCK = 8 * PROMPT_BLOCK
 """Number of prompts for which float16 directions are converted once. The conversion takes most of the time."""
 _BLOCK_ELEMENTS = 2**21
-"""Number of elements to convert to float32 at a time, which fits into a processor's cache."""
+"""Number of elements to convert to float32 at a time, so that they fit into a processor's cache."""
 
 
 class ArrayField(FieldArrays):
@@ -62,8 +62,8 @@ class ArrayField(FieldArrays):
         arrays, dimension = self.arrays, int(self.manifest["dimension"])
         if text_vectors.shape[1] != dimension:
             raise InputError(
-                f"text embeddings must be [Q, {dimension}] like the features of the field, got {text_vectors.shape}. "
-                "Use the encoder of these features."
+                f"text embeddings must have shape [Q, {dimension}] like the features of the field, got "
+                f"{text_vectors.shape}. Use the encoder of these features."
             )
         vectors = text_vectors.astype(np.float64)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -87,7 +87,7 @@ class ArrayField(FieldArrays):
         return cosine.T
 
     def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
-        """Return a function that computes the cosines to some of the vectors, of the Gaussians with a direction."""
+        """Return a function that computes the cosines of all directions to a slice of the vectors."""
         arrays, rows = self.arrays, cast(Any, self.evidence).rows
         valid = arrays["norm"] > 0
         table = arrays["features"].astype(np.float64) @ vectors.T
@@ -96,7 +96,7 @@ class ArrayField(FieldArrays):
         return lambda block: ((matrix @ table[:, block])[valid] / length).T.astype(np.float32)
 
     def _direction_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
-        """Return a function as `_evidence_products` does."""
+        """Return a function like that of `_evidence_products`, for a field that stores directions."""
         coordinates, basis = self.arrays["coordinates"], self.arrays.get("basis")
         projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
         step = max(1, _BLOCK_ELEMENTS // projected.shape[1])
@@ -151,7 +151,7 @@ class QuickRun:
             texts: prompts.
             rules: keyword arguments of `make_query`.
         Raises:
-            ValueError: as in `make_query`.
+            ValueError: see `make_query`.
         """
         question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)
@@ -167,8 +167,8 @@ def open_quick(
 ) -> QuickRun | None:
     """Open the field of a lifted run; return None if its files do not determine the centers of the Gaussians.
 
-    Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. Such
-    runs need `means`.
+    Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. In
+    both cases, `means` is needed.
 
     Args:
         load_config: path of the run's config.yml.

@@ -32,7 +32,7 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
 
 
 def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
-    """Return whether `judge` uses cosines, with limits of the encoder or with null words, and not relevancies."""
+    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
     kind = find_encoder_kind(encoder)
     return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
 

@@ -31,7 +31,7 @@ def as_numpy(array: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """Query with Q prompts, their embeddings and the settings that select Gaussians. Embeddings may be tensors."""
+    """Query with Q prompts, their embeddings and the settings that select Gaussians. Tensors become NumPy arrays."""
 
     texts: tuple[str, ...]
     embeddings: Float[np.ndarray, "q d"]
@@ -80,7 +80,7 @@ def make_query(
 
     Args:
         field: field to query.
-        encode: function from texts to one embedding each, of an encoder that fits the field.
+        encode: function that returns one embedding per text, from an encoder that fits the field.
         texts: prompts.
         negatives: negative prompts (default: those of the encoder, see `default_rule`).
         relevancy: relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
@@ -147,7 +147,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
             f"negatives must be a list of strings, got the single string {negatives!r}. Write [{negatives!r}]."
         )
     if relevancy not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"relevancy must be auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
+        raise InputError(f"relevancy must be one of auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
     if isinstance(threshold, str) and threshold != "auto":
         raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
@@ -229,7 +229,7 @@ def load_query(folder: Path) -> Query | None:
 
 
 def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
-    """Return the query with this metadata and these embeddings.
+    """Check the metadata and the arrays of embeddings, and return the query that they contain.
 
     Raises:
         ValueError: the metadata or an embedding is not valid, they are inconsistent, or they do not match the field in

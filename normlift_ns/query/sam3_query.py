@@ -1,12 +1,12 @@
-"""Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
+"""Lift SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
 The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views,
 sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
 
-Masks can be wrong for a whole view, which misses an object or confuses it with another. Two rounds therefore determine
-the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second round, a view votes
-if the weighted intersection over union of its mask and the Gaussians selected in the first round exceeds one half. If
-none of these views has the prompt, the result is that of the first round.
+The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
+therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
+round, a view votes if the weighted intersection over union of its mask and the Gaussians selected in the first round
+exceeds one half. If SAM 3 found the prompt in none of these views, the result is that of the first round.
 
 A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
 eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
@@ -35,7 +35,7 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_MASK_FRACTION = 0.5
-"""Fraction of its weight inside the masks above which a Gaussian is selected."""
+"""A Gaussian is selected if a larger fraction of its weight than this is inside the masks."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ def mask_evidence(
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"masks must have one set per camera, for one or more cameras; got {len(masks)} sets for {len(cameras)} "
-            "cameras"
+            f"masks must have one set of masks for each of one or more cameras; got {len(masks)} sets for "
+            f"{len(cameras)} cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []
     inside: list[Bool[Tensor, "q c"]] = []

@@ -25,7 +25,7 @@ from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that determine the encoder or the text embeddings of a field. The manifest has their names of version 0.2."""
+"""Options that determine the encoder or the text embeddings of a field, by the names in manifests (version 0.2)."""
 PRECOMPUTED = "given"
 """Encoder name in the manifest for features provided by the user."""
 _CHOSEN = "texts_chosen"
@@ -220,8 +220,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level. Without it, the rule is that of the encoder. The exceptions are
-    unknown encoders and files of text embeddings without the default negatives, which use cosine.
+    The rule is contrast for a field with a null level, and otherwise the rule of the encoder. It is cosine if the
+    encoder is unknown, or if a file of text embeddings does not contain the encoder's default negatives.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

@@ -1,6 +1,6 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
-Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, so
+Relevancy is drawn with a uniform colormap that is readable with color blindness. Opacity rises with relevancy, so
 that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other prompts get colors
 that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors are used up.
 """
@@ -71,7 +71,7 @@ def apply_colormap(
 
 
 def named_color(text: str) -> tuple[float, float, float] | None:
-    """Return the first saturated color that a prompt names, as RGB in 0..1; None without such a color.
+    """Return the first saturated color that a prompt names, as RGB in 0..1; None if it names no saturated color.
 
     The color names are those of the XKCD color survey.
 
@@ -138,7 +138,7 @@ def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
 
 
 MIN_LEGEND_HEIGHT = 160
-"""Minimum height in pixels of an image with a legend; the small images of a moving camera have none."""
+"""Minimum height in pixels of an image with a legend. Smaller images, as rendered while the camera moves, have none."""
 _MAX_PROMPTS = 12
 _BACKDROP, _INK = (20, 20, 20), (255, 255, 255)
 _BACKDROP_OPACITY = 0.75
@@ -155,7 +155,7 @@ def clip_text(text: str, most: int) -> str:
 
 @lru_cache(maxsize=16)
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Load matplotlib's DejaVu Sans font, the font of all images, in a size in pixels."""
+    """Load matplotlib's DejaVu Sans, the font of all images, at a size in pixels."""
     from matplotlib import get_data_path  # noqa: PLC0415 (a lift does not need it)
 
     return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)

@@ -449,7 +449,7 @@ def save_overlays(
     figures share one color scale.
 
     Args:
-        cameras: training cameras by file name prefix, as from `training_cameras`.
+        cameras: training cameras by file name prefix, as `training_cameras` returns them.
         settings: rasterizer settings (default: those of gsplat 1.4).
         device: torch device that renders.
         overwrite: replace existing files.
@@ -508,7 +508,7 @@ def _render_overlays(
     settings: RasterSettings | None,
     device: str,
 ) -> Iterator[tuple[str, list[_Overlay]]]:
-    """Yield the name of every view with the overlays of all prompts, which are rendered at once."""
+    """Yield the name of every view with the overlays of all prompts, which are rendered together."""
     count, gaussians = len(answer.texts), scene.gaussians.to(device)
     values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
     for name, camera in cameras.items():
@@ -567,8 +567,8 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. Among several such images, it is the one in
-    which the objects cover the largest area.
+    The camera is that of the training image that shows the most objects. Among several such images, it is the one with
+    the largest objects, each compared with its largest size in any image.
 
     Args:
         path: file to write.
