@@ -297,8 +297,8 @@ class Finding:
 class SelectionStats(NamedTuple):
     """Summary numbers of selected Gaussians.
 
-    Positions are in scene units. All numbers but the fraction are None if no Gaussian is selected. Means are weighted by
-    W_j, the total weight of Gaussian j over all views.
+    Positions are in scene units. Means are weighted by W_j, the total weight of Gaussian j over all views. All numbers
+    except the fraction are None if no Gaussian is selected.
     """
 
     fraction: float

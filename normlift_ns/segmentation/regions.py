@@ -137,7 +137,7 @@ class Grid(RegionDefaults):
 
 @dataclass(frozen=True)
 class LabelFiles(RegionDefaults):
-    """Label maps from a folder, one per image and of the size of the image.
+    """Label maps from a folder, one per image, each of the size of its image.
 
     A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
     integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
@@ -263,7 +263,7 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{what} is a grayscale PNG with {bits} bits, whose values image readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits per pixel, whose values image readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":

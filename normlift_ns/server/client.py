@@ -125,7 +125,7 @@ Part = RemoteAnswer | RemoteFinding | Bool[Tensor, " n"]
 
 @dataclass(eq=False, repr=False)
 class RemoteRun:
-    """Lifted run on a server, with methods like those of `LiftedRun`. They may be called from any thread.
+    """Lifted run on a server, with methods like those of `LiftedRun`. Any thread may call the methods.
 
     >>> from normlift_ns import connect, open_run
     >>> from normlift_ns.server.app import ServerOptions, WarmServer
@@ -184,7 +184,7 @@ class RemoteRun:
         return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
 
     def select(self, part: Part | Selection) -> SelectResult:
-        """Return the number, center and box of the selected Gaussians, for instance of `Selection(ray=…)`."""
+        """Return the number, center and box of the selected Gaussians, for instance for `Selection(ray=…)`."""
         return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
 
     @check_arguments

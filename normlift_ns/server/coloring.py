@@ -37,7 +37,7 @@ class Codes(NamedTuple):
     """Colors of M drawn Gaussians: a palette, and the index of each Gaussian in it."""
 
     palette: list[tuple[int, int, int, float, int]]
-    """Red, green and blue in 0..255, opacity of this color, and 1 if it is mixed with gray, 0 with the trained color.
+    """Red, green and blue in 0..255, the opacity of this color, and the color under it (0: trained color, 1: gray).
     """
     codes: UInt8[np.ndarray, " m"]
 

@@ -149,7 +149,7 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the images with the largest weight and the largest disagreement, as the message `explanation`.
+    """Return the content of the message `explanation`: the images with the largest weight and disagreement.
 
     Raises:
         ValueError: nothing is selected, or the votes of the images are no longer in the cache.

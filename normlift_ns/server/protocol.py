@@ -114,7 +114,7 @@ class LayerVisibility(LayerName, frozen=True):
 
 
 class Export(msgspec.Struct, frozen=True):
-    """Download of the selection or of an object."""
+    """Request to download the selection or an object."""
 
     format: Annotated[str, msgspec.Meta(max_length=20)] = "ply"
     object: Count | None = None

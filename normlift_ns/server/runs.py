@@ -52,7 +52,7 @@ _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
 _JPEG_QUALITY = 85
 _POSITION_STEP = 2**-14
-"""Steps to which the positions on the page are rounded, as a fraction of the radius of the scene."""
+"""Step to which positions on the page are rounded, as a fraction of the radius of the scene."""
 _MEMORY_SHARE = 0.5
 """Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()
@@ -169,7 +169,7 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without vocabulary."""
+        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without a vocabulary."""
         color = encoder_name(self.run.field) == "color"
         words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
         if len(words) == 0:
@@ -359,7 +359,7 @@ def to_jpeg(image: UInt8[np.ndarray, "h w 3"], max_size: int | None = None) -> b
 
 
 class RunStore:
-    """Store of runs by id. It opens runs at first use, and closes the least recently used ones above a memory limit.
+    """Store of runs by id. It opens runs on first use, and closes the least recently used ones above a memory limit.
 
     Args:
         configs: paths of the runs' config.yml files.

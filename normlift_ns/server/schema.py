@@ -57,9 +57,9 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     object: Annotated[int, msgspec.Meta(ge=1)] | None = None
     """Number of an object to select, from the response of /objects to the same question."""
     ray: Ray | None = None
-    """Ray to select the object that it hits."""
+    """Ray that selects the object that it hits."""
     region: Region | None = None
-    """Polygon in an image to select the visible Gaussians inside it."""
+    """Polygon in an image; the visible Gaussians inside it are selected."""
     floaters: bool = False
     """Select the likely floaters."""
     mask: Annotated[bytes, msgspec.Meta(max_length=2**22)] | None = None
@@ -86,7 +86,7 @@ class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     question: Question
     replace: bool = True
-    """Replace the prompts stored in the run; False: add the new prompts to them."""
+    """True to replace the prompts stored in the run, False to add the new prompts to them."""
 
 
 class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -268,7 +268,7 @@ def select_state(served: ServedRun, selection: Selection) -> State:
 
 
 def find_object(state: State, number: int) -> ObjectRow:
-    """Return the object with this number in the list of objects, from 1.
+    """Return the object with this number in the list of objects; numbers start at 1.
 
     Raises:
         ValueError: the list has no object with this number.

@@ -31,14 +31,14 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Warning about the prompt, or an empty string. The warning lists the words that the encoder uses, if it ignores
-    other words. If the prompt is not found or selects no Gaussian, it describes the nearest match."""
+    """Warning about the prompt, or an empty string. If the encoder ignores some words, the warning lists those that it
+    uses. If the prompt is not found or selects no Gaussian, the warning describes the nearest match."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return diagnostics of the first `max_prompts` prompts that select Gaussians, or () for a selection by hand."""
+    """Return diagnostics of the first `max_prompts` prompts of the query, or () for a selection made by hand."""
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
@@ -82,7 +82,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose that one.
+    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose the latter.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -204,7 +204,7 @@ def set_color_mode(state: State, name: str) -> State:
 
 
 def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
-    """Return the index of the drawn Gaussian with a direction that has the largest weight on a ray.
+    """Return the index of the Gaussian with the largest weight on a ray, among drawn Gaussians with a direction.
 
     Raises:
         ValueError: the ray hits no such Gaussian.
@@ -239,7 +239,7 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
     """Select, add or remove the clicked object; see `object_under`.
 
     Args:
-        weights: weights of the Gaussians on the ray of the click, as from `rasterization.rasterize.ray_weights`.
+        weights: weights of the Gaussians on the ray of the click, from `rasterization.rasterize.ray_weights`.
     """
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
@@ -279,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. After growing or shrinking, it no longer depends on prompts."""
+    """Add Gaussians to the selection. If it was grown or shrunk, the new selection no longer depends on prompts."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -288,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. After growing or shrinking, it no longer depends on prompts."""
+    """Remove Gaussians from the selection. If it was grown or shrunk, the new one no longer depends on prompts."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)

@@ -213,7 +213,7 @@ def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Ite
 def _occlusion(
     scene: GaussianScene, position: Float[Tensor, " 3"], center: Float[Tensor, " 3"], margin: float
 ) -> float:
-    """Return the opacity between a position and a center, excluding the last `margin` in front of the center."""
+    """Return the opacity between a position and a center, excluding a distance of `margin` in front of the center."""
     direction = center - position
     length = direction.norm().clamp(min=1e-12)
     before = (scene.means.double() - position) @ (direction / length) < length - margin

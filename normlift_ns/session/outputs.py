@@ -29,7 +29,7 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
         folder: folder of the field.
         replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
-        ValueError: there is no query or no folder, or as in `merge_queries`.
+        ValueError: there is no query or no folder, or `merge_queries` cannot merge the queries.
     """
     if query is None or folder is None:
         raise InputError("There is no query yet, so there are no prompts to save. Type a prompt and press Ask.")

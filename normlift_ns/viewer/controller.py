@@ -283,7 +283,7 @@ class Controller(ABC):
                     self._do(state, message, answered=True)
 
     def _explain(self) -> None:
-        """Explain the selection by its training images; find them without the lock."""
+        """Explain the selection by training images, which are found without the lock."""
         state, reasons = self.history.now, self._reasons
         token = reasons.start(state)
         self.show_message("")
