@@ -38,7 +38,7 @@ class LazyLpips(torch.nn.Module):
     """Replacement for torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights on first use.
 
     Args:
-        options: keyword arguments of the metric.
+        options: Keyword arguments of the metric.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -114,7 +114,7 @@ class NormLiftModel(SplatfactoModel):
         """Load a splatfacto or normlift checkpoint, and then the semantic field of the config.
 
         Raises:
-            FileNotFoundError, ValueError: if the field is missing, is damaged, or belongs to other Gaussians.
+            FileNotFoundError, ValueError: If the field is missing, is damaged, or belongs to other Gaussians.
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
@@ -143,8 +143,8 @@ class NormLiftModel(SplatfactoModel):
         """Return the stock outputs (rgb, depth, accumulation, background), and those of `render_outputs` for a display.
 
         Args:
-            camera: one camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
-            obb_box: crop box. Gaussians outside it are not drawn.
+            camera: One camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
+            obb_box: Crop box. Gaussians outside it are not drawn.
         """
         display, (camera, view) = self._display, _valid_camera(camera.to(self.device))
         rows = self.drawn_mask(obb_box, display)
@@ -242,7 +242,7 @@ def find_field_folder(semantics: Path) -> Path:
     config to models. It is therefore read from the call stack.
 
     Args:
-        semantics: folder in the config, which is returned if there is no folder next to config.yml.
+        semantics: Folder in the config, which is returned if there is no folder next to config.yml.
     """
     frame = inspect.currentframe()
     while frame is not None:

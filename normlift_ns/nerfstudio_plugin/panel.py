@@ -64,7 +64,7 @@ class ClickListener:
     """Listener for a click on the scene in one browser.
 
     Args:
-        hit: callback with the action of the click, and the origin and direction of its ray in scene units.
+        hit: Callback with the action of the click, and the origin and direction of its ray in scene units.
     """
 
     def __init__(self, hit: Callable[[Action, Tensor, Tensor], None]) -> None:
@@ -111,7 +111,7 @@ def visible_mask(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
     """Return the mask of Gaussians that are opaque enough to be drawn.
 
     Args:
-        opacities: logits.
+        opacities: Logits.
     """
     return opacities.detach()[:, 0] >= MIN_OPACITY_LOGIT
 
@@ -120,8 +120,8 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     """Return the status as MDX, with the running work, message, size of the selection, remarks on it, and warnings.
 
     Args:
-        busy: description of the running work, or an empty string.
-        drawn: mask of Gaussians from `visible_mask`.
+        busy: Description of the running work, or an empty string.
+        drawn: Mask of Gaussians from `visible_mask`.
     """
     lines = [escape_mdx(text) for text in (busy, clip_text(message, 400)) if text]
     selection = state.selection
@@ -222,7 +222,7 @@ class PanelWidgets(ActionWidgets):
         """Reset the settings that apply to the next query.
 
         Args:
-            negatives: default negative prompts.
+            negatives: Default negative prompts.
         """
         self.reset_reliability()
         self._reset(Action.REFINED, self.refined, True)
@@ -261,8 +261,8 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
     The first explanation opens the run again, with its images.
 
     Args:
-        folder: folder of the semantic field, or None if the run is not stored yet.
-        field: semantic field of the run, or None if the run is not stored yet.
+        folder: Folder of the semantic field, or None if the run is not stored yet.
+        field: Semantic field of the run, or None if the run is not stored yet.
     """
 
     @cache
@@ -319,7 +319,7 @@ class SearchPanel(Controller):
     """Search panel in nerfstudio's viewer.
 
     Args:
-        host: the `NormLiftModel`, untyped because its module imports this one.
+        host: The `NormLiftModel`, untyped because its module imports this one.
     """
 
     reading_message = "Reading the prompts. The first query also loads the text encoder, which takes a while."
@@ -357,7 +357,7 @@ class SearchPanel(Controller):
         """Enable the panel for a field, and show the answer to a query.
 
         Args:
-            folder: folder of the field, or None if prompts cannot be saved.
+            folder: Folder of the field, or None if prompts cannot be saved.
         """
         with self._lock:
             self._folder, state = folder, State(SelectionContext(field, means))

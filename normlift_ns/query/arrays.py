@@ -57,7 +57,7 @@ class ArrayField(FieldArrays):
         """Return the cosine of every Gaussian's direction to Q vectors, as `SemanticField.query` does.
 
         Raises:
-            ValueError: the vectors have a different dimension than the field.
+            ValueError: The vectors have a different dimension than the field.
         """
         arrays, dimension = self.arrays, int(self.manifest["dimension"])
         if text_vectors.shape[1] != dimension:
@@ -148,10 +148,10 @@ class QuickRun:
         """Run a query. The arrays of the answer are NumPy arrays.
 
         Args:
-            texts: prompts.
-            rules: keyword arguments of `make_query`.
+            texts: Prompts.
+            rules: Keyword arguments of `make_query`.
         Raises:
-            ValueError: see `make_query`.
+            ValueError: See `make_query`.
         """
         question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)
@@ -171,12 +171,12 @@ def open_quick(
     both cases, `means` is needed.
 
     Args:
-        load_config: path of the run's config.yml.
-        means: centers of the Gaussians, from a scene that `open_run` has matched with the field.
-        device: device for the network of the text encoder.
-        text_embeddings, prompt_template: as in `open_run`.
+        load_config: Path of the run's config.yml.
+        means: Centers of the Gaussians, from a scene that `open_run` has matched with the field.
+        device: Device for the network of the text encoder.
+        text_embeddings, prompt_template: As in `open_run`.
     Raises:
-        FileNotFoundError, ValueError: the run has no semantic field, or its files are damaged.
+        FileNotFoundError, ValueError: The run has no semantic field, or its files are damaged.
     """
     run_dir = Path(os.path.abspath(load_config)).parent
     check_run(run_dir)

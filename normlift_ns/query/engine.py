@@ -346,9 +346,9 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
 
     Args:
-        means: centers of the Gaussians, as a tensor or array like those of the field.
+        means: Centers of the Gaussians, as a tensor or array like those of the field.
     Raises:
-        ValueError: the embeddings have a different dimension than the field, or the negatives that the rule needs are
+        ValueError: The embeddings have a different dimension than the field, or the negatives that the rule needs are
             missing.
     """
     vectors, count = question.embeddings, len(question.embeddings)
@@ -463,10 +463,10 @@ def relevancy_histogram(
     """Return the histogram of one prompt; None if no Gaussian has a direction.
 
     Args:
-        relevancy: relevancies of all Gaussians.
+        relevancy: Relevancies of all Gaussians.
         valid: True for Gaussians that have a direction.
-        threshold: relevancy above which a Gaussian is selected.
-        positions: result of `suggested_range`.
+        threshold: Relevancy above which a Gaussian is selected.
+        positions: Result of `suggested_range`.
     """
     values = _ascending(relevancy[valid])
     if len(values) == 0:
@@ -512,7 +512,7 @@ def suggest_threshold(
     """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
     Args:
-        positions: result of `suggested_range`.
+        positions: Result of `suggested_range`.
 
     >>> values = np.array([[0.1]] * 60 + [[0.2]] * 30 + [[0.9]] * 10)
     >>> 0.2 < suggest_threshold(values, np.ones(100, bool), (0.4, 0.8)) < 0.9

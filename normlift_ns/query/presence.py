@@ -43,11 +43,11 @@ def judge(
     """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
 
     Args:
-        manifest: manifest of the field.
-        encoder: name of the encoder of the field.
-        rule: relevancy rule of the query.
-        top_cosine: cosine that one Gaussian in a thousand exceeds.
-        top: relevancy that one Gaussian in a thousand exceeds.
+        manifest: Manifest of the field.
+        encoder: Name of the encoder of the field.
+        rule: Relevancy rule of the query.
+        top_cosine: Cosine that one Gaussian in a thousand exceeds.
+        top: Relevancy that one Gaussian in a thousand exceeds.
     """
     kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
     if kind is not None and kind.present_from is not None:

@@ -122,12 +122,12 @@ def mask_evidence(
     """Rasterize the evidence of the masks of Q prompts; each view is rasterized once for all prompts.
 
     Args:
-        cameras: one camera per view.
-        masks: one mask per view and prompt; empty if the prompt was not found.
-        valid_pixels: mask of the pixels to use in each view; None for all pixels.
+        cameras: One camera per view.
+        masks: One mask per view and prompt; empty if the prompt was not found.
+        valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: there are no views, or the masks do not match the number or size of the cameras.
+        ValueError: There are no views, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
@@ -172,8 +172,8 @@ class SegmentationResult(NamedTuple):
         """Return the numbers of every prompt as plain Python types.
 
         Args:
-            means: centers of the Gaussians.
-            selected: selections of another query with the same prompts, for comparison.
+            means: Centers of the Gaussians.
+            selected: Selections of another query with the same prompts, for comparison.
         """
         return [self._row(text, means, selected[:, text]) for text in range(len(self.answers))]
 
@@ -212,15 +212,15 @@ def query_sam3(
     """Segment evenly spaced training views with SAM 3, and lift the masks.
 
     Args:
-        find_masks: function that returns SAM 3's mask of each prompt in an image.
-        texts: prompts.
-        views: maximum number of views.
-        min_reliability: minimum R of a selected Gaussian, in 0..1.
-        settings: constants of the rasterizer.
-        device: device of the rasterizer.
+        find_masks: Function that returns SAM 3's mask of each prompt in an image.
+        texts: Prompts.
+        views: Maximum number of views.
+        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        settings: Constants of the rasterizer.
+        device: Device of the rasterizer.
     Raises:
-        FileNotFoundError: an image does not exist.
-        ValueError: an image is damaged, or a prompt is too long.
+        FileNotFoundError: An image does not exist.
+        ValueError: An image is damaged, or a prompt is too long.
     """
     indices, masks, cameras, counted = sample_evenly(len(scene.train), views), [], [], []
     for index in indices:

@@ -59,9 +59,9 @@ def apply_colormap(
     """Map relevancy to a color and an opacity over the scene.
 
     Args:
-        scale: relevancies of the first and the last color; relevancies outside this range are clamped.
-        colors: colors of a colormap, RGB in 0..1.
-        min_opacity: opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
+        scale: Relevancies of the first and the last color; relevancies outside this range are clamped.
+        colors: Colors of a colormap, RGB in 0..1.
+        min_opacity: Opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
 
     >>> apply_colormap(torch.tensor([0.0, 0.5, 1.0]), (0.0, 1.0), colormap_rgb("viridis"))[1]
     tensor([0.3500, 0.6250, 0.9000])
@@ -168,8 +168,8 @@ def add_color_bar(
 
     Args:
         image: RGB in 0..1.
-        scale: values of the first and the last color.
-        title: title above the color bar.
+        scale: Values of the first and the last color.
+        title: Title above the color bar.
     """
     height, width = image.shape[:2]
     tile = None if height < MIN_LEGEND_HEIGHT else _color_bar(colormap, scale, clip_text(title, 28), _font_size(height))

@@ -92,9 +92,9 @@ def make_display(
     """Make the display of an answer on the device of the field.
 
     Args:
-        shown: index of the only prompt to show (default: all prompts).
-        selection: mask of the selected Gaussians (default: those that the answer selects).
-        drawn: mask of the Gaussians to draw (default: all).
+        shown: Index of the only prompt to show (default: all prompts).
+        selection: Mask of the selected Gaussians (default: those that the answer selects).
+        drawn: Mask of the Gaussians to draw (default: all).
         by_hand: True if `selection` is independent of the answer.
     """
     scalars = field.scalars
@@ -160,10 +160,10 @@ def render_outputs(
     other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
 
     Args:
-        rgb: rendered scene, RGB in 0..1.
-        image: composited `display.values`.
-        alpha: opacity of every pixel.
-        named_by_text: return relevancies as color images with the names of `output_names`, for a viewer. Otherwise,
+        rgb: Rendered scene, RGB in 0..1.
+        image: Composited `display.values`.
+        alpha: Opacity of every pixel.
+        named_by_text: Return relevancies as color images with the names of `output_names`, for a viewer. Otherwise,
             return them as scalars with the names relevancy_0, relevancy_1, …
     """
     count = display.num_prompts
@@ -199,7 +199,7 @@ def overlay(
     """Color the selection by relevancy over the scene in gray; opacity increases with relevancy.
 
     Args:
-        share: selected fraction of each pixel, in 0..1.
+        share: Selected fraction of each pixel, in 0..1.
     """
     color, opacity = colors.apply_colormap(relevancy, display.scale, colors.colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
@@ -223,9 +223,9 @@ def segmentation(
     """Draw the selection in the color of the most relevant prompt over the scene in gray.
 
     Args:
-        labels: index of the most relevant prompt of each pixel.
-        share: selected fraction of each pixel, in 0..1.
-        palette: colors of the prompts, RGB in 0..1.
+        labels: Index of the most relevant prompt of each pixel.
+        share: Selected fraction of each pixel, in 0..1.
+        palette: Colors of the prompts, RGB in 0..1.
     """
     return _over_gray(rgb, palette[labels], SEGMENTATION_OPACITY * share.clamp(0, 1))
 
@@ -236,7 +236,7 @@ def reliability_map(
     """Return a map of R on a fixed scale from 0 to 1, with its legend.
 
     Args:
-        reliability: composited R.
+        reliability: Composited R.
     """
     pixel = pixel_relevancy(reliability, alpha)[:, :, 0]
     color = colors.colormap_rgb(colors.RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
@@ -320,11 +320,11 @@ def view_figure(
     """Draw a figure of one view, with the training image next to the overlay.
 
     Args:
-        header: title and summary above the figure.
-        view: name of the view.
-        image: training image; None to show only the overlay.
-        overlay: rendered overlay of the same view.
-        selected: mask of the selected pixels, which the figure outlines.
+        header: Title and summary above the figure.
+        view: Name of the view.
+        image: Training image; None to show only the overlay.
+        overlay: Rendered overlay of the same view.
+        selected: Mask of the selected pixels, which the figure outlines.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
     panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
@@ -341,9 +341,9 @@ def contact_sheet(
     """Draw a figure of all views for one prompt.
 
     Args:
-        header: title and summary above the figure.
-        panels: overlay of each view with an outline of the selection, of the width `_panel_width`.
-        views: names of the views.
+        header: Title and summary above the figure.
+        panels: Overlay of each view with an outline of the selection, of the width `_panel_width`.
+        views: Names of the views.
     """
     return _page(sheet, [header.title, header.summary], panels, views, _columns(len(panels)))
 
@@ -449,16 +449,16 @@ def save_overlays(
     figures share one color scale.
 
     Args:
-        cameras: training cameras by file name prefix, as `training_cameras` returns them.
-        settings: rasterizer settings (default: those of gsplat 1.4).
+        cameras: Training cameras by file name prefix, as `training_cameras` returns them.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
         device: torch device that renders.
-        overwrite: replace existing files.
+        overwrite: Replace existing files.
     Returns:
         Paths of the files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        OSError: a file cannot be written.
-        ValueError: two figures would have the same name.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
+        ValueError: Two figures would have the same name.
     """
     prefixes = [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras]
     ends = [f"{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
@@ -532,9 +532,9 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: names from `unique_file_names`, or image paths with or without suffix (default: three views).
+        names: Names from `unique_file_names`, or image paths with or without suffix (default: three views).
     Raises:
-        ValueError: a name matches no training image, or several.
+        ValueError: A name matches no training image, or several.
     """
     images, cameras = list(scene.train.names), scene.train.cameras
     unique = unique_file_names(images)
@@ -571,14 +571,14 @@ def save_inventory(
     the largest objects, each compared with its largest size in any image.
 
     Args:
-        path: file to write.
-        manifest: manifest of the field, with the settings of the rasterizer.
-        overwrite: replace an existing file.
+        path: File to write.
+        manifest: Manifest of the field, with the settings of the rasterizer.
+        overwrite: Replace an existing file.
     Returns:
         Name of the training image.
     Raises:
-        FileExistsError: the file exists, and `overwrite` is False.
-        OSError: the file cannot be written.
+        FileExistsError: The file exists, and `overwrite` is False.
+        OSError: The file cannot be written.
     """
     settings, count = RasterSettings.recorded(manifest), len(inventory)
     instances = as_instances(inventory.instance_id, tuple(item.text for item in inventory.catalog.objects))
@@ -637,14 +637,14 @@ def write_masks(
     images of the training.
 
     Args:
-        invert: write 0 for pixels that show the selection, and 255 for others.
-        settings: rasterizer settings (default: those of gsplat 1.4).
-        overwrite: replace existing files.
+        invert: Write 0 for pixels that show the selection, and 255 for others.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
+        overwrite: Replace existing files.
     Returns:
         Paths of the files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        OSError: a file cannot be written.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
     """
     files = mask_files(scene, folder)
     with atomic_files(*files, overwrite=overwrite) as drafts:

@@ -223,8 +223,8 @@ class WarmServer:
     """HTTP server of lifted runs, with the web page, its sessions and the HTTP API on one port.
 
     Args:
-        runs: store of the runs.
-        options: address, port and write access.
+        runs: Store of the runs.
+        options: Address, port and write access.
     """
 
     def __init__(self, runs: RunStore, options: ServerOptions) -> None:
@@ -245,7 +245,7 @@ class WarmServer:
         """Return the ASGI application.
 
         Args:
-            extra_routes: routes in addition to those of the page and the API.
+            extra_routes: Routes in addition to those of the page and the API.
             lifespan: Starlette lifespan context of the application.
         """
         routes = [
@@ -270,7 +270,7 @@ class WarmServer:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            HTTPException: no run has this id (status 404).
+            HTTPException: No run has this id (status 404).
         """
         if name not in self.runs.ids:
             raise HTTPException(404, f"There is no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")

@@ -46,8 +46,8 @@ def make_codes(state: State, rows: np.ndarray, pca: Float[torch.Tensor, "n 3"] |
     """Return the colors of the drawn Gaussians.
 
     Args:
-        rows: indices of the drawn Gaussians in the scene.
-        pca: principal components of all Gaussians, in 0..1; needed for the color mode pca.
+        rows: Indices of the drawn Gaussians in the scene.
+        pca: Principal components of all Gaussians, in 0..1; needed for the color mode pca.
     """
     table: list[tuple[int, int, int, float, int]] = [(0, 0, 0, 0.0, 0), (0, 0, 0, 0.0, 1)]
     codes = np.full(len(rows), _OWN)

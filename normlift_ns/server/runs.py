@@ -87,7 +87,7 @@ class ServedRun:
     """Open run, shared by all pages and requests.
 
     Args:
-        max_gaussians: maximum number of Gaussians to draw; large and opaque ones have priority.
+        max_gaussians: Maximum number of Gaussians to draw; large and opaque ones have priority.
     """
 
     id: str
@@ -233,7 +233,7 @@ class ServedRun:
         """Return the vectors of stored prompts and of clicks, which do not need an encoder.
 
         Raises:
-            ValueError: a click refers to a Gaussian that this scene does not have.
+            ValueError: A click refers to a Gaussian that this scene does not have.
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
@@ -256,7 +256,7 @@ class ServedRun:
         """Return the cached result for a key, and compute it if necessary; the most recently used results are kept.
 
         Args:
-            size: function that returns the size of a result in bytes.
+            size: Function that returns the size of a result in bytes.
         """
         with self._memory_lock:
             found = self._results.pop(key, None)
@@ -276,8 +276,8 @@ class ServedRun:
         """Return a camera that looks at an object or a point from a position without occlusion.
 
         Args:
-            view: current camera; None for that of the first training image.
-            drawn: mask of the Gaussians that are drawn.
+            view: Current camera; None for that of the first training image.
+            drawn: Mask of the Gaussians that are drawn.
         Raises:
             ValueError: `view` is None, and the run has no training images.
         """
@@ -362,10 +362,10 @@ class RunStore:
     """Store of runs by id. It opens runs on first use, and closes the least recently used ones above a memory limit.
 
     Args:
-        configs: paths of the runs' config.yml files.
-        open_run: function that opens the run of a config.yml.
-        max_gaussians: as in `ServedRun`.
-        memory_limit: maximum size of all open runs in bytes (default: half of the free memory).
+        configs: Paths of the runs' config.yml files.
+        open_run: Function that opens the run of a config.yml.
+        max_gaussians: As in `ServedRun`.
+        memory_limit: Maximum size of all open runs in bytes (default: half of the free memory).
     """
 
     def __init__(
@@ -398,7 +398,7 @@ class RunStore:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            ValueError: no run has this id, or the run cannot be opened.
+            ValueError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
             raise InputError(f"There is no run {name!r}. Choose one of: {', '.join(self.ids)}.")

@@ -118,10 +118,10 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
     """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
-        prompts: all rows, from `build_query`.
-        question: query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
+        prompts: All rows, from `build_query`.
+        question: Query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
     Raises:
-        ValueError: the vectors have a different dimension than the field.
+        ValueError: The vectors have a different dimension than the field.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
     return _with_suggested_threshold(replace(_unasked(state), prompts=tuple(prompts), query=question, action=did))
@@ -163,7 +163,7 @@ def use_suggested_threshold(state: State) -> State:
     """Set the threshold that the relevancies of the selecting prompts suggest.
 
     Raises:
-        ValueError: there is no query.
+        ValueError: There is no query.
     """
     value = threshold_suggestion(state)
     if value is None:
@@ -189,7 +189,7 @@ def show_prompt(state: State, shown: int | None) -> State:
     """Select by only one prompt of the query.
 
     Args:
-        shown: index of the prompt; None for all prompts.
+        shown: Index of the prompt; None for all prompts.
     """
     count = 0 if state.query is None else len(state.query.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
@@ -207,7 +207,7 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     """Return the index of the Gaussian with the largest weight on a ray, among drawn Gaussians with a direction.
 
     Raises:
-        ValueError: the ray hits no such Gaussian.
+        ValueError: The ray hits no such Gaussian.
     """
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
@@ -239,7 +239,7 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
     """Select, add or remove the clicked object; see `object_under`.
 
     Args:
-        weights: weights of the Gaussians on the ray of the click, from `rasterization.rasterize.ray_weights`.
+        weights: Weights of the Gaussians on the ray of the click, from `rasterization.rasterize.ray_weights`.
     """
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
@@ -256,7 +256,7 @@ def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, wh
     """Select Gaussians, add them to the selection, or remove them from it.
 
     Args:
-        what: description of the Gaussians for the history.
+        what: Description of the Gaussians for the history.
     """
     change = {"select": select, "add": add, "remove": remove}[mode]
     return change(state, mask, f"{mode.capitalize()} {what}")
@@ -266,7 +266,7 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
     """Return the direction of the clicked Gaussian, which is the vector of a prompt named `click_name(...)`.
 
     Args:
-        weights: weights of the Gaussians on the ray of the click.
+        weights: Weights of the Gaussians on the ray of the click.
     """
     row = torch.tensor([pick_gaussian(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()
@@ -305,9 +305,9 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     """Select likely floaters.
 
     Args:
-        floaters: mask of the floaters, from `analysis.objects.find_floaters`.
+        floaters: Mask of the floaters, from `analysis.objects.find_floaters`.
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     if not bool(floaters.any()):
         raise InputError("The scene has no likely floaters.")
@@ -324,9 +324,9 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Hide Gaussians in addition to those that are already hidden.
 
     Args:
-        chosen: mask of the Gaussians (default: the selection).
+        chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -339,9 +339,9 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Draw only these Gaussians, including hidden ones.
 
     Args:
-        chosen: mask of the Gaussians (default: the selection).
+        chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -358,7 +358,7 @@ def add_layer(state: State, name: str) -> State:
     """Save the selection as a layer, and replace a layer with the same name.
 
     Raises:
-        ValueError: nothing is selected, the name is empty, or there are too many layers.
+        ValueError: Nothing is selected, the name is empty, or there are too many layers.
     """
     name = clip_text(name, 60)
     layers = tuple(layer for layer in state.layers if layer.name != name)
@@ -384,7 +384,7 @@ def find_layer(state: State, name: str) -> Layer:
     """Return the layer with this name.
 
     Raises:
-        ValueError: no layer has this name.
+        ValueError: No layer has this name.
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:

@@ -52,7 +52,7 @@ class SelectionContext:
         """Return the answer to a query, as `run_query` does; cache the relevancies of the last four queries.
 
         Raises:
-            ValueError: the vectors have a different dimension than the field, or negatives are missing.
+            ValueError: The vectors have a different dimension than the field, or negatives are missing.
         """
         negative = None if question.negative_embeddings is None else question.negative_embeddings.tobytes()
         key = (question.texts, question.embeddings.tobytes(), negative, question.rule, question.refined)
@@ -79,8 +79,8 @@ class SelectionContext:
         component of all Gaussians similar to this one.
 
         Args:
-            gaussian: index of the Gaussian.
-            selected: mask of the selection.
+            gaussian: Index of the Gaussian.
+            selected: Mask of the selection.
         """
         if not bool(selected[gaussian]):
             (direction,) = self.field.directions(torch.tensor([gaussian], device=self.means.device), refined=refined)

@@ -122,7 +122,7 @@ def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Call
     a press of its first button before any other press.
 
     Args:
-        pressed: function to call with the caption of the pressed button and viser's event.
+        pressed: Function to call with the caption of the pressed button and viser's event.
     """
     group = gui.add_button_group(label, options)
 

@@ -71,8 +71,8 @@ class Controller(ABC):
     called from any thread.
 
     Args:
-        session: session that the actions change.
-        explanation: explanation of the current selection.
+        session: Session that the actions change.
+        explanation: Explanation of the current selection.
     """
 
     reading_message: str
@@ -115,7 +115,7 @@ class Controller(ABC):
         """Carry out an action, and show any error in the panel.
 
         Args:
-            value: value of a slider or a choice, or row of an object.
+            value: Value of a slider or a choice, or row of an object.
             client: viser's handle of the user's browser.
         """
         self._guard(lambda: self._act(action, value, client))
@@ -131,7 +131,7 @@ class Controller(ABC):
         """Make a history current, and show its state.
 
         Args:
-            message: message to show with it.
+            message: Message to show with it.
             answered: True if the selection is new and must be visible.
         """
 
@@ -305,8 +305,8 @@ class Controller(ABC):
         """Start a query for all Gaussians similar to a clicked one.
 
         Args:
-            clicked: index or direction of the clicked Gaussian.
-            stored: prompt texts that are already in use, in addition to those of other clicks.
+            clicked: Index or direction of the clicked Gaussian.
+            stored: Prompt texts that are already in use, in addition to those of other clicks.
         """
         with self._lock:
             names = {*self._session.clicks, *stored}
