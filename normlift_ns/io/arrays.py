@@ -81,7 +81,7 @@ def save_arrays(
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Write a safetensors file, and return the digest that its metadata also contains.
+    """Write a safetensors file, and return its digest, which is also stored in its metadata.
 
     Args:
         arrays: NumPy arrays only, or tensors only.
@@ -150,7 +150,7 @@ def load_arrays(
     remedy: str = "write it again",
     framework: str = "np",
 ) -> ArrayFile:
-    """Read a file of `save_arrays` and check its digest.
+    """Read a file that `save_arrays` wrote, and check its digest.
 
     Args:
         key: Key that the file was saved with.
@@ -290,4 +290,4 @@ def _check_npy(file: IO[bytes]) -> None:
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:
         lengths = " x ".join(map(str, shape))
-        raise InputError(f"{lengths[:80]} numbers of type {dtype} need {expected:,} bytes, but it has {found:,}")
+        raise InputError(f"{lengths[:80]} numbers of type {dtype} need {expected:,} bytes, but the file has {found:,}")

@@ -358,7 +358,7 @@ def draft_directory(path: Path) -> Iterator[Path]:
 
 
 def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Collection[str]] | None = None) -> bool:
-    """Rename a folder of `draft_directory` to its final path; return False if that path exists and `replaced` is None.
+    """Rename a folder from `draft_directory` to its final path; return False if the path exists and `replaced` is None.
 
     The system exchanges an existing folder with the new one, so the path exists at every instant. If the system cannot
     exchange folders, a journal records the steps. The next command that opens or writes the run then completes them.
@@ -436,7 +436,7 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
 
 
 def complete_interrupted_writes(folder: Path) -> None:
-    """Complete the interrupted replacements in a folder, and delete the temporary folders of dead processes."""
+    """Complete the interrupted replacements in a folder, and delete the temporary folders of ended processes."""
     for temporary in folder.glob(f"{_TEMPORARY_PREFIX}*"):
         if _TEMPORARY_NAME.fullmatch(temporary.name) is None or temporary.is_symlink():
             continue

@@ -48,7 +48,7 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
-    """Raise the errors of `open_regular` if another library must not open the file."""
+    """Raise the errors of `open_regular` if a path is not a regular file that another library may open."""
     open_regular(path, max_bytes=max_bytes).close()
 
 
@@ -94,7 +94,7 @@ def protect_inputs(*paths: Path | None) -> None:
 
 
 def forget_inputs() -> None:
-    """Remove the protection of `protect_inputs`, at the beginning of a command."""
+    """Remove all protections of `protect_inputs`. Each command calls this function when it starts."""
     _inputs.clear()
 
 
@@ -125,7 +125,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
     """Return a description of the input, run, data set or cache that contains a path; None if it may be written.
 
-    The path must have its links resolved.
+    Links in the path must already be resolved.
     """
     exists, folder = os.path.exists(path), os.path.dirname(path)
     for kind, parent, names in owners(folder):

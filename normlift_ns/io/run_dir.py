@@ -31,7 +31,7 @@ TEXT_EMBEDDINGS_FILE = "texts.npz"
 _MAX_NAME_BYTES = 200
 """Maximum length of a folder name in bytes. Systems allow 255 bytes; the rest is reserved for appended numbers."""
 _SEAL = "# Lines below: "
-"""Beginning of a config.yml that normlift_ns wrote. The digest of all lines after the first follows it."""
+"""Beginning of a config.yml that normlift_ns wrote. After it comes the digest of all lines except the first."""
 _WRITTEN = (
     *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
     *("../splat.json", "../transforms.json", "../added_photographs.json"),

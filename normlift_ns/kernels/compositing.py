@@ -219,7 +219,7 @@ class RegionSums(NamedTuple):
     """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """Keys row * columns + label + 1, in which row is that of the splat."""
+    """Keys row * columns + label + 1, in which row is the row of the splat."""
     weight: Float32[Tensor, " m"]
 
 

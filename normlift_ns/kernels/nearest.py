@@ -27,7 +27,7 @@ _PAIRS = 2**24
 _SORTED_IN_A_BLOCK = 4096
 """Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Number of leaves per launch, which is half a million points of 320 bytes each for K = 36."""
+"""Number of leaves per launch. They contain half a million points, of 320 bytes each for K = 36."""
 
 
 class GatheringProcesses(Protocol):

@@ -192,7 +192,7 @@ def vote(
         own: Number of views that agree on each Gaussian's own direction, or None for the paper's vote.
         prior: Weight of the neighbors in a posterior vote, as a number of views.
         precision: Precision of the products of float32 directions. "halves" uses two halves of 11 bits each.
-            "certified" has the same winners, but uses only the first halves if these determine the winner. "first"
+            "certified" gives the same winners, but uses only the first halves if these determine the winner. "first"
             writes only winners that the first halves determine. "tf32" rounds to 11 bits, "tf32x3" adds three such
             products, and "ieee" does not round. Directions in half precision are not rounded.
     """

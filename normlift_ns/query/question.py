@@ -232,7 +232,7 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     """Check the metadata and the arrays of embeddings, and return the query that they contain.
 
     Raises:
-        ValueError: The metadata or an embedding is not valid, they are inconsistent, or they do not match the field in
+        ValueError: The metadata or an embedding is not valid, both are inconsistent, or they do not match the field in
             the folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)

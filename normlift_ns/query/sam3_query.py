@@ -35,7 +35,7 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_MASK_FRACTION = 0.5
-"""A Gaussian is selected if a larger fraction of its weight than this is inside the masks."""
+"""A Gaussian is selected if the fraction of its weight inside the masks exceeds this number."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def mask_evidence(
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"masks must have one set of masks for each of one or more cameras; got {len(masks)} sets for "
+            f"expected one set of masks per camera, and at least one camera; got {len(masks)} sets of masks for "
             f"{len(cameras)} cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []

@@ -35,7 +35,7 @@ versions support these too."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
-"""Lower bound of the radius in pixels if a determinant overflows. It is of the order of (radius / 3) ** 4."""
+"""Lower bound of the radius in pixels if the determinant, of the order of (radius / 3) ** 4, overflows."""
 _LONGEST_RADIUS = 2**31 - 128
 """Largest int32 number that float32 represents exactly."""
 
@@ -118,7 +118,7 @@ def _project_enormous(
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not float32 on a GPU, has 2D Gaussians, or needs constants of another gsplat."""
+    """Raise ValueError if a scene is not in float32 on a GPU, has 2D Gaussians, or needs another version of gsplat."""
     check_gpu("gsplat", job)
     if job.is_2d:
         raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')

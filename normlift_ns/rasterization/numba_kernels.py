@@ -363,7 +363,7 @@ def _blend_2d(
 
 @fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
-    """Composite one Gaussian over a tile, and write A_ij to weights[row, chunk, lane], or 0 for pixels without it.
+    """Composite one Gaussian over a tile. Write A_ij, or 0 if it is not drawn, to weights[row, chunk, lane].
 
     The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
     transform of a Gaussian of 2D Gaussian Splatting.

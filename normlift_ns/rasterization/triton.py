@@ -20,14 +20,14 @@ from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)
-"""Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians and for at least as many.
+"""Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians, and for `_MANY` or more.
 
 With many Gaussians, smaller cells are faster, because the pixels of a cell have fewer Gaussians in common.
 """
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest product of views in a batch and Gaussians, and largest number of views in a batch.
+"""Largest number of views in a batch times Gaussians, and largest number of views in a batch.
 
 A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """

@@ -49,7 +49,7 @@ class Display:
 
     values: Float[Tensor, "n q_plus_5"]
     """Columns: relevancy of each prompt, relevancy shown in the overlay, selected (0 or 1), selected by any prompt
-    (0 or 1), R, N_eff."""
+    (0 or 1), R, and N_eff."""
     scale: tuple[float, float]
     """Relevancies of the first and the last color of the overlay."""
     map_scale: tuple[float, float]

@@ -85,7 +85,7 @@ _WORKERS = min(8, os.cpu_count() or 1)
 
 
 class RegionDefaults:
-    """Defaults of `Regions` for mask sources with one level and no files that segment one image at a time."""
+    """Defaults of `Regions` for mask sources that have one level and no files, and segment one image at a time."""
 
     at_once = 1
 
@@ -171,7 +171,7 @@ class LabelFiles(RegionDefaults):
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
+                f"the folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
                 "PNG or NPY file per image"
             )
 
@@ -272,7 +272,7 @@ class LabelFiles(RegionDefaults):
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(f"{what} holds {maps.dtype}, expected an integer type; save it with .astype(numpy.int32)")
+            raise InputError(f"{what} has type {maps.dtype}, expected an integer; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps

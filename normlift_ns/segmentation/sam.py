@@ -115,7 +115,7 @@ class MaskDecoder:
 
         Args:
             image: Embedding of the image, one row per position, [N, C].
-            positioned: The same plus position embeddings, [N, C].
+            positioned: The same embedding plus position embeddings, [N, C].
             prompts: Two tokens per point, [P, 2, C].
         """
         decoder = self._model.mask_decoder

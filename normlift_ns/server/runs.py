@@ -52,7 +52,7 @@ _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
 _JPEG_QUALITY = 85
 _POSITION_STEP = 2**-14
-"""Step to which positions on the page are rounded, as a fraction of the radius of the scene."""
+"""Rounding step of the positions on the page, as a fraction of the radius of the scene."""
 _MEMORY_SHARE = 0.5
 """Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()

@@ -82,7 +82,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose the latter.
+    If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -186,7 +186,7 @@ def remove_weak(state: State) -> State:
 
 
 def show_prompt(state: State, shown: int | None) -> State:
-    """Select by only one prompt of the query.
+    """Let only one prompt of the query, or all prompts, select Gaussians.
 
     Args:
         shown: Index of the prompt; None for all prompts.

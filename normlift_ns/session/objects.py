@@ -111,7 +111,7 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 
 
 Position = tuple[float, float, float]
-"""x, y, z in scene units."""
+"""x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
 """Maximum mean opacity in front of the object for a clear view."""
 _FILL = 0.8

@@ -131,7 +131,7 @@ class Controller(ABC):
         """Make a history current, and show its state.
 
         Args:
-            message: Message to show with it.
+            message: Message to show with the state.
             answered: True if the selection is new and must be visible.
         """
 
