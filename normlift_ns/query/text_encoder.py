@@ -96,7 +96,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     """Return the text encoder that fits a field.
 
     Args:
-        device: Device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
+        device: Device of the network, as in `choose_device`; "auto" runs the text tower of OpenCLIP on the CPU.
         cache: Folder for a cache of embeddings; None for no cache.
     Raises:
         ValueError: The encoder is unknown, or its weights or the text embeddings are not those of the lift.
