@@ -27,6 +27,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
+    "research/studies.md": "studies.md",
 }
 _SOURCE = "https://github.com/normlift-ns/normlift_ns/blob/main/"
 _LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
