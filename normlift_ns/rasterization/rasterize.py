@@ -254,12 +254,29 @@ def render(
     >>> image.tolist(), alpha.tolist()
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
+    options = {"backend": backend, "rasterize_mode": rasterize_mode, "settings": settings, "dtype": dtype}
+    return next(render_views(scene, [camera], values, **options))
+
+
+def render_views(
+    scene: GaussianScene,
+    cameras: Iterable[Camera],
+    values: Float[Tensor, "n c"],
+    *,
+    backend: BackendName = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+) -> Iterator[tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]]:
+    """Yield what `render` returns for each of several cameras; the Gaussians are prepared once."""
     if len(values) != len(scene):
         raise InputError(f"values must have shape [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job)
-    with torch.no_grad():
-        return chosen.composite(job, camera, values)
+    for camera in cameras:
+        with torch.no_grad():
+            image = chosen.composite(job, camera, values)
+        yield image
 
 
 def render_image(

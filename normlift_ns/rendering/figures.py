@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
-from normlift_ns.analysis.inventory import Inventory, as_instances
-from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color, view_shares
+from normlift_ns.analysis.inventory import Inventory
+from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color
 from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
@@ -581,8 +581,7 @@ def save_inventory(
         OSError: The file cannot be written.
     """
     settings, count = RasterSettings.recorded(manifest), len(inventory)
-    instances = as_instances(inventory.instance_id, tuple(item.text for item in inventory.catalog.objects))
-    shares = view_shares(scene, instances, settings, str(scene.gaussians.means.device))
+    shares = inventory.catalog.view_shares
     shares = shares / shares.amax(dim=1, keepdim=True).clamp(min=1e-12)
     shown = (shares >= MIN_VIEW_SHARE).sum(dim=0) + shares.sum(dim=0) / max(count, 1)  # the second term is below 1
     view = int(shown.argmax())

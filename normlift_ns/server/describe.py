@@ -29,7 +29,7 @@ _MAX_HISTOGRAMS = 8
 _MAX_IMAGES = 3
 """Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
 _IMAGE_SIZE = 480
-_OVER_VIEWS = "Based on about {:.0f} images; {}."
+_OVER_VIEWS = "Based on about {:.0f} images; the vote of neighboring Gaussians changed {:.0%} of the answers."
 
 
 def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:
@@ -170,7 +170,6 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
-    smoothed = f"{why.copied / why.gaussians:.0%} of the Gaussians copied the feature of a neighbor"
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
-    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}
+    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), why.changed), **facts, **votes_of}
