@@ -191,7 +191,7 @@ class NormLiftQuery(CheckedOptions):
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
         """Prompts of --text, split at commas."""
-        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
 
@@ -427,7 +427,7 @@ def run_repl(
     from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
     from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
 
-    from normlift_ns.session.prompts import split_prompts  # noqa: PLC0415
+    from normlift_ns.query.question import split_prompts  # noqa: PLC0415
 
     file = _history_file() if keep_history else None
     session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
