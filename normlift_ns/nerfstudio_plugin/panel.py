@@ -30,7 +30,7 @@ from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.question import Query, join_prompts, load_query, split_prompts
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for
 from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text
 from normlift_ns.rendering.figures import Display, make_display, output_names
@@ -38,7 +38,7 @@ from normlift_ns.session import actions
 from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
 from normlift_ns.session.objects import ObjectRow, list_objects, unoccluded_viewpoint
 from normlift_ns.session.outputs import splat_bytes, store_query
-from normlift_ns.session.prompts import join_prompts, prompts_of_query, split_prompts
+from normlift_ns.session.prompts import prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import KEYS_SCRIPT, handle_in_order, ignore_closed_clients, send_in_order

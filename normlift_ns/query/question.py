@@ -1,4 +1,4 @@
-"""Queries for a semantic field: prompts with their embeddings, and the rule that selects Gaussians.
+"""Queries for a semantic field: lines of prompts, their embeddings, and the rule that selects Gaussians.
 
 This module does not need torch.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,40 @@ from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import DefaultRule, HasManifest, default_rule, encoder_digest
+
+_PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
+
+
+def split_prompts(text: str) -> list[str]:
+    """Split a text into prompts at commas, semicolons and line breaks outside quotes; drop duplicates.
+
+    >>> split_prompts('red mug , bowl;;"salt, pepper"; bowl')
+    ['red mug', 'bowl', 'salt, pepper']
+    """
+    parts = (" ".join((quoted or bare).split()) for quoted, bare in _PROMPT.findall(text))
+    return list(dict.fromkeys(part for part in parts if part))
+
+
+def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Split every text of an option with `split_prompts`.
+
+    Raises:
+        ValueError: there are texts, but no prompts in them.
+    """
+    prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
+    if len(texts) > 0 and len(prompts) == 0:
+        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
+    return prompts
+
+
+def join_prompts(texts: Sequence[str]) -> str:
+    """Join texts into a line that `split_prompts` splits into the same texts.
+
+    >>> join_prompts(["red mug", "salt, pepper"])
+    'red mug, "salt, pepper"'
+    """
+    lines = (" ".join(text.replace('"', " ").split()) for text in texts)
+    return ", ".join(f'"{line}"' if re.search("[,;]", line) else line for line in lines)
 
 
 def as_numpy(array: Any) -> np.ndarray:

@@ -14,7 +14,7 @@ import torch
 
 from normlift_ns.core.gaussians import Camera, facing_pose
 from normlift_ns.errors import InputError
-from normlift_ns.session.prompts import join_prompts
+from normlift_ns.query.question import join_prompts
 from normlift_ns.session.state import State
 
 MAX_LINK_LENGTH = 6000

@@ -30,14 +30,14 @@ from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.question import Query, join_prompts, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
 from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
-from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts, prompts_of_query
+from normlift_ns.session.prompts import build_query, encode_prompts, prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, State
 

@@ -12,7 +12,7 @@ import torch
 from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query
+from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.server.coloring import ColorMode
 from normlift_ns.server.describe import region_mask
 from normlift_ns.server.permalink import Finite, PageView
@@ -20,7 +20,7 @@ from normlift_ns.server.protocol import CameraValue, Ray, Region
 from normlift_ns.server.runs import ServedRun
 from normlift_ns.session import actions
 from normlift_ns.session.objects import ObjectRow, list_objects
-from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts
+from normlift_ns.session.prompts import build_query, encode_prompts
 from normlift_ns.session.state import State
 
 Prompt = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]

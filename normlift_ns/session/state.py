@@ -13,9 +13,9 @@ from torch import Tensor
 
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query
+from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.rendering.colors import Colormap
-from normlift_ns.session.prompts import Prompt, join_prompts
+from normlift_ns.session.prompts import Prompt
 from normlift_ns.session.selection import SelectionContext
 
 
