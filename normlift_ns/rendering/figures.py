@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image, ImageDraw, ImageFilter
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from normlift_ns.analysis.inventory import Inventory
@@ -329,7 +330,7 @@ def view_figure(
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
     panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
     panels["answer"] = panel
-    share = float(selected.float().mean())
+    share = np.count_nonzero(selected.cpu().numpy()) / max(1, selected.numel())
     summary = f"{100 * share:.1f} % of this view, {header.summary}" if share > 0 else header.summary
     titles = [f"{header.title}   ·   {colors.clip_text(view, 40)}", summary]
     return _page(sheet, titles, list(panels.values()), list(panels), 2)
@@ -364,10 +365,10 @@ def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
     size = (max(1, round(scale * overlay.shape[1])), max(1, round(scale * overlay.shape[0])))
     image = Image.fromarray(overlay.cpu().numpy()).resize(size, Image.Resampling.BICUBIC)
     mask = Image.fromarray(selected.cpu().numpy() * np.uint8(255)).resize(size, Image.Resampling.BILINEAR)
-    mask = mask.point(lambda value: 255 * (value > 127))  # pyright: ignore[reportOperatorIssue]
+    inside = (np.asarray(mask) > 127).astype(np.uint8)
     for color, thickness in (((0, 0, 0), 5), ((255, 255, 255), 3)):
-        dilated, eroded = mask.filter(ImageFilter.MaxFilter(thickness)), mask.filter(ImageFilter.MinFilter(thickness))
-        image.paste(color, mask=Image.fromarray(np.asarray(dilated) != np.asarray(eroded)))
+        window = np.ones((thickness, thickness), np.uint8)
+        image.paste(color, mask=Image.fromarray(cv2.dilate(inside, window) != cv2.erode(inside, window)))
     return image
 
 
@@ -430,7 +431,7 @@ CONTACT_SHEET_PREFIX = "contact_sheet"
 _THREADS = min(16, os.cpu_count() or 1)
 """Number of views whose figures are drawn and saved concurrently."""
 _ZLIB_LEVEL = 4
-"""Compression level of PNG files; PIL's default, 6, takes twice as long for files that are 6% smaller."""
+"""Compression level of PNG files. A level of 6 takes twice as long for files that are 6% smaller."""
 
 
 def save_overlays(
@@ -472,8 +473,12 @@ def save_overlays(
 
     def save(prefix: str, q: int, picture: Image.Image) -> Path:
         path = folder / f"{prefix}_{ends[q]}"
+        pixels = cv2.cvtColor(np.asarray(picture), cv2.COLOR_RGB2BGR)
+        _, content = cv2.imencode(
+            ".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, _ZLIB_LEVEL]
+        )  # PIL blocks other threads
         with atomic_file(path, overwrite=overwrite) as draft:
-            picture.save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+            draft.write_bytes(content.tobytes())
         return path
 
     def draw(rendered: tuple[str, list[_Overlay]]) -> tuple[list[Path], list[Image.Image]]:
@@ -486,9 +491,12 @@ def save_overlays(
     drawn = list(prefetch_map(draw, _render_overlays(scene, answer, display, cameras, settings, device), _THREADS))
     paths = [path for saved, _ in drawn for path in saved]
     if len(cameras) > 1:
-        panels = ([panel[q] for _, panel in drawn] for q in range(len(ends)))
-        sheets = [contact_sheet(sheet, header, x, list(cameras)) for header, x in zip(headers, panels)]
-        paths += [save(CONTACT_SHEET_PREFIX, q, picture) for q, picture in enumerate(sheets)]
+
+        def save_sheet(q: int) -> Path:
+            panels = [panel[q] for _, panel in drawn]
+            return save(CONTACT_SHEET_PREFIX, q, contact_sheet(sheet, headers[q], panels, list(cameras)))
+
+        paths += prefetch_map(save_sheet, range(len(ends)), _THREADS)
     return paths
 
 
