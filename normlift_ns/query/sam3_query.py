@@ -131,7 +131,7 @@ def mask_evidence(
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"expected one set of masks per camera, and at least one camera; got {len(masks)} sets of masks for "
+            f"expected one set of masks per camera, and at least one camera; got {len(masks)} sets for "
             f"{len(cameras)} cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []

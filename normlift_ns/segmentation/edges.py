@@ -24,8 +24,7 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d
 
-from normlift_ns.encoders.package_files import EDGES
-from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.encoders.weights import EDGES, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.segmentation.regions import RegionDefaults, resample_nearest
 from normlift_ns.segmentation.sam import resize_bilinear

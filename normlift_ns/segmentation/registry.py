@@ -14,9 +14,8 @@ from importlib.util import find_spec
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, get_args
 
-from normlift_ns.encoders.package_files import EDGES, PackageFile
 from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts, with_encoder
-from normlift_ns.encoders.weights import find_local_sam
+from normlift_ns.encoders.weights import EDGES, PackageFile, find_local_sam
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, MASK_GROUP, FeatureKind, SourceOptions, short_repr
 from normlift_ns.registry import Registry

@@ -30,7 +30,7 @@ from normlift_ns.segmentation.checkpoint import (
     resolve_precision,
     sam_identity,
 )
-from normlift_ns.segmentation.regions import RegionDefaults
+from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 _BITS = 22
 
@@ -628,7 +628,7 @@ class SamMasks(RegionDefaults):
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device. Raises the same errors as `masks`."""
-        maps = [mask_filtering.stack_masks(masks) for masks in self.masks(image).values()]
+        maps = [stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(labels) for labels in maps)
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 

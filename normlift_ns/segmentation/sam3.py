@@ -29,8 +29,7 @@ from normlift_ns.segmentation.checkpoint import (
     resolve_precision,
     transformers_folder,
 )
-from normlift_ns.segmentation.mask_filtering import stack_masks
-from normlift_ns.segmentation.regions import RegionDefaults
+from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 SCORE_THRESHOLD = 0.5
 """Largest score of masks that are dropped, as in the model card.
