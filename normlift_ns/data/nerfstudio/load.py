@@ -230,7 +230,7 @@ def load_nerfstudio_scene(
     count, expected = checkpoint.splat.features_rest.shape[1], (model.sh_degree + 1) ** 2 - 1
     if count != expected:
         raise InputError(
-            f"{checkpoint.path} has {count} spherical harmonics without the constant one, but {load_config} has "
+            f"{checkpoint.path} has {count} spherical harmonics above degree 0, but {load_config} has "
             f"sh_degree {model.sh_degree}, which needs {expected}. Copy the checkpoint and the config of the same "
             "training run again."
         )
