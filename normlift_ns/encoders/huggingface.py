@@ -85,7 +85,7 @@ MODEL_FAMILIES = {
 
 
 def family_of_tokenizer(name: str) -> ModelFamily | None:
-    """Return the family that the name of a tokenizer class identifies, or None if it identifies none.
+    """Return the family that the name of a tokenizer class identifies, or None if no family matches.
 
     >>> family_of_tokenizer("GemmaTokenizerFast").title, family_of_tokenizer("SiglipTokenizer").title
     ('SigLIP 2', 'SigLIP')

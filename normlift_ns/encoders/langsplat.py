@@ -244,7 +244,7 @@ class LangSplat:
                 )
             warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
-        check_files_distinct(maps, "features", "by naming the images such that they differ before the first dot")
+        check_files_distinct(maps, "features", "by naming the images so that they differ before the first dot")
         dimensions: dict[int, Path] = {}
         for files in files_of.values():
             dimensions.setdefault(open_feature_table(files.features).shape[1], files.features)
@@ -319,7 +319,7 @@ class LangSplat:
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return whether a map can show the same image at a different resolution.
+    """Return True if a map can show the same image at a different resolution.
 
     The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
     within 2 % of each other must be equal, because a small difference is probably a crop.
@@ -352,7 +352,7 @@ def check_unique_stems(names: Sequence[str]) -> None:
         ValueError: If the files of two images would have the same name.
     """
     files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
-    remedy = "by renaming the images such that they differ before the first dot, or lift without the export"
+    remedy = "by renaming the images so that they differ before the first dot, or lift without the export"
     check_files_distinct(files, "exported file", remedy)
 
 
