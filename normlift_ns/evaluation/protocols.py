@@ -61,7 +61,9 @@ def read_names(path: Path) -> Names:
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
-        raise FileNotFoundError(f'mask names {path} do not exist; write {{"labels": {{"1": "table", ...}}}} to it')
+        raise FileNotFoundError(
+            f'the file of mask names {path} does not exist; write {{"labels": {{"1": "table", ...}}}} to it'
+        )
     try:
         document = read_document(path, dict[str, Any])
         named = msgspec.convert(document if "labels" in document else {"labels": document}, _NamesFile)
