@@ -296,7 +296,7 @@ def print_plan(plan: Plan) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc reuse freed memory instead of returning it to the system at once.
+    """Let glibc reuse freed memory instead of immediately returning it to the system.
 
     Without this, a lift on the CPU spends a third of its time in page faults of large temporary arrays.
     """
@@ -357,7 +357,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     table.add_row("stored as", f"{sizes.pop(storage)}, {error}")
     table.add_row("", "instead of " + ", ".join(sizes.values()))
     table.add_row("run", common.plain_text(run.folder))
-    return Group(Text("Lifted", style="bold green"), table, Text("Search it with:"))
+    return Group(Text("Lifted", style="bold green"), table, Text("Search the run with:"))
 
 
 def next_command(config: Path, queries: tuple[str, ...]) -> str:
