@@ -315,7 +315,7 @@ def query_to_store(
     """Return the query that a new run stores for these prompts; None without prompts.
 
     Raises:
-        ValueError: the vectors of the prompts and the features have different lengths.
+        ValueError: the vectors of the prompts and the features have different dimensions.
     """
     if len(queries) == 0:
         return None

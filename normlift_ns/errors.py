@@ -45,7 +45,10 @@ class MissingImageError(InputError, KeyError, IndexError):
 
 
 class OutputError(Exception):
-    """Error for a failed write to standard output; not an OSError, because loaders report that as a read error."""
+    """Error for a failed write to standard output.
+
+    It is not an OSError, because loaders report an OSError as a read error.
+    """
 
 
 def escape_unprintable(text: str, keep: str = "") -> str:

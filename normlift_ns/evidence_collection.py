@@ -408,9 +408,9 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         if not maps.resample:
             raise InputError(
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
-                "--regions-resample True and accept an error of some pixels"
+                "--regions-resample True and accept an error of a few pixels"
             )
-        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by some pixels", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by a few pixels", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
             f"{reason} without changing its size. Make sure that the label maps in {file.parent} were made from the "

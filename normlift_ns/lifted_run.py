@@ -203,7 +203,7 @@ class LiftedRun:
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: the vectors of the query and the directions of the field have different lengths.
+            ValueError: the vectors of the query and the directions of the field have different dimensions.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
@@ -432,7 +432,8 @@ class LiftedRun:
 
         Args:
             vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
-                imagenet, the names of colors, or the texts of your own features. Other encoders have no words.
+                imagenet, the names of colors, or the texts of your own features. With other encoders, objects are only
+                numbered.
             meters_per_unit: as in `catalogue`.
         Raises:
             ValueError: the encoder cannot encode a word, or as in `why` and `catalogue`.

@@ -396,7 +396,7 @@ def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
         if (run_dir / FIELD_FOLDER / MANIFEST_FILE).is_file():
             facts = read_manifest(run_dir / FIELD_FOLDER)[0].get("statistics", {}).get("recognition")
             if facts is None:
-                advice = "lift again to measure how well it recognizes views that were left out"
+                advice = "lift again to measure how well regions are recognized in left-out views"
                 return [Diagnostic("lifted run", "ok", str(run_dir), advice)]
             return [Diagnostic("lifted run", "ok", describe_recognition(facts))]
     return []

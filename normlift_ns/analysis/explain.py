@@ -125,17 +125,17 @@ class Why:
         if len(self.views) == 0 and self.n_eff == 0:
             return "No image shows the selection."
         if len(self.views) == 1:
-            return "Only one image shows the selection, so no other image can confirm its vote."
+            return "Only one image shows the selection, so no other image can confirm its features."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
         count = "a single image" if self.n_eff < 1.05 else f"{self.n_eff:.1f} images of equal weight"
         return f"The images {level} (C_inter {self.c_inter:.2f}). Their weights are equivalent to {count} (N_eff)."
 
     @property
     def sentence(self) -> str:
-        """Sentences of `words`, and the fraction of the selection that copied the direction of a neighbor."""
+        """Sentences of `words`, and the fraction of the selected Gaussians that have a neighbor's direction."""
         if self.copied == 0:
             return self.words
-        return f"{self.words} {self.copied / self.gaussians:.0%} of the selection copied the direction of a neighbor."
+        return f"{self.words} {self.copied / self.gaussians:.0%} of the selected Gaussians have a neighbor's direction."
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the words as plain Python types."""

@@ -100,7 +100,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
 
 
 def is_lifted(run: Path) -> bool:
-    """Return whether a lifted run with a valid manifest exists.
+    """Return True if a lifted run with a valid manifest exists.
 
     Raises:
         InputError: The path exists, but is not a lifted run or is a damaged one.
@@ -210,7 +210,7 @@ class Shard:
     count: int
 
     def contains(self, position: int) -> bool:
-        """Return whether a position in the list, from 0, belongs to this part. Parts do not overlap.
+        """Return True if a position in the list, from 0, belongs to this part. Parts do not overlap.
 
         >>> [position for position in range(7) if Shard(1, 3).contains(position)]
         [1, 4]
@@ -461,7 +461,7 @@ def lift_captures(
 
 
 def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
-    """Return whether a capture is lifted and its result is recorded."""
+    """Return True if a capture is lifted and its result is recorded."""
     outcome = outcomes.get(capture.key)
     if outcome is None or outcome.state == "failed":
         return False

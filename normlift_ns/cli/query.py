@@ -119,7 +119,7 @@ class NormLiftQuery(CheckedOptions):
     object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
-    classes for imagenet and the names of colors for color. Other encoders have no words."""
+    classes for imagenet and the names of colors for color. With other encoders, objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
     objects."""
@@ -197,7 +197,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _run(self) -> StoredRun:
-        """Stored run with its scene, which most answers do not need."""
+        """Stored run with its scene. Most answers do not need the scene."""
         from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
         return open_stored_run(self.load_config, self.data)

@@ -82,7 +82,9 @@ def _hub(
             return download()
         except FileNotFoundError as error:
             page = f"https://huggingface.co/{repository}"
-            raise FileNotFoundError(f"{error}. Or download them from {page} on another machine: {local}") from None
+            raise FileNotFoundError(
+                f"{error}. Or download the weights from {page} on another machine: {local}"
+            ) from None
 
     return Weights(user, megabytes, license_name, data, repository, partial(hub_folder, repository), find, fetch)
 

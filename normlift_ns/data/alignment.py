@@ -112,8 +112,8 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            f"The cameras do not show this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
-            f"of three training views. {causes}. To lift anyway, give --check-alignment False."
+            "The cameras do not show this splat: each of three training views contains at most "
+            f"{match.visible_fraction:.2%} of its Gaussians. {causes}. To lift anyway, give --check-alignment False."
         )
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:

@@ -20,11 +20,11 @@ _PARALLEL = 1e-6
 
 
 def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
-    """Read the camera file in the options, and check that its images exist.
+    """Read the camera file that the options name, and check that its images exist.
 
     Args:
         options: Paths of cameras, images and masks.
-        advice: Advice on missing images, for error messages; None for advice that suits the options.
+        advice: Advice on missing images, for error messages; None for advice that depends on the options.
     Raises:
         FileNotFoundError: A file, folder, image or mask is missing.
         ValueError: The options do not contain exactly one camera file, or it cannot be read.

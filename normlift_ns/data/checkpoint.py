@@ -323,7 +323,7 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file, or the file of another rank, does not exist.
         ValueError: A file is damaged, comes from another trainer or training run, or needs an appearance network, or
-            the Gaussians cannot be drawn.
+            the Gaussians cannot be rendered.
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]

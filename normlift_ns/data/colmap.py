@@ -63,8 +63,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {folder}. Give the folder of the COLMAP project, which contains images/ and sparse/0, "
-            "with --colmap."
+            f"The folder {folder} does not exist. Give the folder of the COLMAP project, which contains images/ and "
+            "sparse/0, with --colmap."
         )
     if _is_model(folder):
         return folder
@@ -240,7 +240,9 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
     intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (images or folder / "images").absolute()
     if not images_dir.is_dir():
-        raise FileNotFoundError(f"There is no image folder {images_dir}. Copy the images into it, or {advice}.")
+        raise FileNotFoundError(
+            f"The image folder {images_dir} does not exist. Copy the images to this path, or {advice}."
+        )
     names = [image.name for image in registered]
     files = find_images(names, images_dir, model, advice, allow_copies=True)
     mask_files = [None] * len(files) if masks is None else find_masks(names, masks)

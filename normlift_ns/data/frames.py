@@ -110,7 +110,11 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
             "are in CMYK, which training reads with wrong colors",
             "Convert them to RGB",
         ),
-        ([header.multi_frame for header in headers], "contain several images", "Only the first of each is used"),
+        (
+            [header.multi_frame for header in headers],
+            "contain several images",
+            "Only the first image of each file is used",
+        ),
     )
     warnings = []
     for affected, problem, advice in kinds:

@@ -116,7 +116,8 @@ def read_gltf(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
         ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
-            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be drawn.
+            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be
+            rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The glTF file {path} does not exist. Give an existing file with --load-ply.")

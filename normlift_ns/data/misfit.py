@@ -49,7 +49,7 @@ _PROBES = (
 
 
 class _Pair(NamedTuple):
-    """An image and a render of the same size. Both are blurred, because a change of the lens interpolates the image."""
+    """An image and a render of the same size. Both are blurred, because interpolation for a lens blurs the image."""
 
     image: Float[Tensor, "1 4 h w"]
     """RGB in 0..1, and 1 at pixels that count."""

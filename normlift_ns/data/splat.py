@@ -237,7 +237,7 @@ def read_ply(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The file is not a PLY file, is truncated, does not contain a splat, or has Gaussians that cannot be
-            drawn. The number of spherical harmonics must match a degree.
+            rendered. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
         raise FileNotFoundError(
@@ -346,7 +346,7 @@ def _not_ply(path: Path, error: Exception) -> InputError:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
-    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
+    """Return True if the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]

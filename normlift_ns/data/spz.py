@@ -105,7 +105,7 @@ def read_spz(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be drawn.
+        ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The SPZ file {path} does not exist. Give an existing file with --load-ply.")

@@ -79,7 +79,7 @@ class CandidateWorld(NamedTuple):
 
 
 def with_opengl_axes(frames: Sequence[Frame]) -> list[Frame]:
-    """Return frames whose poses have OpenCV's axes with those of OpenGL."""
+    """Convert the poses of frames from OpenCV's axes to OpenGL's."""
     return [replace(frame, pose=frame.pose * _OPENCV_AXES) for frame in frames]
 
 

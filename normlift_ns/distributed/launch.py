@@ -271,7 +271,7 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
 
 
 def _is_listening(host: str, port: int) -> bool:
-    """Return whether a server accepts connections at an address."""
+    """Return True if a server accepts connections at an address."""
     with suppress(OSError):
         socket.create_connection((host, port), timeout=5).close()
         return True

@@ -124,7 +124,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Return the points of a polygon. Raise InputError if a point is farther outside than the image size."""
+    """Return the points of a polygon. Raise InputError if a point is farther from the image than the image size."""
     points = np.array(segmentation, dtype=float)
     if np.abs(points / (width, height) - 0.5).max() > 1.5:
         raise InputError(
@@ -195,8 +195,8 @@ def prompt_mask(
     Args:
         masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores
             above SFS's threshold, from their histogram and the number of true instances. "langsplat" and
-            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels
-            around it exceed 0.7, which is 0.4 after 2 x - 1.
+            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels around
+            it exceed 0.7, which LangSplat writes as 2 x - 1 > 0.4.
         margin: lead over the background words, in cosine.
         instances: number of true instances.
     """

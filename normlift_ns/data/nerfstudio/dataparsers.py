@@ -619,7 +619,7 @@ def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]
 
 
 def _downscaled(files: list[Path], folder: Path, factor: int) -> list[Path]:
-    """Return the paths of the copies of files that are downscaled by a factor; unchanged for factor 1."""
+    """Return the paths of copies of the files, downscaled by a factor. For factor 1, return the paths of the files."""
     smaller = folder.parent / f"{folder.name}_{factor}"
     return files if factor == 1 else [smaller / file.relative_to(folder) for file in files]
 

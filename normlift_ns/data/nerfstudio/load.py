@@ -238,7 +238,7 @@ def load_nerfstudio_scene(
     if not bool(gaussians.drawable.any()):
         raise InputError(
             f"{checkpoint.path}: all {len(gaussians):,} Gaussians have NaN or infinite parameters, or zero "
-            "quaternions, so they cannot be drawn. Give another checkpoint with --load-step."
+            "quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
         )
     dataset = parse_dataset(datamanager, data_given=data is not None)
     advice = "" if data is not None else ", or give the path of the dataset with --data"
