@@ -19,7 +19,8 @@ from research.plots import DOCS
 from tests.browser.page import OnPage
 from tests.browser.person import PANEL, chromium, coloured
 from tests.browser.server import OWN, Server
-from tests.browser.viewer import TITLE, Tab, ns_viewer
+from tests.browser.server import STOCK as STOCK_VIEWER
+from tests.browser.viewer import TITLE, Tab
 
 RUNS = Path("demo/outputs/room/normlift")
 ASKED, STOCK = "banana, wine bottle", "tomato red, banana yellow"
@@ -35,7 +36,7 @@ def main(runs: Path) -> None:
     with chromium() as browser:
         with Server(OWN, runs / "thing" / "config.yml", log).running() as address:
             own(browser, address)
-        with ns_viewer(config, log, cwd=config.parents[4]) as address:
+        with Server(STOCK_VIEWER, config, log, cwd=config.parents[4]).running() as address:
             stock(browser, address)
 
 

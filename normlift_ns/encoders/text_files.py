@@ -296,10 +296,9 @@ class CachedTextEncoder(LazyTextEncoder):
             ValueError, FileNotFoundError, MemoryError: For the same reasons as `make_encoder` and the encoder's `text`.
         """
         check_prompts(prompts)
-        if len(prompts) > _MANY:  # a vocabulary: a thousand files would take longer than its network
-            paths = {tuple(prompts): self._path("\n".join(prompts))}
-        else:
-            paths = {(prompt,): self._path(prompt) for prompt in prompts}
+        # The thousand files of a vocabulary would take longer than its network.
+        keys = [tuple(prompts)] if len(prompts) > _MANY else [(prompt,) for prompt in prompts]
+        paths = {key: self._path("\n".join(key)) for key in keys}
         blocks = {key: self._load(path, len(key)) for key, path in paths.items()}
         new = [key for key, block in blocks.items() if block is None]
         made = self._encoder.text([prompt for key in new for prompt in key]).numpy() if len(new) > 0 else np.empty(0)
