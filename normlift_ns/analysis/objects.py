@@ -49,22 +49,22 @@ class OrientedBox:
     ([8.0, 4.0, 2.0], [4.0, 2.0, 1.0], [1.0, 0.0, 0.0])
     """
 
-    center: Float64[np.ndarray, " 3"]
-    size: Float64[np.ndarray, " 3"]
+    center: Float64[Tensor, " 3"]
+    size: Float64[Tensor, " 3"]
     """Edge lengths in descending order."""
-    axes: Float64[np.ndarray, "3 3"]
+    axes: Float64[Tensor, "3 3"]
     """Unit vectors along the edges, one per row, which form a right-handed system."""
 
     @property
-    def corners(self) -> Float64[np.ndarray, "8 3"]:
+    def corners(self) -> Float64[Tensor, "8 3"]:
         """The eight corners. Bits a, b, c of index 4 a + 2 b + c select the far end of axes 0, 1 and 2."""
-        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+        signs = torch.tensor(list(product((-0.5, 0.5), repeat=3)), dtype=torch.float64)
         return self.center + (signs * self.size) @ self.axes
 
     def transformed(self, by: SimilarityTransform) -> OrientedBox:
         """Return the transformed box."""
-        center = by.scale * by.rotation @ self.center + by.shift
-        return OrientedBox(center, by.scale * self.size, self.axes @ by.rotation.T)
+        center = torch.from_numpy(by.transform_points(self.center.numpy()[None])[0])
+        return OrientedBox(center, by.scale * self.size, self.axes @ torch.from_numpy(by.rotation).T)
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
@@ -86,7 +86,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     if np.linalg.det(axes) < 0:
         axes[2] *= -1
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)
-    return OrientedBox((low + high) / 2 @ axes, high - low, axes)
+    return OrientedBox(*map(torch.from_numpy, ((low + high) / 2 @ axes, high - low, axes)))
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
@@ -124,8 +124,13 @@ class SceneObject:
     """Number of Gaussians."""
     centroid: list[float]
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the axis-aligned bounding box of the centers."""
+    """Corners "min" and "max" of the axis-aligned bounding box of the centers: lists, in this version; see `bounds`."""
     mean_reliability: float
+
+    @property
+    def bounds(self) -> Float64[Tensor, "2 3"]:
+        """Lowest and highest corner of the axis-aligned bounding box of the centers."""
+        return torch.tensor([self.box["min"], self.box["max"]], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -358,9 +363,9 @@ class SimilarityTransform:
 class Placement:
     """Position and size of an object in one coordinate system."""
 
-    centroid: Float64[np.ndarray, " 3"]
+    centroid: Float64[Tensor, " 3"]
     """Mean of the Gaussian centers, weighted by W_j, the total weight of Gaussian j over all views."""
-    extent: Float64[np.ndarray, " 3"]
+    extent: Float64[Tensor, " 3"]
     """Distance from the 1st to the 99th percentile of the centers along x, y and z."""
     box: OrientedBox
 
@@ -513,7 +518,8 @@ def _inside(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = None) -> Placement:
     low, high = np.quantile(points, BOX_QUANTILES, axis=0)
-    return Placement(np.average(points, axis=0, weights=weight), high - low, box or oriented_box(points))
+    centroid = np.average(points, axis=0, weights=weight)
+    return Placement(torch.from_numpy(centroid), torch.from_numpy(high - low), box or oriented_box(points))
 
 
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -550,9 +556,7 @@ def write_catalogue(
 
 
 def _plain(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    return {
-        key: x.tolist() if isinstance(x, np.ndarray) else list(x) if isinstance(x, tuple) else x for key, x in items
-    }
+    return {key: x.tolist() if isinstance(x, Tensor) else list(x) if isinstance(x, tuple) else x for key, x in items}
 
 
 def csv_columns() -> list[str]:
@@ -580,7 +584,7 @@ def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
     for item in catalog.objects:
         best = [*item.best_views, *[""] * (MAX_BEST_VIEWS - len(item.best_views))]
         places = [(x.centroid, x.extent, x.box.center, x.box.size, *x.box.axes) for x in (item.capture, item.scene)]
-        numbers = np.array(places).ravel().tolist()
+        numbers = [number for place in places for vector in place for number in vector.tolist()]
         names = [csv_text(item.text), *map(csv_text, best)]
         yield [item.id, names[0], item.class_id, item.gaussians, item.reliability, item.views, *names[1:], *numbers]
 
@@ -602,7 +606,7 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
     dtype += [("class_id", "<u4"), ("instance_id", "<u4")]
     corners = np.zeros(8 * len(objects), dtype)
     for item, box, block in zip(objects, boxes, corners.reshape(len(objects), 8)):
-        block["x"], block["y"], block["z"] = box.corners.T
+        block["x"], block["y"], block["z"] = box.corners.T.numpy()
         block["red"], block["green"], block["blue"] = object_color(item.id)
         block["class_id"], block["instance_id"] = item.class_id, item.id
     faces = np.empty(6 * len(objects), [("vertex_indices", "<i4", (4,))])

@@ -48,7 +48,7 @@ class Demo(CheckedOptions):
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""
-    num_gaussians: int = 30_000
+    num_gaussians: int = 36_000
     """Number of Gaussians in the room, at least 2,000. Larger values give finer surfaces and take longer."""
     views: int = 24
     """Number of training views, at least 3. More views take longer."""
@@ -120,9 +120,9 @@ class Demo(CheckedOptions):
         """Lift the features of the networks, search for the object, and return the IoU with the ground truth."""
         CONSOLE.rule("Searching for an object")
         flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
-        flags += ("--refine", "False", "--storage", "evidence")
+        flags += ("--refine", "False", "--recognition", "False", "--storage", "evidence")
         _show("ns-normlift", "--load-config", config, *flags)
-        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, storage="evidence")
+        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, recognition=False, storage="evidence")
         source = SourceOptions(regions="edges", encoder="imagenet")
         run = NormLift(
             config, source=source, lift=lift, timestamp="thing", overwrite=True, check_alignment=False

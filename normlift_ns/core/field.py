@@ -299,7 +299,8 @@ def choose_form(
     Args:
         portion: part of the Gaussians that the lift covers (default: all).
     Returns:
-        Metadata of the chosen form and of all forms for the manifest, and the basis if the form is "low_rank".
+        Metadata of the chosen form and of the compared forms for the manifest, and the basis if the form is "low_rank",
+        which is compared only if it could be chosen.
     Raises:
         ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """
@@ -307,7 +308,8 @@ def choose_form(
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
         raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}, got {storage!r}")
-    basis = smallest_basis(lifted, tolerance, None if portion is None else portion.communicator)
+    communicator = None if portion is None else portion.communicator
+    basis = smallest_basis(lifted, tolerance, communicator) if storage in ("auto", "low_rank") else None
     forms = sizes_and_bounds(lifted, basis, portion)
     if storage == "auto":
         allowed = (name for name, form in forms.items() if form["bound"] <= tolerance)
