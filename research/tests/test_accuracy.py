@@ -15,16 +15,13 @@ from research.accuracy import Bench
 from research.accuracy_report import METHODS, summarize
 from research.batched_votes import parts, voters_of
 from research.candidates import Candidate
-from research.damage import GROUP, LADDER, STEPS, Damage, observe
+from research.damage import LADDER, STEPS, Damage, observe
 from research.documents import read
 from research.features import LENGTHS, mask_features, orthogonal_words
 from research.geometry import Seen, geometry, spread
-from research.pseudo_regions import KINDS, observe_pieces, pieces
 from research.real_features import FOX, NOISE, Regions, real_features
 from research.report import RESULTS, Report
-from research.rule import cells_of, real_cells_of
-from research.second_room import second
-from research.synthetic_scenes import PARTS, World, made_words
+from research.synthetic_scenes import PARTS, made_words
 from research.tests import ROOT, quick
 from research.tests.tiny import CLASSES, WORDS
 from tests.random_scenes import dense, generator
@@ -122,25 +119,6 @@ def test_quick_accuracy_benchmark(tmp_path):
     assert values["reliability.spearman_bins_mean"] > 0.7
 
 
-@pytest.fixture(scope="module")
-def room() -> World:
-    return second(4000, views=10, width=160)
-
-
-def test_a_group_shares_one_mask_and_an_arc_one_wrong_class(room):
-    damages = Damage(noise=0.0), Damage(noise=0.0, grouped=0.4), Damage(noise=0.0, arc=0.4)
-    plain, grouped, arc = (observe(room, made_words(16), damage, 0) for damage in damages)
-    lost = plain.evidence.region_view.bincount() - grouped.evidence.region_view.bincount()
-    struck = lost[lost > 0].tolist()
-    assert len(struck) == 4 and all(GROUP[0] - 1 <= count <= GROUP[1] - 1 for count in struck)
-    shown = (arc.features @ made_words(16).classes.T).argmax(1)[arc.columns[0].clamp(min=0)]
-    wrong = (room.cells.mask >= 0) & (shown != room.cells.mask)
-    assert bool(wrong.any())
-    for c in range(16):  # the same wrong class in all views of two fifths of the azimuth
-        here = wrong & (room.cells.mask == c)
-        assert len(shown[here].unique()) <= 1 and len(room.cells.view[here].unique()) <= 4
-
-
 def test_statistics_have_the_geometry_that_is_documented():
     expected = {"clip": (0.83, 0.64), "isotropic": (0.13, 0.10), "low contrast": (0.90, 0.85), "orthogonal": (0.26, 0)}
     k, masks = 12, torch.arange(12).repeat(40)
@@ -156,20 +134,6 @@ def test_statistics_have_the_geometry_that_is_documented():
         loud = mask_features(words, *given, 2.5, lengths, generator(0))
         mistakes[name] = float(((loud @ words.classes.T).argmax(1) != masks).float().mean())
     assert all(0.25 < share < 0.5 for share in mistakes.values()), mistakes
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_pieces_show_what_is_in_them(room, kind):
-    cut = pieces(room, kind, 64)
-    assert len(cut.labels) == 10 and cut.evidence.num_regions == len(cut.content)
-    assert torch.allclose(cut.content.sum(1), torch.ones(len(cut.content)), atol=1e-5)
-    plain = observe_pieces(cut, made_words(16), Damage(noise=0.0), 0, LENGTHS["clip"])
-    pure = cut.content[:, :16].max(1)
-    share = (plain.features @ made_words(16).classes.T).argmax(1) == pure.indices
-    assert float(share[pure.values > 0.9].float().mean()) == 1
-    lost = observe_pieces(cut, made_words(16), Damage(dropped=0.5, views=3), 0)
-    assert lost.evidence.num_views == len(lost.views) == 3
-    assert len(lost.features) == lost.evidence.num_regions < 0.3 * len(plain.features)
 
 
 def test_votes_are_those_of_refine(world):
@@ -222,11 +186,3 @@ def test_real_features_have_the_cosines_of_the_fox():
     assert spread(lifted[torch.arange(len(home)), thing[: len(home)]]) == pytest.approx(FOX.spread, abs=0.12)
     wrong = cosines.mean(0).view(things, PARTS, things).mean(1).fill_diagonal_(-1).amax(1)
     assert float(wrong.mean()) == pytest.approx(FOX.wrong, abs=0.04) and bool((wrong > 0.02).all())
-
-
-def test_regions_of_real_features_areparts_of_things(room):
-    plain, real = (observe(room, orthogonal_words(16), Damage(noise=0.0), 0, like) for like in (None, FOX))
-    alike = (real.features @ real.features.T > 1 - 1e-5).unique(dim=0)
-    assert 2 * 16 < len(alike) <= 16 * PARTS
-    assert len(plain.features) < real.evidence.num_regions == len(real.features)
-    assert len(beside := real_cells_of("demo")) == 43 and len(set(cells_of("demo")) - set(beside)) == 299
