@@ -29,6 +29,7 @@ from PIL import Image, ImageDraw
 from torch.nn.functional import normalize
 
 import normlift_ns as nl
+from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source
 from normlift_ns.errors import InputError
 from normlift_ns.query.engine import run_query
@@ -73,13 +74,15 @@ def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         yield image, whole | {name: np.array(part) for name, part in parts.items()}
 
 
-def region_rows(run: Any, views: dict[str, Any], images: Iterable[str]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def region_rows(
+    source: FeatureSource, views: dict[str, Any], images: Iterable[str]
+) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """Return the features of every labeled image, and the row of each pixel among them, -1 without one."""
-    source, rows = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu"), {}
+    rows = {}
     for image in images:
         found = source.view(views[image].image, views[image].name)
-        cell = found.labels.long()
-        rows[image] = (found.features, torch.where(cell >= 0, found.region_of_cell[0].long()[cell.clamp(min=0)], -1))
+        cell, region = found.labels.long().cpu(), found.region_of_cell[0].long().cpu()
+        rows[image] = (found.features.cpu(), torch.where(cell >= 0, region[cell.clamp(min=0)], -1))
     return rows
 
 
@@ -121,7 +124,7 @@ def measure(report: Report, capture: str, config: Path) -> None:
     run, masks = nl.open_run(config), dict(label_masks(capture))
     scene, field = run.scene, run.field
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
-    rows = region_rows(run, views, masks)
+    rows = region_rows(make_source(nl.SourceOptions.stored(run.field.manifest["source"]), "cpu"), views, masks)
     vectors = prototypes(rows, masks)
     asked = {name: (name, Query((name,), row[None].numpy(), suggest_threshold=True)) for name, row in vectors.items()}
     for name in vectors:
