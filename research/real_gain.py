@@ -89,7 +89,7 @@ class Form:
         """Name in the results."""
         if self.old:
             return "version 0.2"
-        return NAMES.get(self, f"power {self.power:g}, overlap {self.overlap:g}, gate {self.gate}")
+        return NAMES.get(self, f"power {self.power}, overlap {self.overlap}, gate {self.gate}")
 
 
 LIFT, CONSENSUS, DEFAULT, OLD = Form(power=None, gate=None), Form(gate=None), Form(), Form(gate="fixed", old=True)
