@@ -21,8 +21,12 @@ more than 0.3 points, the default stays. A form that is taken must also hold on 
 mean gain of damaged cells with all views at most 0.3 points below the default's.
 
 Keys: <capture>.<front end>.<views>.<form>: .mean, .worst and .below, over prototypes: gain over the lift alone, in
-points of average precision, the mean, the smallest and the number below 0; .words, the mean gain of words. Also
-<capture>.<front end>.<text>.<images, lift, default>, the average precision itself with all views.
+points of average precision, the mean, the smallest and (not for candidates) the number below 0; .words, the mean gain
+of words. <capture>.<front end>.<text>.<images, lift, default>: the average precision itself with all views.
+
+What came of it: no form reaches +2. Over fox and tabletop the default gains 1.72 points, the consensus without a vote
+1.95, the quantile 0.5 1.84, and all others less. The lead is below 0.3, so the default stays. On the castle, which does
+not choose, the vote costs 2.3 points at level m, and quantiles of 0.2 and 0.5 gain 2.7 and 1.9 points over the default.
 """
 
 from __future__ import annotations
@@ -257,10 +261,13 @@ def observe(collection: EvidenceCollection, place: Capture, least: float) -> Obs
 
 
 def recognition(observed: Observed, front: str, least: float) -> None:
-    """Print how many regions are recognized in left-out views, and the time."""
+    """Print how many regions are recognized in left-out views, and the time, with that of a lift."""
     start = perf_counter()
+    nl.lift(observed.views.evidence, observed.views.features)
+    lifted = perf_counter()
     found = leave_views_out(observed.sampled, observed.chance, observed.views.features, least=least)
-    print(f"{front}: recognition {found}, {perf_counter() - start:.2f} s", flush=True)
+    seconds = lifted - start, perf_counter() - lifted
+    print(f"{front}: lift {seconds[0]:.2f} s, recognition {seconds[1]:.2f} s: {found}", flush=True)
 
 
 def write(path: Path) -> None:
@@ -282,6 +289,8 @@ def write(path: Path) -> None:
         key = f"{key}.{views}.{form}"
         report.add(f"{key}.mean", mean(labels), "points over the lift, prototypes")
         report.add(f"{key}.worst", min(labels), "points over the lift, the worst prototype")
+        if form not in {x.name for x in BASE}:
+            continue
         report.add(f"{key}.below", sum(gain < 0 for gain in labels), f"of {len(labels)} prototypes")
         if len(words) > 0:
             report.add(f"{key}.words", mean(words), "points over the lift, words")
