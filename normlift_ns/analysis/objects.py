@@ -252,7 +252,10 @@ class Instances:
     prompts."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the names of all classes and objects, by id, as plain Python types."""
+        """Return the prompt of each class, and the class, prompt and size of each object, as plain Python types.
+
+        Keys are ids. `none` is the id of Gaussians without a class or an object.
+        """
         sizes = torch.bincount(self.instance_id.long(), minlength=len(self.classes) + 1).tolist()
         return {
             "none": 0,

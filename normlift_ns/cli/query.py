@@ -109,7 +109,7 @@ class NormLiftQuery(CheckedOptions):
     If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
-    objects.json and objects.csv, and the meshes objects.ply and objects_scene.ply of the boxes. docs/objects.md
+    objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes. docs/objects.md
     explains every column."""
     meters_per_unit: float | None = None
     """Length of one capture unit in meters for --objects, > 0. If given, the table of objects is in meters, in the
