@@ -26,7 +26,7 @@ PROMPTS = ("banana", ", wine bottle")
 SIZE, WIDTH = (1200, 750), 800
 """Size of the page, and width of the picture."""
 POINTER = """
-const pointer = document.createElement("div");
+const pointer = globalThis.pointer = document.createElement("div");
 const arrow = "M3 2v19l5-5 4 9 4-2-4-8h7z";
 pointer.innerHTML = `<svg width="26" height="26"><path d="${arrow}" fill="white" stroke="black"/></svg>`;
 pointer.style.cssText = "position: fixed; z-index: 9999; pointer-events: none; left: 600px; top: 420px";
