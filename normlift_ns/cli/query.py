@@ -405,8 +405,10 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-_HELP = """Type prompts, separated by commas; double quotes keep a comma: "salt, pepper".
-help: this text. exit, quit or Ctrl-D: end. To ask for one of these words, write it in double quotes."""
+_HELP = (
+    'Type prompts, separated by commas; double quotes keep a comma: "salt, pepper".',
+    "help: this text. exit, quit or Ctrl-D: end. To ask for one of these words, write it in double quotes.",
+)
 
 
 def run_repl(
@@ -442,7 +444,8 @@ def run_repl(
         if text in ("exit", "quit"):
             return
         if text in ("help", "?"):
-            common.info(_HELP)
+            for line in _HELP:
+                common.info(line)
             continue
         prompts = split_prompts(text)
         if len(prompts) == 0:
