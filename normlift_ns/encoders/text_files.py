@@ -52,7 +52,7 @@ class LazyTextEncoder(TextEncoder, Protocol):
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
+        import torch  # noqa: PLC0415 (queries do not need torch)
 
         return torch.from_numpy(self.rows(prompts))
 
@@ -66,7 +66,7 @@ def check_prompts(prompts: Sequence[str]) -> None:
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise InputError('no prompt given; name at least one object to search for, for example --text "orange"')
+        raise InputError('no prompt is given; name at least one object to search for, for example --text "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
             raise InputError(f"a prompt must be a string of valid characters, got {prompt!r:.60}")

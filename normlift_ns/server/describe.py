@@ -39,7 +39,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     """Return the mask of the visible Gaussians whose centers lie in a region of a view.
 
     Raises:
-        ValueError: the camera is not valid, or the region contains no visible Gaussian.
+        ValueError: The camera is not valid, or the region contains no visible Gaussian.
     """
     camera, scene = value.camera.camera(), served.run.scene
     pixels, inside = project(scene.gaussians.means, camera)
@@ -61,8 +61,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     """Return the content of the message `state`, and the listed objects.
 
     Args:
-        rows: indices of the drawn Gaussians in the scene.
-        details: include objects and histograms, which takes longer.
+        rows: Indices of the drawn Gaussians in the scene.
+        details: Include objects and histograms, which takes longer.
     """
     selection, answer, query = state.selection, state.answer, state.query
     content: dict[str, Any] = {
@@ -152,10 +152,10 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the images with the largest weight and the largest disagreement, as the message `explanation`.
+    """Return the content of the message `explanation`: the images with the largest weight and disagreement.
 
     Raises:
-        ValueError: nothing is selected, or the votes of the images are no longer in the cache.
+        ValueError: Nothing is selected, or the votes of the images are no longer in the cache.
     """
     with served.reading:
         votes = served.run.votes
