@@ -416,8 +416,10 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-_HELP = """Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".
-help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes."""
+_HELP = (
+    'Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".',
+    "help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes.",
+)
 
 
 def run_repl(
@@ -453,7 +455,8 @@ def run_repl(
         if text in ("exit", "quit"):
             return
         if text in ("help", "?"):
-            common.info(_HELP)
+            for line in _HELP:
+                common.info(line)
             continue
         prompts = split_prompts(text)
         if len(prompts) == 0:
