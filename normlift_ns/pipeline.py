@@ -79,7 +79,6 @@ def lift_scene(
     encoder: Mapping[str, Any],
     export: FeatureExport | None = None,
     report: ProgressCallback = lambda stage, done, total: None,
-    check: Callable[[], None] = lambda: None,
 ) -> LiftResult:
     """Lift 2D features onto the Gaussians of a trained scene.
 
@@ -89,16 +88,33 @@ def lift_scene(
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
         export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
-        check: function that raises if the scene must not be lifted. It runs while kernels are compiled.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
     """
-    stages, facts = StageTimer(report), {}
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
-    options, means = collection.options, collection.gaussians.means
-    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
-    check()
+    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    return lift_collection(collection, wait_for_kernels, device=device, encoder=encoder, report=report)
+
+
+def lift_collection(
+    collection: EvidenceCollection,
+    wait_for_kernels: Callable[[], None],
+    *,
+    device: str,
+    encoder: Mapping[str, Any],
+    report: ProgressCallback,
+) -> LiftResult:
+    """Run the steps of a planned lift.
+
+    Args:
+        wait_for_kernels: function from `start_kernel_warm_up`.
+        device, encoder, report: as in `lift_scene`.
+    Raises:
+        ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
+    """
+    stages, facts = StageTimer(report), {}
+    options, means, source = collection.options, collection.gaussians.means, collection.source
     views = collection.collect(stages, wait_for_kernels)
     table = views.features
     if options.consensus:
