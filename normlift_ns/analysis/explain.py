@@ -371,6 +371,8 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features
+        if not any((self.cache / "evidence").glob("*")):  # do not compute regions first, which takes minutes
+            raise self._no_evidence()
         blocks = (self._observe(chunk)[0] for chunk in evidence_collection.chunk_views(range(len(self.names))))
         parts = (evidence_collection.ViewObservations.of_block(block, self._cached_evidence(block)) for block in blocks)
         evidence, features, level = evidence_collection.ViewObservations.merge(parts)
@@ -393,11 +395,14 @@ class RecordedVotes:
             self.scene.gaussians, block, self.cache / "evidence", config
         )
         if evidence is None:
-            raise InputError(
-                f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
-                f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
-            )
+            raise self._no_evidence()
         return evidence
+
+    def _no_evidence(self) -> InputError:
+        return InputError(
+            f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
+            f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
+        )
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
         """Return labels, regions and features of some lifted images, and the images at the resolution of the lift."""

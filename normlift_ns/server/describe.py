@@ -157,7 +157,7 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
     Raises:
         ValueError: Nothing is selected, or the votes of the images are no longer in the cache.
     """
-    with served.reading:
+    with served.analyzing:
         votes = served.run.votes
         why = votes.explain(state.selection.cpu(), refined=state.refined)
         groups = {"support": why.views[:_MAX_IMAGES], "disagreement": why.most_different[:_MAX_IMAGES]}

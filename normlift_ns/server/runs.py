@@ -94,7 +94,9 @@ class ServedRun:
     run: LiftedRun
     max_gaussians: int
     reading: threading.Lock = field(default_factory=threading.Lock)
-    """Lock for the text encoder and the votes, so that no two threads load them."""
+    """Lock for the text encoder, so that no two threads load it."""
+    analyzing: threading.Lock = field(default_factory=threading.Lock)
+    """Lock for votes, floaters and the inventory, which take seconds, so that no two threads compute them."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
     _results: OrderedDict[bytes, tuple[Any, int]] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
@@ -200,7 +202,7 @@ class ServedRun:
     @cached_property
     def floaters(self) -> Bool[torch.Tensor, " n"]:
         """Mask of the likely floaters, which are Gaussians that are not part of a surface."""
-        with self.reading:
+        with self.analyzing:
             return find_floaters(self.run.scene.gaussians, self.run.field.scalars).mask
 
     def describe(self, *, read_only: bool) -> dict[str, Any]:
