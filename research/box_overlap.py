@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from normlift_ns.analysis.objects import OrientedBox
@@ -21,6 +20,8 @@ def intersection_volume(first: OrientedBox, second: OrientedBox) -> float:
     """Of two convex polytopes: the largest ball inside of both (a linear programme) gives a point inside, the faces
     around it the corners (qhull), and these the volume. 0 where they have no inside in common.
     """
+    from scipy.optimize import linprog  # noqa: PLC0415 (slow)
+
     faces = np.concatenate([half_spaces(first), half_spaces(second)])
     scale = float(max(first.size.max(), second.size.max()))
     if scale == 0:
