@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from normlift_ns.data.cameras import read_camera_file
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.open_splat import _read, open_splat
+from normlift_ns.data.quantization import normalize_quats
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.errors import InputError
@@ -112,6 +113,21 @@ def test_spz_files_of_phones_are_read_exactly(degree: int, tmp_path: Path) -> No
     assert np.allclose(found.quats.numpy(), quats, atol=1e-6)
     assert np.allclose(found.features_dc.numpy(), (colors / 255 - 0.5) / 0.15, atol=1e-6)
     assert np.array_equal(found.features_rest.numpy(), (rest / 128 - 1).astype(np.float32))
+
+
+def test_splat_files_of_web_viewers_are_read_exactly(tmp_path: Path) -> None:
+    """Sorted by size, as antimatter15's converter, OpenSplat and Polycam's viewer expect it."""
+    g, n = np.random.default_rng(0), 60
+    rows = np.empty(n, [("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+    rows["means"], rows["scales"] = g.normal(size=(n, 3)), np.exp(g.normal(size=(n, 3)) - 4)
+    rows["colors"], rows["quats"] = g.integers(1, 255, (n, 4)), g.integers(0, 256, (n, 4))
+    (tmp_path / "scene.splat").write_bytes(rows.tobytes())
+    found = _read(tmp_path / "scene.splat").splat
+    assert np.array_equal(found.means.numpy(), rows["means"])
+    assert np.allclose(found.scales.exp().numpy(), rows["scales"], rtol=1e-6)
+    assert np.allclose(found.opacities[:, 0].double().sigmoid().numpy(), rows["colors"][:, 3] / 255, rtol=1e-6)
+    quats = normalize_quats(torch.from_numpy(rows["quats"].astype(np.float64)) / 128 - 1)
+    assert np.allclose(normalize_quats(found.quats.double()), quats, atol=1e-6)
 
 
 NAMES = ("DSC_0001.JPG", "DSC 0002.JPG", "DSC_0003.JPG")
