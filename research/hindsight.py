@@ -25,6 +25,8 @@ from normlift_ns.query.engine import suggest_threshold
 from research.cut import Asked, ask, best_cut
 from research.report import Report
 
+STEP = 5
+"""One pixel in this many counts."""
 SHARES = np.linspace(0, 1, 101)
 
 
@@ -58,8 +60,8 @@ FAMILIES: dict[str, Family] = {
 
 def measure(report: Report, capture: str, config: Path) -> None:
     """Add the figures of one lifted capture."""
-    asked = {key: Prototype(x) for key, x in ask(capture, config).items() if not key.startswith("word ")}
-    contrast = {key: Prototype(x) for key, x in ask(capture, config, "contrast").items() if key in asked}
+    asked = {key: Prototype(x) for key, x in ask(capture, config, step=STEP).items()}
+    contrast = {key: Prototype(x) for key, x in ask(capture, config, "contrast", step=STEP).items()}
     shares = {"default": {key: p.reached(p.threshold) for key, p in asked.items()}}
     numbers: dict[str, Any] = {}
     for family, (rule, choices) in FAMILIES.items():

@@ -50,8 +50,7 @@ def main() -> None:
         with TemporaryDirectory() as folder:
             lift = nl.LiftOptions(storage="evidence", refine=False)
             run = nl.lift_run(CONFIG, source=INPUTS[name], lift=lift, output_dir=Path(folder), device="cpu")
-            (evidence, features), norm = run.votes.table, run.field.scalars.norm
-            spread = 1 - float(norm[norm > 0].median())
+            (evidence, features), spread = run.votes.table, run.votes.disagreement
             with stopwatch() as watch:
                 found = find_inventory(evidence, features, run.scene.gaussians.means, spread)
         count = int(found.max())

@@ -30,7 +30,7 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import lift
+from normlift_ns.core.lift import lift, norm_of_reliability
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.refine import CHANGED_COSINE
 from normlift_ns.core.scene import Scene
@@ -381,6 +381,14 @@ class RecordedVotes:
             least = self._option("consensus_min_agreement", float, CHANCE_AGREEMENT)
             features = consensus(evidence, features, level=level, power=power, sample=sample, least=least).features
         return evidence, features
+
+    @property
+    def disagreement(self) -> float:
+        """Usual disagreement of the views about a Gaussian before the consensus, 1 - median ||f_j||."""
+        norm = self.field.scalars.norm
+        if self._option("reliability", str, "paper") == "paper":
+            norm = norm_of_reliability(self.field.scalars, self._option("reliability_beta", float, 1.0))
+        return 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:
         config = evidence_collection.RasterConfig(
