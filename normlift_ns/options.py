@@ -505,8 +505,8 @@ class SourceOptions:
     edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto depends on the encoder. For
     a neural network on a GPU, auto selects the first of sam, edges and patches that this machine and the network
-    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that encode crops. In all other cases,
-    auto selects superpixel. Any other name: a mask source from an installed plugin."""
+    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that encode crops. In all
+    other cases, auto selects superpixel. Any other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -580,10 +580,10 @@ class SplatOptions:
     masks: Path | None = None
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | Literal["auto"] | None = "auto"
-    """Transform from the world of the cameras to that of the splat. auto: search for a rotation,
-    normalization or scaling that common tools apply, and use it only if the splat does not fit its images without it. A path: a file with
-    a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file.
-    None: no transform, without a search."""
+    """Transform from the world of the cameras to that of the splat. auto: search for a rotation, normalization or
+    scaling that common tools apply, and use it only if the splat does not fit its images without it. A path: a file
+    with a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY
+    file. None: no transform, without a search."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
     COLMAP project. For a PLY file, --world-transform auto tries this transform among others."""
