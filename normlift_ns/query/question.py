@@ -66,7 +66,7 @@ def as_numpy(array: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """Query with Q prompts, their embeddings and the settings that select Gaussians. Embeddings may be tensors."""
+    """Query with Q prompts, their embeddings and the settings that select Gaussians. Tensors become NumPy arrays."""
 
     texts: tuple[str, ...]
     embeddings: Float[np.ndarray, "q d"]
@@ -114,19 +114,19 @@ def make_query(
     """Encode prompts as a query for a field.
 
     Args:
-        field: field to query.
-        encode: function from texts to one embedding each, of an encoder that fits the field.
-        texts: prompts.
-        negatives: negative prompts (default: those of the encoder, see `default_rule`).
-        relevancy: relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
+        field: Field to query.
+        encode: Function that returns one embedding per text, from an encoder that fits the field.
+        texts: Prompts.
+        negatives: Negative prompts (default: those of the encoder, see `default_rule`).
+        relevancy: Relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
-        threshold: relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
+        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
             None is the threshold of the encoder for its own rule, and otherwise that of `RELEVANCY_RULES`. For the rule
             cosine with an encoder that has a different rule, None is "auto", because no threshold suits all encoders.
-        min_reliability: minimum R of a selected Gaussian, in 0..1.
-        refined: use refined features.
+        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        refined: Use refined features.
     Raises:
-        ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
+        ValueError: An argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
     _check_rules(negatives, relevancy, threshold)
     min_reliability = check_number("min_reliability", min_reliability)
@@ -182,7 +182,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
             f"negatives must be a list of strings, got the single string {negatives!r}. Write [{negatives!r}]."
         )
     if relevancy not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"relevancy must be auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
+        raise InputError(f"relevancy must be one of auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
     if isinstance(threshold, str) and threshold != "auto":
         raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
@@ -217,9 +217,9 @@ def save_query(folder: Path, question: Query) -> Path:
     """Write queries.safetensors to the folder of a field, replacing an existing file, and return its path.
 
     Raises:
-        ValueError: the query is not valid, or does not match the field.
-        FileNotFoundError: the folder no longer exists.
-        OSError: the file cannot be written.
+        ValueError: The query is not valid, or does not match the field.
+        FileNotFoundError: The folder no longer exists.
+        OSError: The file cannot be written.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -247,7 +247,7 @@ def load_query(folder: Path) -> Query | None:
     """Load the query stored in the folder of a field; return None if there is no stored query.
 
     Raises:
-        ValueError: the file is damaged, or does not contain a query.
+        ValueError: The file is damaged, or does not contain a query.
     """
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
@@ -264,10 +264,10 @@ def load_query(folder: Path) -> Query | None:
 
 
 def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
-    """Return the query with this metadata and these embeddings.
+    """Check the metadata and the arrays of embeddings, and return the query that they contain.
 
     Raises:
-        ValueError: the metadata or an embedding is not valid, they are inconsistent, or they do not match the field in
+        ValueError: The metadata or an embedding is not valid, both are inconsistent, or they do not match the field in
             the folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)

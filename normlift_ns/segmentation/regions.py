@@ -87,7 +87,7 @@ _WORKERS = min(8, os.cpu_count() or 1)
 
 
 class RegionDefaults:
-    """Defaults of `Regions` for mask sources with one level and no files that segment one image at a time."""
+    """Defaults of `Regions` for mask sources that have one level and no files, and segment one image at a time."""
 
     at_once = 1
 
@@ -139,7 +139,7 @@ class Grid(RegionDefaults):
 
 @dataclass(frozen=True)
 class LabelFiles(RegionDefaults):
-    """Label maps from a folder, one per image and of the size of the image.
+    """Label maps from a folder, one per image, each of the size of its image.
 
     A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
     integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
@@ -173,7 +173,7 @@ class LabelFiles(RegionDefaults):
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
+                f"the folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
                 "PNG or NPY file per image"
             )
 
@@ -265,7 +265,7 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{what} is a grayscale PNG with {bits} bits, whose values image readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits per pixel, whose values image readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
@@ -274,7 +274,7 @@ class LabelFiles(RegionDefaults):
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(f"{what} holds {maps.dtype}, expected an integer type; save it with .astype(numpy.int32)")
+            raise InputError(f"{what} has type {maps.dtype}, expected an integer; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps

@@ -118,7 +118,7 @@ def build_query(
     Returns:
         The rows, with an error for each click if the rule is not cosine, and their query.
     Raises:
-        ValueError: no row has a vector, or as in `make_query`.
+        ValueError: no row has a vector, or an argument is not valid (see `make_query`).
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]

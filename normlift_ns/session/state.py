@@ -164,7 +164,7 @@ class History(Generic[T]):
         """Append a new state, make it current, and drop undone states; do nothing if the state is already current.
 
         Args:
-            key: key to merge successive steps, such as those of a slider drag; None to keep them separate.
+            key: Key to merge successive steps, such as those of a slider drag; None to keep them separate.
         """
         if state is self.now:
             return self
