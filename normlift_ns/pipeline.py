@@ -31,7 +31,7 @@ from normlift_ns.core.consensus import (
     with_original_reliability,
 )
 from normlift_ns.core.evidence import Entries, Evidence
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.independence import independent_views, pair_reliability
@@ -39,7 +39,7 @@ from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift, norm_of_reliability
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems

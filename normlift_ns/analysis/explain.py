@@ -29,10 +29,9 @@ from normlift_ns import evidence_collection
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.lift import lift, norm_of_reliability
 from normlift_ns.core.lowrank import StoredEvidence
-from normlift_ns.core.refine import CHANGED_COSINE
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
