@@ -35,10 +35,9 @@ from normlift_ns.data.open_scene import (
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
 from normlift_ns.io.memory import refuse_small_memory
 from normlift_ns.io.run_dir import (

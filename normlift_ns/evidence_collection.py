@@ -24,9 +24,14 @@ from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.data.images import filled_function, label_undistortion
-from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
+from normlift_ns.encoders.base import (
+    FeatureSource,
+    PrecomputedFeatures,
+    RegionFeatures,
+    StoredMaps,
+    iterate_view_features,
+)
 from normlift_ns.encoders.cache import CachedRegions, cached
-from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_metadata
 from normlift_ns.options import BackendName, LiftOptions, RasterizeMode
@@ -35,6 +40,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
 
 if TYPE_CHECKING:
+    from normlift_ns.encoders.langsplat import FeatureExport
     from normlift_ns.progress import StageTimer
 
 _MAX_CHUNK = 16
@@ -76,14 +82,6 @@ class RasterConfig:
     def key(self) -> list[Any]:
         """Part of every cache key, as JSON types."""
         return [self.rasterize_mode, self.weight_power, str(self.dtype), asdict(self.settings), self.backend]
-
-
-class FeatureExport(NamedTuple):
-    """Export of 2D features to LangSplat files, in addition to the lift."""
-
-    folder: Path
-    overwrite: bool
-    """Replace existing files whose content differs."""
 
 
 class ViewObservations(NamedTuple):
@@ -155,7 +153,7 @@ class EvidenceCollection:
 
             def done(view: View) -> None:
                 if self.export is not None:
-                    write_langsplat(source, view.image, view.name, *self.export)
+                    self.export.write(source, view.image, view.name)
                 step()
 
             divisor = self.options.lift_downscale
@@ -397,7 +395,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
     maps = maps.inner if isinstance(maps, CachedRegions) else maps
-    if original_size is None or not isinstance(maps, LabelFiles | LangSplat) or getattr(maps, "undistort", None):
+    if original_size is None or not isinstance(maps, StoredMaps) or getattr(maps, "undistort", None):
         return
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]

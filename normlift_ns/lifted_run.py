@@ -12,14 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
 from normlift_ns import exports
 from normlift_ns.analysis.explain import RecordedVotes, Why
-from normlift_ns.analysis.inventory import Inventory, as_instances, best_words, find_inventory, mean_directions
+from normlift_ns.analysis.inventory import Inventory, Vocabulary, list_inventory
 from normlift_ns.analysis.objects import (
     Catalogue,
     Floaters,
@@ -37,10 +37,8 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
-from normlift_ns.encoders.null_words import null_words
-from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder, check_template
-from normlift_ns.errors import InputError, MissingImageError, truncate_text
+from normlift_ns.errors import InputError, MissingImageError
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -55,7 +53,6 @@ from normlift_ns.options import (
     RelevancyRule,
     check_number,
     check_path,
-    check_prompt_list,
     renamed,
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
@@ -64,10 +61,6 @@ from normlift_ns.query.text_encoder import encoder_name, own_words, text_encoder
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
-
-_MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
-"""Settings of `inventory`: the minimum number of words for its test against chance, the expected number of wrong names
-that this test allows, and the approximate number of Gaussians in its sample of the scene."""
 
 
 @check_arguments
@@ -445,49 +438,10 @@ class LiftedRun:
         """
         if meters_per_unit is not None:
             check_number("meters_per_unit", meters_per_unit)
-        words = own_words(self.field) if vocabulary is None else tuple(dict.fromkeys(vocabulary))
-        check_prompt_list("vocabulary", words)
-        kind = find_encoder_kind(encoder_name(self.field))
-        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
-        if len(unknown) > 0:
-            raise InputError(
-                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
-                f"remove them: {truncate_text(', '.join(unknown), 400)}"
-            )
-        (evidence, features), norm = self.votes.table, self.field.scalars.norm
-        spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
-        means = self.scene.gaussians.means
-        instance_id = find_inventory(evidence, features, means, spread)
-        directions = mean_directions(evidence, features, instance_id)
-        names = self._names(instance_id, directions, words)
-        instances = as_instances(instance_id, names)
-        catalog = make_catalogue(
-            self.scene, self.field, instances, self.to_capture, meters_per_unit=meters_per_unit, device=self.device
-        )
-        return Inventory(instance_id, catalog)
-
-    def _names(
-        self, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], words: tuple[str, ...]
-    ) -> tuple[str, ...]:
-        """Return a name for every object of an inventory."""
-        names = [f"object {number}" for number in range(1, len(directions) + 1)]
-        if len(words) == 0 or len(names) == 0:
-            return tuple(names)
-        kind = find_encoder_kind(encoder_name(self.field))
-        others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
-        compared = tuple(dict.fromkeys((*words, *others)))
-        absolute = len(compared) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
-        sample = self.field.directions(torch.arange(0, len(self.field), max(1, len(self.field) // _SAMPLE)))
-        vectors, limit = torch.from_numpy(self.texts.rows(compared)), float("inf") if absolute else _FALSE_NAMES
-        best = best_words(directions, sample, vectors, by_chance=limit, count=len(words))
-        chosen = {number: words[index] for number, index in enumerate(best, 1) if index is not None}
-        if len(chosen) > 0:
-            answer = self.ask(*dict.fromkeys(chosen.values()))
-            for number, word in chosen.items():
-                selected = answer[word].mask[instance_id == number]
-                if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
-                    names[number - 1] = word
-        return tuple(names)
+        words = own_words(self.field) if vocabulary is None else vocabulary
+        encode = lambda texts: self.texts.rows(texts)  # noqa: E731, PLW0108 (loads the encoder only if needed)
+        known = Vocabulary.of(words, encoder_name(self.field), encode, lambda texts: self.ask(*texts))
+        return list_inventory(self.votes, known, self.to_capture, meters_per_unit=meters_per_unit, device=self.device)
 
     @property
     def to_capture(self) -> SimilarityTransform:

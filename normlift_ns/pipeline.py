@@ -39,19 +39,13 @@ from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
-from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import (
-    EvidenceCollection,
-    FeatureExport,
-    RasterConfig,
-    ViewObservations,
-    sample_evenly,
-)
+from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, ViewObservations, sample_evenly
 from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
@@ -59,8 +53,6 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_back
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
-CHANGED_COSINE = 0.98
-"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
 _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of them."""
 _COMPARED = 20_000

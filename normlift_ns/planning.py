@@ -37,8 +37,7 @@ from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
-from normlift_ns.encoders.package_files import EDGES, IMAGENET
-from normlift_ns.encoders.weights import find_local_sam
+from normlift_ns.encoders.weights import EDGES, IMAGENET, find_local_sam
 from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import FIELD_FOLDER, MANIFEST_FILE, cache_folder, read_manifest, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions

@@ -59,7 +59,7 @@ FOREIGN = {
     "analysis": BASE | {"trimesh", "PIL", "plyfile"},
     "query": BASE | {"msgspec"},
     "exports": BASE | {"plyfile"},
-    "rendering": TENSORS | {"numpy", "matplotlib", "PIL"},
+    "rendering": TENSORS | {"numpy", "matplotlib", "PIL", "cv2"},
     "session": BASE,
     "lifted_run": TENSORS | {"numpy", "PIL"},
     "planning": TENSORS,

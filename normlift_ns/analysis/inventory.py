@@ -18,21 +18,25 @@ images.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.analysis.objects import Catalogue, Instances
+from normlift_ns.analysis.explain import RecordedVotes
+from normlift_ns.analysis.objects import Catalogue, Instances, SimilarityTransform, make_catalogue
 from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.errors import InputError
-from normlift_ns.options import OBJECT_MIN_GAUSSIANS
+from normlift_ns.encoders.null_words import null_words
+from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
+from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.options import OBJECT_MIN_GAUSSIANS, check_prompt_list
 
 MAX_OBJECTS = 20
 """Maximum number of objects in an inventory."""
@@ -47,6 +51,12 @@ _SPREADS = 3.0
 """Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
 """Minimum affinities of the successive rounds of joining, from 0.95 to 0.5."""
+_MANY_WORDS = 100
+"""Minimum number of words for the test of names against chance."""
+_FALSE_NAMES = 0.25
+"""Expected number of wrong names that the test allows."""
+_SAMPLE = 5000
+"""Approximate number of Gaussians in the sample of the scene with which names are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +83,42 @@ class Inventory:
         return self.instance_id == number
 
 
+@dataclass(frozen=True)
+class Vocabulary:
+    """Candidate names of objects, with the text encoder and the queries of a run."""
+
+    words: tuple[str, ...]
+    kind: EncoderKind | None
+    """Encoder of the run; None if it is unknown."""
+    encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]]
+    """Function from words to unit vectors."""
+    ask: Callable[[Sequence[str]], Any]
+    """Function from words to the `Answer` of a query."""
+
+    @classmethod
+    def of(
+        cls,
+        words: Sequence[str],
+        encoder: str | None,
+        encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]],
+        ask: Callable[[Sequence[str]], Any],
+    ) -> Vocabulary:
+        """Return a vocabulary without duplicates for the encoder with this name.
+
+        Raises:
+            ValueError: a word is empty, or the encoder cannot encode it.
+        """
+        words, kind = tuple(dict.fromkeys(words)), find_encoder_kind(encoder)
+        check_prompt_list("vocabulary", words)
+        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
+        if len(unknown) > 0:
+            raise InputError(
+                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
+                f"remove them: {truncate_text(', '.join(unknown), 400)}"
+            )
+        return cls(words, kind, encode, ask)
+
+
 class ViewRegions(NamedTuple):
     """M Gaussians that an image shows, and the region of each, as a column of the evidence."""
 
@@ -96,6 +142,33 @@ class _Borders(NamedTuple):
         key, index = np.unique(low * len(part) + high, return_inverse=True)
         sums = (np.bincount(index, x[keep], len(key)) for x in (self.total, self.observed))
         return _Borders(key // len(part), key % len(part), *sums)
+
+
+def list_inventory(
+    votes: RecordedVotes,
+    vocabulary: Vocabulary,
+    transform: SimilarityTransform,
+    *,
+    meters_per_unit: float | None = None,
+    device: str = "cpu",
+) -> Inventory:
+    """Find the main objects of a scene, name them, and list them.
+
+    Args:
+        votes: evidence of the lift, with its scene and its field.
+        vocabulary: candidate names. An object keeps its number as its name if none of them fits.
+        transform, meters_per_unit, device: as in `make_catalogue`.
+    Raises:
+        ValueError, FileNotFoundError: as in `RecordedVotes.table` and `make_catalogue`.
+    """
+    scene, field = votes.scene, votes.field
+    (evidence, features), norm = votes.table, field.scalars.norm
+    spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
+    instance_id = find_inventory(evidence, features, scene.gaussians.means, spread)
+    names = name_objects(field, instance_id, mean_directions(evidence, features, instance_id), vocabulary)
+    instances = as_instances(instance_id, names)
+    catalog = make_catalogue(scene, field, instances, transform, meters_per_unit=meters_per_unit, device=device)
+    return Inventory(instance_id, catalog)
 
 
 def find_inventory(
@@ -234,6 +307,42 @@ def mean_directions(
     weight = torch.zeros((count + 1) * evidence.num_regions, dtype=torch.float64, device=key.device)
     weight.index_add_(0, key, rows.weight.double())
     return torch.nn.functional.normalize(weight.view(count + 1, -1)[1:] @ features.to(weight), dim=1)
+
+
+def name_objects(
+    field: SemanticField, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
+) -> tuple[str, ...]:
+    """Return the name of every object, which is a word of the vocabulary or a number such as "object 3".
+
+    The word must be the best name, have the verdict "found", and select more than half of the object.
+
+    Args:
+        directions: unit directions of the objects, from `mean_directions`.
+    """
+    names = [f"object {number}" for number in range(1, len(directions) + 1)]
+    if len(vocabulary.words) == 0 or len(names) == 0:
+        return tuple(names)
+    chosen = _words_of_objects(field, directions, vocabulary)
+    answer = vocabulary.ask(tuple(dict.fromkeys(chosen.values()))) if len(chosen) > 0 else {}
+    for number, word in chosen.items():
+        selected = torch.as_tensor(answer[word].mask)[instance_id == number]
+        if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
+            names[number - 1] = word
+    return tuple(names)
+
+
+def _words_of_objects(
+    field: SemanticField, directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
+) -> dict[int, str]:
+    """Return the best name of each object for which a word stands out, by the number of the object."""
+    words, kind = vocabulary.words, vocabulary.kind
+    others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
+    compared = tuple(dict.fromkeys((*words, *others)))
+    absolute = len(compared) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
+    sample = field.directions(torch.arange(0, len(field), max(1, len(field) // _SAMPLE)))
+    vectors, limit = torch.from_numpy(vocabulary.encode(compared)), float("inf") if absolute else _FALSE_NAMES
+    best = best_words(directions, sample, vectors, by_chance=limit, count=len(words))
+    return {number: words[index] for number, index in enumerate(best, 1) if index is not None}
 
 
 def best_words(

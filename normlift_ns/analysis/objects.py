@@ -393,6 +393,8 @@ class Catalogue:
     """Number of selected Gaussians in components that are too small to be listed."""
     meters_per_unit: float | None
     """Meters per unit of the capture; None if unknown. If known, `capture` positions are in meters."""
+    view_shares: Float[Tensor, "m v"]
+    """Fraction of each of V training images that each of M objects covers, on the CPU; see `view_shares`."""
 
     @property
     def unit(self) -> str:
@@ -444,13 +446,13 @@ def make_catalogue(
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
     weight, reliability = (x.double().cpu().numpy() for x in (field.scalars.weight + 1e-12, field.scalars.reliability))
     count, names, cameras = len(instances.classes), scene.train.names, scene.train.cameras
-    shares = view_shares(scene, instances, RasterSettings.recorded(field.manifest), device).cpu().numpy()
+    shares = view_shares(scene, instances, RasterSettings.recorded(field.manifest), device).cpu()
     objects = []
     for number in range(1, count + 1):
         rows = np.flatnonzero(ids == number)
         if len(rows) == 0:
             continue
-        share = shares[number - 1]
+        share = shares[number - 1].numpy()
         shows = (share > 0) & (share >= MIN_VIEW_SHARE * share.max(initial=0))
         inside = _inside(means[rows], cameras)
         whole = shows & (inside >= MIN_WHOLE_FRACTION * inside[shows].max(initial=0))
@@ -472,7 +474,7 @@ def make_catalogue(
             )
         )
     small = int(((instances.class_id > 0) & (instances.instance_id == 0)).sum())
-    return Catalogue(tuple(objects), small, meters_per_unit)
+    return Catalogue(tuple(objects), small, meters_per_unit, shares)
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:

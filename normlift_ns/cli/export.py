@@ -111,7 +111,7 @@ class NormLiftExport(options.CheckedOptions):
         """Return the job with the Gaussians to export and the answer to the prompts."""
         from normlift_ns import exports  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
-        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415
+        from normlift_ns.query.question import split_texts  # noqa: PLC0415
 
         prompts = split_texts("--text", self.text)
         answer = run.ask(*prompts, **self.ask.rules()) if len(prompts) > 0 else run.ask_stored()

@@ -153,7 +153,7 @@ class NormLift(CheckedOptions):
         keep_freed_memory()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
-        from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
+        from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
         message_times: list[float] = []

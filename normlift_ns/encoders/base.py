@@ -19,7 +19,7 @@ from functools import cached_property
 from hashlib import blake2b
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -126,6 +126,20 @@ class FeatureSource(Protocol):
         Raises:
             ValueError: If `prompts` or a prompt is empty, or the encoder cannot embed a prompt.
         """
+        ...
+
+
+@runtime_checkable
+class StoredMaps(Protocol):
+    """Label maps or features that a program wrote to files, at a size that may differ from that of the images."""
+
+    @property
+    def resample(self) -> bool:
+        """True to accept maps of any size."""
+        ...
+
+    def size(self, name: str) -> tuple[Path, int, int]:
+        """Return the path, width and height of the map of an image."""
         ...
 
 

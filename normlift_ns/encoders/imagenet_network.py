@@ -28,8 +28,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import resize_image
 from normlift_ns.encoders.imagenet import find_classes
-from normlift_ns.encoders.package_files import IMAGENET
 from normlift_ns.encoders.text_files import check_prompts
+from normlift_ns.encoders.weights import IMAGENET
 from normlift_ns.segmentation.regions import resample_nearest
 
 WIDTH, CLASSES = 1280, 1000

@@ -361,6 +361,18 @@ def _stem(name: str) -> str:
     return PurePosixPath(name).name.split(".")[0]
 
 
+class FeatureExport(NamedTuple):
+    """Export of 2D features to LangSplat files, in addition to the lift."""
+
+    folder: Path
+    overwrite: bool
+    """Replace existing files whose content differs."""
+
+    def write(self, source: FeatureSource, image: UInt8[Tensor, "h w 3"], name: str) -> None:
+        """Write the files of an image; see `write_langsplat`."""
+        write_langsplat(source, image, name, self.folder, self.overwrite)
+
+
 def write_langsplat(
     source: FeatureSource, image: UInt8[Tensor, "h w 3"], name: str, folder: Path, overwrite: bool
 ) -> None:

@@ -28,7 +28,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
 
-from normlift_ns.encoders.package_files import PackageFile
+from normlift_ns.encoders.weights import PackageFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.io.guard import read_file

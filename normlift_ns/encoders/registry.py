@@ -23,8 +23,7 @@ from normlift_ns.encoders.huggingface import (
     find_local_model,
     resolve_model_name,
 )
-from normlift_ns.encoders.package_files import IMAGENET
-from normlift_ns.encoders.weights import CONNECT_ONCE, check_hub_access, is_local_path, third_party_errors
+from normlift_ns.encoders.weights import CONNECT_ONCE, IMAGENET, check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,

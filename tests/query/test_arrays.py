@@ -77,7 +77,7 @@ def test_every_rule_is_in_the_table_and_vectors_of_another_encoder_are_refused(t
     assert set(RELEVANCY_RULES) == set(get_args(RelevancyRule))
     lifted, means, source = example()
     SemanticField.build(lifted, means, source).save(tmp_path)
-    with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
+    with pytest.raises(InputError, match=rf"must have shape \[Q, {D}\].*got \(1, 3\)"):
         arrays.ArrayField(*read_field(tmp_path)).query(np.ones((1, 3), np.float32))
 
 
