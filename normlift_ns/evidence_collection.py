@@ -65,7 +65,7 @@ class RasterConfig:
     weight_power: int
     """Exponent of the summed weights."""
     clip_planes: tuple[float, float] | None = None
-    """Near and far plane of the training in world units; None: those of splatfacto."""
+    """Near and far planes of the training, in world units; None for those of splatfacto."""
 
     @property
     def settings(self) -> RasterSettings:
@@ -124,7 +124,7 @@ class EvidenceCollection:
     cache: Path
     """Directory of cached features and evidence."""
     export: FeatureExport | None
-    """Destination of the 2D features; None: no export."""
+    """Destination of the 2D features; None for no export."""
 
     @cached_property
     def _cached_source(self) -> FeatureSource:
@@ -178,7 +178,7 @@ def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tenso
 
 
 class ViewBatch(NamedTuple):
-    """Batch of views, as input of the rasterizer and the lift."""
+    """Batch of views, as input to the rasterizer and the lift."""
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
@@ -190,10 +190,10 @@ class ViewBatch(NamedTuple):
 
 
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
-    """Split views into chunks of at most 16. Each chunk has one evidence file; an interrupted lift loses one at most.
+    """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk.
 
-    Every process gets the same number of chunks. The evidence of a view does not depend on the other views in its
-    chunk.
+    Every process gets the same number of chunks, and each chunk has one evidence file. The evidence of a view does not
+    depend on the other views in its chunk.
 
     >>> [[len(chunk) for chunk in chunk_views(range(45), processes)] for processes in (1, 2)]
     [[15, 15, 15], [12, 12, 12, 9]]
@@ -388,9 +388,9 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
 
     Args:
-        views: The same view at every size that the label map may have.
+        views: the same view at every size that the label map may have.
     Raises:
-        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
+        ValueError: the map has the wrong size. If the source resamples maps, the function warns instead.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
@@ -406,9 +406,9 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         if not maps.resample:
             raise InputError(
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
-                "--regions-resample True and accept an error of some pixels"
+                "--regions-resample True and accept an error of a few pixels"
             )
-        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by some pixels", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by a few pixels", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
             f"{reason} without changing its size. Make sure that the label maps in {file.parent} were made from the "
@@ -435,12 +435,12 @@ def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
     """Write the evidence of views to a file in a folder.
 
     Args:
-        evidence: Evidence of the views.
-        folder: Folder of the cache.
-        keys: Digests of the inputs of each view, in the order of the views.
+        evidence: evidence of the views.
+        folder: folder of the cache.
+        keys: digest of the inputs of each view, in the order of the views.
 
     Raises:
-        OSError: The file cannot be written, for instance because the disk is full.
+        OSError: the file cannot be written, for instance because the disk is full.
     """
     path = _cache_path(folder, keys)
     evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)}, own=True)
@@ -461,7 +461,7 @@ def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView
 
 
 def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
-    """Return a boolean for each view, which is True if the header of a file in the folder lists its key."""
+    """Return a boolean for each key; it is True if the header of a file in the folder lists the key."""
     listed = {key for keys in _cache_headers(folder).values() for key in keys}
     return [key in listed for key in keys]
 

@@ -91,7 +91,7 @@ class LiftedRun:
 
     @property
     def features(self) -> Float[Tensor, "n d"]:
-        """Unit direction of every Gaussian after the vote, or 0 without a direction, computed at every access."""
+        """Unit direction of every Gaussian after the vote, 0 if it has none; computed on every access."""
         return self.field.directions()
 
     @property
@@ -134,14 +134,14 @@ class LiftedRun:
 
         Args:
             texts: prompts for the text encoder of the run.
-            vectors: vectors [D] of further prompts by name, in the space of the features. They have any length > 0, and
-                need no text encoder, unless the rule compares with negatives.
+            vectors: vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
+                and need no text encoder unless the rule compares with negatives.
             negatives: negative prompts to compare with. If None, use those of the encoder.
             relevancy: formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
                 the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for the rule cosine with encoders other
-                than "color".
+                relevancies. None means 0.02 for the rule margin, "auto" for the rule cosine with encoders other than
+                "color", and otherwise 0.5.
             min_reliability: minimum reliability R of selected Gaussians, in 0..1.
             refined: use the directions after the vote.
         Raises:
@@ -191,19 +191,19 @@ class LiftedRun:
 
     @check_arguments
     def save(self, question: Query | Answer) -> Path:
-        """Store a query in the run in place of an earlier one, and return the path of its file.
+        """Store a query in the run in place of an earlier one, and return the path of the query file.
 
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: the vectors of the query and the directions of the field have different lengths.
+            ValueError: the vectors of the query and the directions of the field have different dimensions.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
                 f"the query has vectors of {question.embeddings.shape[1]} numbers, but the features of "
                 f"{self.folder} "
-                f"have {self.field.dimension}; query this run again, and save that answer"
+                f"have {self.field.dimension}; query this run again, and save the new answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
 
@@ -239,8 +239,8 @@ class LiftedRun:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Or the name is
-                reserved for files of a run, or the options of objects are given without an answer.
+            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Also if the
+                name is reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -307,7 +307,7 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
     ) -> exports.LabelTransfer:
-        """Label a point cloud or mesh with the nearest Gaussians, and write it to a new PLY file.
+        """Label a point cloud or mesh with the semantics of the nearest Gaussians, and write it to a new PLY file.
 
         Each point gets the relevancies, class_id and instance_id of its nearest Gaussian.
 
@@ -323,8 +323,8 @@ class LiftedRun:
         Raises:
             FileNotFoundError: the cloud does not exist.
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: `part` has no answer, the cloud is not a PLY file or already has such labels, or the distance is
-                not positive.
+            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
+                the distance is not positive.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -364,7 +364,7 @@ class LiftedRun:
             part: answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
                 refined directions.
         Raises:
-            ValueError: the selection is empty, or the mask has the wrong type or length. Or the run stores only
+            ValueError: the selection is empty, or the mask has the wrong type or length. Also if the run stores only
                 directions, and its cache no longer has the evidence or the features.
             FileNotFoundError: the run stores only directions, and an image is missing.
 
@@ -425,7 +425,8 @@ class LiftedRun:
 
         Args:
             vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
-                imagenet, the names of colors, or the texts of your own features. Other encoders have no words.
+                imagenet, the names of colors, or the texts of your own features. With other encoders, objects are only
+                numbered.
             meters_per_unit: as in `catalogue`.
         Raises:
             ValueError: the encoder cannot encode a word, or as in `why` and `catalogue`.
@@ -463,7 +464,7 @@ class LiftedRun:
 
     @check_arguments
     def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
-        """Find Gaussians that likely belong to no surface; see `analysis.objects`.
+        """Find Gaussians that are probably not part of a surface; see `analysis.objects`.
 
         `run.export(path, ~floaters.mask)` writes the scene without them.
 
@@ -504,8 +505,8 @@ class LiftedRun:
         Args:
             view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: several images have this name, or no image does. The latter is also a KeyError and an
-                IndexError.
+            ValueError: several images have this name, or no image has it. The error for no image is also a KeyError and
+                an IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
@@ -591,8 +592,8 @@ def open_run(
         text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
         prompt_template: template for prompts, such as "a photo of {}". If None, use the template of the lift.
     Raises:
-        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or those of other
-            Gaussians.
+        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or the semantics belong to
+            other Gaussians.
 
     >>> run = open_run(config)
     >>> answer = run.ask("red", "yellow", min_reliability=0.3)

@@ -54,7 +54,7 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_back
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
 _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
-"""Kinds of regions that are objects or parts of them."""
+"""Kinds of regions that are objects or parts of objects."""
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
@@ -186,7 +186,7 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingProxyType({})) -> float:
     """Return the agreement up to which the consensus leaves features unchanged.
 
-    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may not.
+    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may agree only by chance.
 
     Args:
         features: identity of the source of 2D features, as in the manifest.
@@ -247,11 +247,11 @@ def lift_features(
 
 
 def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collection: EvidenceCollection) -> Lifted:
-    """Replace the paper's R by the kind of R to store.
+    """Replace the paper's R with the kind of R that the options select.
 
     Args:
         lifted: lift with the paper's R of the features before the consensus.
-        means: centers of its Gaussians.
+        means: centers of the Gaussians.
     """
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
@@ -311,7 +311,9 @@ def _describe(source: FeatureSource) -> str:
 
 
 def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
-    """Return whether the vote measures its gate, as a posterior vote without --vote-tau does after an active consensus.
+    """Return True if the gate of the vote (tau and gamma) is measured instead of taken from the options.
+
+    It is measured in a posterior vote without --vote-tau, after a consensus that changed features.
 
     Args:
         facts: `consensus_facts`, if the consensus is enabled.
@@ -348,10 +350,10 @@ def vote_directions(
     """Let neighboring Gaussians vote on their directions.
 
     Args:
-        level: level of every region, to measure the gate (default: the gate of the options).
+        level: level of every region, to measure the gate. If None, use the gate of the options.
     Returns:
-        For every Gaussian, the index of the Gaussian whose direction it takes. Also the options with all numbers of the
-        vote, and the gate and the counts for the manifest.
+        The index of the Gaussian whose direction each Gaussian takes, the options with the resolved parameters of the
+        vote, and the manifest entries (the gate and shares of Gaussians).
     """
     reliability, n = lifted.scalars.reliability, len(means)
     gaussians = torch.arange(n, device=means.device)
@@ -376,11 +378,14 @@ def vote_directions(
 def count_changes(
     lifted: Lifted, source: Int64[Tensor, " m"], gaussians: Int64[Tensor, " m"], n: int
 ) -> Int64[Tensor, " 2"]:
-    """Return the number of sampled Gaussians whose direction changes by more than `CHANGED_COSINE`, and of all sampled.
+    """Return the number of sampled Gaussians that change direction, and the number of all sampled Gaussians.
+
+    The direction changes if the cosine between old and new direction is below `CHANGED_COSINE`.
 
     Args:
-        source: rows in the lift of the Gaussians whose directions the first m Gaussians take.
-        gaussians: indices of the first m Gaussians among all n, which decide whether they are sampled.
+        source: row in the lift of the Gaussian that provides the direction, for each of the first m Gaussians.
+        gaussians: indices of the first m Gaussians among all n. A hash of the index decides whether a Gaussian is
+            sampled.
     """
     row = (hash_to_unit(gaussians) < min(1.0, _COMPARED / max(1, n))).nonzero().squeeze(1)
     copies = row[source[row] != row]
@@ -479,9 +484,9 @@ def start_kernel_warm_up(
 def warm_up_kernels(
     gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig
 ) -> list[Thread]:
-    """Compile or load kernels in threads that each run a stage of the lift on some Gaussians and discard the result.
+    """Compile or load kernels in threads. Each runs a stage of the lift on a few Gaussians and discards the result.
 
-    The threads suppress errors, because the lift itself raises them again.
+    The threads suppress errors, because the lift raises the same errors again.
     """
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image

@@ -70,11 +70,11 @@ class ViewVote:
     weight: float
     """W_v, in pixels."""
     share: float
-    """Fraction of the weight of all images in this image, in 0..1."""
+    """Weight of this image as a fraction of the weight of all images, in 0..1."""
     agreement: float
     """a_v, in -1..1."""
     disagreement: float
-    """Fraction of the total disagreement from this image, in 0..1; 0 if all images agree."""
+    """Fraction of the total disagreement that comes from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
     """Regions by descending weight; together they have at least 90 % of the image's weight."""
 
@@ -127,14 +127,14 @@ class Why:
         if len(self.views) == 0 and self.n_eff == 0:
             return "No image shows the selection."
         if len(self.views) == 1:
-            return "Only one image shows the selection, so there is no other image to confirm it."
+            return "Only one image shows the selection, so no other image can confirm its features."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
         count = "a single image" if self.n_eff < 1.05 else f"{self.n_eff:.1f} images of equal weight"
         return f"The images {level} (C_inter {self.c_inter:.2f}). Their weights are equivalent to {count} (N_eff)."
 
     @property
     def sentence(self) -> str:
-        """`words`, with the share of answers that the vote changed."""
+        """Sentences of `words`, and the share of the answers that the vote changed."""
         if self.changed == 0:
             return self.words
         return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the answers."
@@ -202,7 +202,7 @@ def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: T
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of the Gaussians `rows` as one row; a Gaussian counts once per occurrence."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; repeated Gaussians count repeatedly."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)
@@ -215,7 +215,7 @@ def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
 
 
 def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, ...]:
-    """Return one vote per image, from evidence with a single row and the features of its entries."""
+    """Return one vote per image, from evidence with a single row and the features of the entries of that row."""
     column, weight = joined.rows.column.long(), joined.rows.weight
     view = joined.region_view[column].long()
     total = torch.zeros(joined.num_views, dtype=torch.float64, device=weight.device).index_add_(0, view, weight)
@@ -282,7 +282,7 @@ def _eroded(masks: Bool[Tensor, "r h w"], width: int) -> Bool[Tensor, "r h w"]:
 
 
 _FEATURE_TOLERANCE = 1e-3
-"""Maximum difference between a stored feature and the same feature after recomputation."""
+"""Maximum difference between the numbers of a stored feature and of the same feature after recomputation."""
 
 
 class VoteImage(NamedTuple):
@@ -302,14 +302,15 @@ class RecordedVotes:
     scene: Scene
     field: SemanticField
     cache: Path
-    """Folder of the cache of 2D features and evidence."""
+    """Folder of cached 2D features and evidence."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the images in the order of the lift.
 
         Raises:
-            ValueError: the run does not record the names, or the dataset no longer has all images.
+            ValueError: the run does not record the names or has evidence of a different number of images, or the
+                dataset no longer has all images.
         """
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -335,7 +336,7 @@ class RecordedVotes:
         """Explain a selection by the votes of the images; see `explain_selection`.
 
         Args:
-            refined: use the evidence of the neighbor for a Gaussian that has the direction of this neighbor.
+            refined: for a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
         Raises:
             ValueError: nothing is selected, or the votes are no longer in the cache.
         """

@@ -1,19 +1,19 @@
 """Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
-Each image in which two neighboring Gaussians have a region gives this pair a count. The count is 1 if both have the
-same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median
-||f_j|| is the usual disagreement of the views. The affinity of two parts is the mean of the counts over all images and
+Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
+region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median ||f_j||
+measures how much the views usually disagree. The affinity of two parts is the mean of the counts over all images and
 all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
-a surface. It separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
-part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
-so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
-Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
-borders of a segmentation differ between images, so their affinity is high; borders of objects are the same in all
-images.
+a surface. This denominator keeps two parts separate if only a few pairs connect them. Initially, every Gaussian is a
+part. Each part joins the part with the largest affinity if that part is larger. This is repeated for affinities of at
+least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of image segmentation
+(Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
+edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
+objects are the same in all images.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
 """Minimum weight of a Gaussian in an image that shows it, as a fraction of its largest weight in any image."""
 _MIN_REGION = 0.25
-"""Minimum fraction of a Gaussian's weight in an image that its region must have; the weight includes all levels."""
+"""Minimum weight of a Gaussian in its region of an image, as a fraction of its weight in this image over all levels."""
 _SPREADS = 3.0
 """Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
@@ -79,7 +79,7 @@ class Inventory:
             ValueError: the inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"There is no object {number}. The inventory has objects 1 to {len(self)}.")
+            raise InputError(f"Object {number} is not in the inventory, which has objects 1 to {len(self)}.")
         return self.instance_id == number
 
 
@@ -120,7 +120,7 @@ class Vocabulary:
 
 
 class ViewRegions(NamedTuple):
-    """M Gaussians that an image shows, and the region of each, as a column of the evidence."""
+    """Gaussians [M] that an image shows, and the region of each as a column index of the evidence."""
 
     gaussian: Int64[Tensor, " m"]
     region: Int64[Tensor, " m"]
@@ -177,7 +177,7 @@ def find_inventory(
     means: Float[Tensor, "n 3"],
     spread: float,
 ) -> Int32[Tensor, " n"]:
-    """Find the main objects of a scene; return the number of the object of every Gaussian, 0 for none.
+    """Find the main objects of a scene; return the object number of every Gaussian, 0 for none.
 
     There are at most 20 objects, numbered from 1 by descending evidence. Each has at least 20 Gaussians, and at least a
     thousandth of the evidence of all images.
@@ -224,7 +224,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between every Gaussian and its nearest neighbors, with every Gaussian as a part."""
+    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a part of its own."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -244,7 +244,7 @@ def _neighbor_borders(
 
 
 def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
-    """Return the counts of P pairs of regions of one image, 1 if both are the same region."""
+    """Return the count of each of P pairs of regions of one image; it is 1 if both are the same region."""
     count = torch.ones(len(one), dtype=torch.float64)
     differs = (one != other).nonzero().squeeze(1)
     key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)
@@ -274,10 +274,10 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins, which is the larger part with the largest affinity, or itself.
+    """Return the part that each part joins: the larger part with the largest affinity, or itself.
 
-    Only the borders in the mask `chosen` count. Ties go to the larger part, then to the part with the smaller index. Of
-    two equally large parts, the part with the smaller index counts as larger.
+    Only the borders with the indices `chosen` count. Ties go to the larger part, then to the part with the smaller
+    index. Of two equally large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
     target = np.concatenate([borders.second[chosen], borders.first[chosen]])
@@ -356,15 +356,15 @@ def best_words(
     """Return the index of the best name of every object; None if the best name does not stand out from other words.
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
-    those of each object over the words that are not names. If these scores were normally distributed, `by_chance` pairs
-    of an object and a name would exceed the limit. The score of the best name must exceed this limit. If all words are
-    names, the scores are standardized over all words, and the best name must also have the best score.
+    those of each object over the words that are not names. The score of the best name must exceed a limit. If the
+    scores were normally distributed, `by_chance` pairs of an object and a name would exceed this limit. If all words
+    are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
         directions: unit directions of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
         vectors: one unit row per word, names first.
-        by_chance: number of pairs that may exceed the limit by chance; inf accepts every best name.
+        by_chance: expected number of pairs that exceed the limit by chance; inf accepts every best name.
         count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T

@@ -1,7 +1,8 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
 The demo searches for colors, then for an object with the small networks of `--regions edges --encoder imagenet`, and
-lists the objects of the room. It fetches the weights at the start, and skips both if that fails.
+lists the objects of the room. It fetches the weights of the networks at the start; if that fails, it searches for
+colors only.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
-"""Number of superpixels per view, which is enough to separate a tomato from its green star."""
+"""Number of superpixels per view, which is enough to separate a tomato from its green leaves."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
 """Prompt for the networks, its class in the room, and a sufficient number of views."""
 _ASK = AskOptions(threshold="auto")
@@ -47,7 +48,7 @@ class Demo(CheckedOptions):
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""
-    num_gaussians: int = 30_000
+    num_gaussians: int = 36_000
     """Number of Gaussians in the room, at least 2,000. Larger values give finer surfaces and take longer."""
     views: int = 24
     """Number of training views, at least 3. More views take longer."""
@@ -119,9 +120,9 @@ class Demo(CheckedOptions):
         """Lift the features of the networks, search for the object, and return the IoU with the ground truth."""
         CONSOLE.rule("Searching for an object")
         flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
-        flags += ("--refine", "False", "--storage", "evidence")
+        flags += ("--refine", "False", "--recognition", "False", "--storage", "evidence")
         _show("ns-normlift", "--load-config", config, *flags)
-        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, storage="evidence")
+        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, recognition=False, storage="evidence")
         source = SourceOptions(regions="edges", encoder="imagenet")
         run = NormLift(
             config, source=source, lift=lift, timestamp="thing", overwrite=True, check_alignment=False
@@ -133,7 +134,7 @@ class Demo(CheckedOptions):
         found = run.ask(_THING).mask.numpy()
         iou = float((found & truth).sum() / (found | truth).sum())
         info(f"IoU of the Gaussians that match {_THING!r} with the ground truth: {iou:.3f}")
-        CONSOLE.rule("What is in here?")
+        CONSOLE.rule("Listing the objects")
         image = self.folder / "objects.png"
         _show("ns-normlift-query", "--load-config", run.config, "--inventory", "--image", image)
         NormLiftQuery(run.config, inventory=True, image=image, overwrite=True).main()

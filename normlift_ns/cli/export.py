@@ -188,7 +188,7 @@ class NormLiftExport(options.CheckedOptions):
             preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
-        """Raise InputError if an output or an option needs prompts, and there are none."""
+        """Raise InputError if an output or an option needs prompts, but none are given or stored."""
         if len(self.text) == 0:
             preflight.refuse_unused(self.ask, vars(self.ask), "--text")
         stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"

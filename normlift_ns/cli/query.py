@@ -86,8 +86,8 @@ class NormLiftQuery(CheckedOptions):
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
-    """Names of training images, such as 0001 0042, from whose cameras to render. Without names, the command renders
-    from three evenly spaced images."""
+    """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
+    three evenly spaced images."""
     explain: bool = False
     """List the images and regions that voted for the selection, and their agreement."""
     explain_dir: Path | None = None
@@ -103,9 +103,9 @@ class NormLiftQuery(CheckedOptions):
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt with the largest relevancy. centroid is the mean position, weighted
-    by evidence. box has the edge lengths of the oriented box, longest first, and extent the size along x, y and z. Both
-    span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least a
-    tenth as much of the object as the best image. best views names three images that show the object whole and large.
+    by evidence. box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z.
+    Both span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least
+    a tenth as much of the object as the best image. best views names three images that show the object whole and large.
     If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
@@ -119,7 +119,7 @@ class NormLiftQuery(CheckedOptions):
     object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
-    classes for imagenet and the names of colors for color. Other encoders have no words."""
+    classes for imagenet and the names of colors for color. With other encoders, objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
     objects."""
@@ -197,7 +197,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _run(self) -> StoredRun:
-        """Stored run with its scene, which most answers do not need."""
+        """Stored run with its scene. Most answers do not need the scene."""
         from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
         return open_stored_run(self.load_config, self.data)
@@ -305,7 +305,7 @@ class NormLiftQuery(CheckedOptions):
 
     @property
     def _table_coordinates(self) -> Literal["scene", "capture"]:
-        """Coordinate system of the table of objects; meters are those of the capture."""
+        """Coordinate system of the table of objects; a table in meters uses that of the capture."""
         return self.coordinates if self.meters_per_unit is None else "capture"
 
     def _list_inventory(self) -> list[dict[str, Any]]:
@@ -364,8 +364,8 @@ class NormLiftQuery(CheckedOptions):
         flags = [f"--{name}" for name in ("text", "stdin", "interactive", "inventory") if getattr(self, name)]
         if len(flags) == 0:
             raise InputError(
-                'there are no prompts; give one with --text, such as --text "orange", or enter prompts one after '
-                "another with --interactive"
+                'no prompt is given; give one with --text, such as --text "orange", or enter prompts one at a time '
+                "with --interactive"
             )
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
@@ -416,8 +416,8 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-_HELP = """Type prompts, separated by commas; double quotes keep a comma: "salt, pepper".
-help: this text. exit, quit or Ctrl-D: end. To ask for one of these words, write it in double quotes."""
+_HELP = """Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".
+help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes."""
 
 
 def run_repl(
@@ -510,7 +510,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.write(json.dumps(output) + "\n")
         sys.stdout.flush()
     if failed > 0:
-        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines have the reasons under `error`")
+        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines give the reasons under `error`")
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
@@ -589,11 +589,11 @@ def answer_table(
 _MAX_ROWS = 40
 """Maximum number of objects in a table of all objects."""
 _LARGEST = 10
-"""Number of objects in the table if there are more."""
+"""Number of objects in the table if there are more than `_MAX_ROWS`."""
 
 
 def print_catalog(catalog: Catalogue, coordinates: Literal["scene", "capture"] = "scene") -> None:
-    """Print a table of the objects. Of more than 40, count those of each prompt and print the 10 largest."""
+    """Print a table of the objects; if there are more than 40, print the 10 largest and the counts of each prompt."""
     count = len(catalog.objects)
     largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[: count if count <= _MAX_ROWS else _LARGEST]
     common.CONSOLE.print(_catalog_table(catalog, sorted(largest, key=lambda item: item.id), coordinates))

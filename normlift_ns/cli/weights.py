@@ -81,7 +81,9 @@ def _hub(
             return download()
         except FileNotFoundError as error:
             page = f"https://huggingface.co/{repository}"
-            raise FileNotFoundError(f"{error}. Or download from {page} on another machine: {local}") from None
+            raise FileNotFoundError(
+                f"{error}. Or download the weights from {page} on another machine: {local}"
+            ) from None
 
     return Weights(user, megabytes, license_name, data, repository, partial(hub_folder, repository), find, fetch)
 
@@ -176,7 +178,7 @@ class NormLiftWeights(CheckedOptions):
         for name in self.get:
             if name not in WEIGHTS:
                 near = difflib.get_close_matches(name, WEIGHTS, cutoff=0.4) or list(WEIGHTS)
-                raise InputError(f"--get {name!r} is not the name of weights; give a name such as {', '.join(near)}")
+                raise InputError(f"--get {name!r} is not a known name; give a name such as {', '.join(near)}")
         check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
         for name in dict.fromkeys(self.get):
             if WEIGHTS[name].find() is None:

@@ -149,7 +149,7 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     with (
         # The metric would download its weights.
         patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
-        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # keep the writers of other trainings in this process
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # keep the writers of other training runs in this process
     ):
         trainer.setup()
     dataset = trainer.pipeline.datamanager.train_dataparser_outputs

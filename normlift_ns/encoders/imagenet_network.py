@@ -97,7 +97,7 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Load the network from the content of a PyTorch weight file, whose names begin with underscores.
+    """Load the network from the content of a PyTorch weight file, in which names begin with underscores.
 
     Batch normalizations are fused into the preceding convolutions, which halves the time on a CPU.
     """
@@ -159,7 +159,7 @@ class ImageNetEncoder:
         a query needs one vector.
 
         Raises:
-            InputError: If `prompts` or a prompt is empty, or a prompt names no class.
+            InputError: If `prompts` or a prompt is empty, or a prompt does not name a class.
             FileNotFoundError: If the weights are not on this machine.
         """
         check_prompts(prompts)

@@ -113,7 +113,7 @@ def download_model(name: str, choose_files: Callable[[dict[str, Any]], Sequence[
 
 
 def is_local_path(name: str, parts: int) -> bool:
-    """Return whether a name can only be a local path.
+    """Return True if a name can only be a local path.
 
     Args:
         parts: Largest number of parts, separated by slashes, of names that are not paths.
@@ -126,10 +126,10 @@ def is_local_path(name: str, parts: int) -> bool:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
+    """Read a JSON file that contains an object.
 
     Raises:
-        InputError: If the file does not exist, is not JSON, or does not hold an object.
+        InputError: If the file does not exist, is not JSON, or does not contain an object.
     """
     if not path.is_file():
         raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
@@ -140,7 +140,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
+        raise InputError(f"{path.name} contains {type(content).__name__}, expected an object")
     return content
 
 

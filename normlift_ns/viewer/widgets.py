@@ -310,7 +310,9 @@ def diagnostics_mdx(state: State) -> str:
         lines += [escape_mdx(clip_text(one.warning, 400))] * (one.warning != "")
     count = 0 if state.answer is None or state.shown is not None else len(state.answer.texts)
     if 0 < len(diagnostics) < count:
-        lines.append(f"{count - len(diagnostics)} more prompts are not shown. Choose one to see its histogram.")
+        more = count - len(diagnostics)
+        shown = "prompt is not shown. Choose it" if more == 1 else "prompts are not shown. Choose one"
+        lines.append(f"{more} more {shown} to see its histogram.")
     return "\n\n".join(lines)
 
 

