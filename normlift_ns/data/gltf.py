@@ -207,7 +207,9 @@ def _open_gltf(path: Path) -> _Gltf:
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise _damaged(path, f"its JSON cannot be read ({error})") from error
     if not str(document.asset.get("version", "")).startswith("2."):
-        raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export glTF 2.0.")
+        raise InputError(
+            f"{path} has glTF version {str(document.asset.get('version'))[:20]}, expected 2.0. Export glTF 2.0."
+        )
     unknown = sorted(set(document.extensions_required) - _KNOWN)
     if len(unknown) > 0:
         raise InputError(

@@ -235,11 +235,11 @@ def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origi
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
             hint = (
-                f"which has {len(vectors)} for other prompts; use one of these, such as {', '.join(near)}"
+                f"use one of its {len(vectors)} prompts, such as {', '.join(near)}"
                 if len(vectors) > 0
-                else "which is empty; write the vectors of your prompts to it"
+                else "it is empty, add the vectors of your prompts"
             )
-            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
+            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}; {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
