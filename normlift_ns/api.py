@@ -255,7 +255,7 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
 
 
 def check_target(prepared: PreparedLift) -> None:
-    """Complete interrupted lifts of the experiment, and raise if the run exists and must not be replaced."""
+    """Complete file writes that earlier lifts left unfinished; raise if the run exists and must not be replaced."""
     complete_interrupted_lifts(prepared.run_dir)
     if prepared.request.timestamp is not None:
         refuse_existing_run(prepared.run_dir, prepared.request.overwrite, prepared.scene.checkpoint_path)

@@ -63,7 +63,7 @@ class RasterConfig:
     dtype: torch.dtype
     rasterize_mode: RasterizeMode
     weight_power: int
-    """Exponent of the summed weights."""
+    """Exponent of the rasterization weights A_ij, whose powers the evidence sums."""
     clip_planes: tuple[float, float] | None = None
     """Near and far planes of the training, in world units; None for those of splatfacto."""
 

@@ -352,7 +352,8 @@ class LiftedRun:
     def votes(self) -> RecordedVotes:
         """Evidence of the lift for each training image.
 
-        `votes.pictures(why.views[:3])` renders the evidence of the three images with the largest share.
+        `votes.pictures(why.views[:3])` yields the three images with the largest weight, with outlines of the regions
+        that voted.
         """
         return RecordedVotes(self.scene, self.field, cache_folder(self.folder))
 

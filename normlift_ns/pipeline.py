@@ -52,7 +52,7 @@ from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
-"""Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
+"""Smallest share of Gaussians with a direction, in 0..1, for which `check_directions` does not warn."""
 _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of objects."""
 _COMPARED = 20_000

@@ -116,9 +116,9 @@ class Measurements:
     view_bytes: float
     """Bytes of a view's features and regions in the cache."""
     host_bytes: int
-    """Peak memory of this process so far."""
+    """Peak memory of this process so far, in bytes."""
     device_bytes: int | None
-    """Peak GPU memory up to the end of the evidence stage; None without a GPU."""
+    """Peak GPU memory up to the end of the evidence stage, in bytes; None without a GPU."""
     measured_views: int = 0
     """Number of measured views."""
 
@@ -147,9 +147,9 @@ class Plan:
     evidence_kept: int
     """Approximate number of views with cached evidence."""
     host_bytes: int
-    """Memory of each process."""
+    """Memory of each process, in bytes."""
     device_bytes: int | None
-    """Memory of each GPU; None without a GPU."""
+    """Memory of each GPU, in bytes; None without a GPU."""
     disk_bytes: int
     """Bytes to be written."""
     looked_at: int
@@ -307,7 +307,7 @@ def measure_core(
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
-    """Fit a line to two pairs of items and cost. It passes through the larger pair; slope and fixed part are >= 0."""
+    """Fit a line to two pairs (items, cost). It passes through the larger pair; slope and fixed part are >= 0."""
     (items, cost), (more, most) = small, large
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
@@ -332,7 +332,7 @@ _PROJECTED_GAUSSIANS = 100_000
 _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
 """Shares of Gaussians in view below which the check warns, and below which it fails."""
 _HIGH_SHARE = 0.8
-"""Share of free memory or disk space above which an estimate gets a warning."""
+"""An estimate gets a warning if it takes more than this share of the free memory or disk space."""
 _LIFT_LESS = "reduce the lift with --lift-downscale 2 or --max-views 50"
 _SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
@@ -510,8 +510,9 @@ _MAX_VIEWS = 4
 _MAX_LOAD_S = 3.0
 """Maximum estimate of the seconds to load kernels. Longer times include compilation, which happens only once."""
 _SLOW_FIRST_VIEW_S = 20.0
-"""Seconds for the first view above which only one more batch is measured. The seconds include an unknown time to load
-networks.
+"""Limit on the seconds of the first view. If it takes longer, only one more batch is measured.
+
+These seconds include an unknown time to load networks.
 """
 _MAX_LOOKUPS = 16
 """Maximum number of views to look up in the cache."""
@@ -698,7 +699,7 @@ def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
 
 
 def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
-    """Return a warning if images and renders of three views differ; record the seconds of both steps."""
+    """Return a warning if images and renders of three views differ; record the seconds of `kernels` and `check`."""
     opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
     start = perf_counter()
     warning = compare_with_images(opened.scene, options, device)

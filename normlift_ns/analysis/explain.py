@@ -99,14 +99,14 @@ class Why:
     gaussians: int
     """Number of selected Gaussians."""
     changed: float
-    """Share of the selected Gaussians whose answer the vote changed, in 0..1: their direction has a cosine below 0.98
-    to their own. It is estimated from at most 4,096 of them."""
+    """Share of the selected Gaussians whose direction the vote changed, in 0..1, estimated from at most 4,096 of them.
+    A direction counts as changed if it has a cosine below 0.98 to the direction before the vote."""
     norm: float
     c_intra: float
     c_inter: float
     n_eff: float
     reliability: float
-    """R of the selection. This and the four numbers above treat the selection as one Gaussian."""
+    """R of the selection. This number, `norm`, `c_intra`, `c_inter` and `n_eff` treat the selection as one Gaussian."""
     views: tuple[ViewVote, ...]
     """Votes of the images with weight > 0, by descending weight."""
 
@@ -133,7 +133,7 @@ class Why:
 
     @property
     def sentence(self) -> str:
-        """Sentences of `words`, and the share of the answers that the vote changed."""
+        """`words`, followed by a sentence about the share of the Gaussians that the vote changed, if there are any."""
         if self.changed == 0:
             return self.words
         return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the answers."
@@ -191,7 +191,7 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Return the share of the Gaussians `rows` whose direction differs from that of `origin`."""
+    """Return the share of pairs of a Gaussian in `rows` and the one in `origin` whose directions differ."""
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)

@@ -89,7 +89,7 @@ class Vocabulary:
 
     words: tuple[str, ...]
     kind: EncoderKind | None
-    """Encoder of the run; None if it is unknown."""
+    """Kind of the encoder of the run; None if it is unknown."""
     encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]]
     """Function from words to unit vectors."""
     ask: Callable[[Sequence[str]], Any]

@@ -33,7 +33,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 BOX_QUANTILES = (0.01, 0.99)
 """Quantiles of the points along each axis at the two faces of a box."""
 _FLAT = 1e-14
-"""Ratio of the smallest to the largest variance below which points count as flat."""
+"""Points count as flat if the ratio of their smallest to their largest variance is below this value."""
 _DIRECTIONS = np.array([
     direction for direction in product((-1, 0, 1), repeat=3) if direction > (0, 0, 0)
 ], dtype=np.float64)  # fmt: skip
@@ -124,7 +124,10 @@ class SceneObject:
     """Number of Gaussians."""
     centroid: list[float]
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the axis-aligned bounding box of the centers: lists, in this version; see `bounds`."""
+    """Lowest corner "min" and highest corner "max" of the axis-aligned bounding box of the centers, as lists.
+
+    `bounds` contains the same corners as a tensor.
+    """
     mean_reliability: float
 
     @property
@@ -331,7 +334,9 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 MIN_VIEW_SHARE = 0.1
 """Minimum area of an object in an image that shows it, as a fraction of its largest area in any image."""
 MIN_WHOLE_FRACTION = 0.95
-"""Minimum fraction of an object inside the frame of an image that shows it whole, relative to its largest value.
+"""Minimum fraction of an object inside the frame of an image that shows the whole object.
+
+It is relative to the largest such fraction over the images that show the object.
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
@@ -693,7 +698,11 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 
 
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
-    """Return the first term of the score, log2(d / (s + s'))."""
+    """Return the first term of the score, log2(d / (s + s')).
+
+    d is the distance to the eighth nearest neighbor, s the largest scale of the Gaussian, and s' the median over its
+    neighbors of their largest scales.
+    """
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)
     size = scene.scales[rows].float().amax(dim=1)

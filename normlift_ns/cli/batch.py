@@ -50,7 +50,7 @@ class Capture:
     """Capture in a capture list."""
 
     name: str
-    """Line of the list."""
+    """Line of the capture list that defines this capture."""
     arguments: tuple[str, ...]
     """Arguments of ns-normlift, including the name of the new run."""
     key: str
@@ -302,7 +302,7 @@ class Outcome:
     """Result of one attempt to lift a capture."""
 
     capture: str
-    """Line of the list."""
+    """Line of the capture list that defines the capture."""
     key: str
     """Digest of scene and options."""
     attempt: int

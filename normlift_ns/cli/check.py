@@ -119,7 +119,7 @@ def _try(rows: list[Diagnostic], name: str, function: Callable[[], _Result]) -> 
     Args:
         rows: Findings so far.
         name: Name of the row.
-        function: The check.
+        function: Function that runs one check.
     Raises:
         Exception: Internal errors of the function.
     """

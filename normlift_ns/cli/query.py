@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 _OUTPUTS = ("output_json", "output_npz", "render_dir")
-"""Options of files that contain an answer."""
+"""Names of the options for output files that contain an answer."""
 
 
 @renamed(
@@ -645,7 +645,7 @@ def _catalog_table(
 
 
 IMAGES_PER_GROUP = 3
-"""Number of images per prompt in each of two groups: the largest weights, and the strongest disagreement."""
+"""Number of images per prompt in each of two groups: images with the largest weights, and images that disagree most."""
 _LARGEST_WEIGHT = "weighs most"
 
 

@@ -1,7 +1,8 @@
 """Runtime checks of public functions' arguments against their annotations.
 
-`check_arguments` decorates every public function and record. Arguments that are annotated as tensors may also be NumPy
-arrays or nested lists of numbers, which are converted. This module imports torch only to convert an array.
+`check_arguments` decorates every public function, dataclass and NamedTuple. Arguments that are annotated as tensors may
+also be NumPy arrays or nested lists of numbers, which are converted. This module imports torch only to convert an
+array.
 """
 
 from __future__ import annotations
@@ -295,7 +296,7 @@ def _kind_of(dtype: Any) -> str:
 
 
 def _layout(value: Any) -> str | None:
-    """Return the unsupported layout of a tensor, such as "meta", "" for a usable array, or None for other values."""
+    """Return the name of a tensor's layout if it is unsupported, "" for a usable array, or None for other values."""
     torch = sys.modules.get("torch")
     if torch is None or not isinstance(value, torch.Tensor):
         return "" if isinstance(value, np.ndarray) else None

@@ -61,11 +61,11 @@ class Overlaps(NamedTuple):
     """Overlaps between regions of different views at one level."""
 
     iou: SparseRows
-    """J, a symmetric [S, S] matrix without its diagonal."""
+    """J, the soft intersection over union of all pairs of regions, a symmetric [S, S] matrix without its diagonal."""
     inside: Float[Tensor, " nnz"]
-    """c_ts of every entry (s, t), the share of t that lies in s."""
+    """c_ts of every entry (s, t) of `iou`, the share of region t that lies in region s."""
     agreement: float
-    """B, in 0..1."""
+    """B, the weighted mean of the best overlaps of all regions, in 0..1."""
 
 
 @check_arguments
@@ -83,9 +83,9 @@ class Consensus(NamedTuple):
     """
 
     features: Float[Tensor, "s d"]
-    """F', as unit rows; rows that are 0 in F stay 0."""
+    """F', the features after the consensus, as unit rows; rows that are 0 in F, the features before it, stay 0."""
     agreement: list[float]
-    """B of every level."""
+    """B of every level, the weighted mean of the best overlaps, in 0..1."""
     gaussians: int
     """Number of Gaussians sampled."""
 
@@ -100,14 +100,14 @@ def consensus(
     sample: int = 50,
     least: float = CHANCE_AGREEMENT,
 ) -> Consensus:
-    """Compute F' of every region with the formulas at the top of this module.
+    """Compute F', the features of all regions after the consensus, with the formulas at the top of this module.
 
     Args:
         features: unit rows or 0, one per column of the evidence.
         level: level of every region (default: the same for all). Regions of different levels are not compared.
         power: q, the exponent of c_ts, >= 0.
         sample: smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
-        least: largest B at which regions overlap by chance and keep their features, in 0..1.
+        least: largest B that regions reach by chance, in 0..1. Up to this B, regions keep their features.
     Raises:
         ValueError: if `features` or `level` has the wrong length, a feature is neither a unit vector nor 0, or another
             argument is out of range.
@@ -236,7 +236,7 @@ def sample_gaussians(
 
 
 def total_view_weights(evidence: Evidence, levels: int = 1) -> SparseRows:
-    """Return W_jv of all Gaussians, [M, views], including pixels without a region.
+    """Return W_jv, the weight of every Gaussian in every view, [M, views]. Pixels without a region count too.
 
     Args:
         levels: number of levels. Weights are divided by it, because the evidence counts every pixel once per level.
@@ -315,7 +315,8 @@ def _shares(
     estimate the sums over all Gaussians.
 
     Returns:
-        The matrices p of visible Gaussians [M, S], 1 for visible Gaussians [M, views], and sums of p [M, views].
+        The shares p_js of visible Gaussians [M, S], a matrix with 1 for every view that shows a Gaussian [M, views],
+        and the sum of the shares in every view [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)
     if total is None:

@@ -60,7 +60,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
     """Run a function on all items. If the GPU runs out of memory, split the items into halves recursively.
 
     Args:
-        run: function of a part of the items.
+        run: function that returns the result for some of the items.
         items: sequence, or tensor that is split along its first dimension.
         advice: suggestion for the user in the message of the MemoryError.
     Returns:

@@ -32,7 +32,8 @@ WEIGHT_POWERS = (0, 1, 2)
 
 @check_arguments
 class Entries(NamedTuple):
-    """Nonzero weights from a rasterizer for one or more views, distinct and sorted by (gaussian, column)."""
+    """Nonzero weights from a rasterizer for one or more views, at most one per (gaussian, column), sorted by this
+    pair."""
 
     gaussian: Int[Tensor, " nnz"]
     column: Int[Tensor, " nnz"]
@@ -45,10 +46,11 @@ class Entries(NamedTuple):
 @check_arguments
 @dataclass(frozen=True)
 class Evidence(TensorRecord):
-    """Sparse matrix E_js, the sum of A_ij over the pixels i of region s, and the weights in unlabeled pixels per view.
+    """Sparse matrix E_js, and the weight of every Gaussian j in the unlabeled pixels of every view.
 
-    Columns s number the regions of all views consecutively, like the rows of the feature table. They ascend within a
-    row, so the order is the same in every run. The constructor raises ValueError if the arrays are inconsistent.
+    E_js is the sum of A_ij, the compositing weight of Gaussian j in pixel i, over the pixels i of region s. Columns s
+    number the regions of all views consecutively, like the rows of the feature table. The columns of a row ascend. The
+    constructor raises ValueError if the arrays are inconsistent.
 
     >>> import torch
     >>> from normlift_ns import Evidence
@@ -110,7 +112,7 @@ class Evidence(TensorRecord):
 
     @property
     def nnz(self) -> int:
-        """Number of entries."""
+        """Number of entries E_js that the matrix stores."""
         return self.rows.weight.numel()
 
     @staticmethod

@@ -195,7 +195,7 @@ class SemanticField(TensorRecord):
     ) -> Float[Tensor, "n q"]:
         """Return the relevancy of every Gaussian to Q text vectors, from the cosines of `query`.
 
-        A Gaussian without a direction gets the smallest value of the rule, 0 or -2 ("margin"), and is never selected.
+        A Gaussian without a direction gets a relevancy of 0, or -2 for the rule "margin", and is never selected.
 
         Args:
             negatives: vectors of the negative prompts, for rules that need them.
@@ -302,8 +302,8 @@ def choose_form(
     Args:
         portion: part of the Gaussians that the lift covers (default: all).
     Returns:
-        Metadata of the chosen form and of the compared forms for the manifest, and the basis if the form is "low_rank",
-        which is compared only if it could be chosen.
+        Metadata for the manifest about the chosen form and all compared forms, and the basis if the form is "low_rank".
+        "low_rank" is compared only if `storage` allows it and a basis meets the tolerance.
     Raises:
         ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """

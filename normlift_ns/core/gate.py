@@ -1,9 +1,9 @@
 """Gate of the vote, measured on neighbors that share their regions.
 
-A gate decides from a cosine whether two directions belong to the same object. Texts of one scene have cosines of 0.73
-to 0.95 in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions of one object
-agree closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted directions of
-neighbors that share a region in at least half of the views that show both::
+A gate decides from a cosine whether two directions belong to the same object. Texts of one scene have cosines to each
+other of 0.73 to 0.95 in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions
+of one object agree closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted
+directions of neighbors that share a region in at least half of the views that show both::
 
     tau   = 5 % quantile of same
     gamma = (1 - tau) / 2
@@ -20,7 +20,7 @@ from normlift_ns.core.lift import Lifted
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 
 GATE_QUANTILE = 0.05
-"""Fraction of the measured pairs of neighbors with a cosine below tau, for which the gate is less than one half."""
+"""Fraction of the measured pairs of neighbors that have a cosine below tau. Their gate is less than one half."""
 SHARED_VIEWS = 0.5
 """Minimum fraction of views with a shared region, among the views that show both Gaussians."""
 MAX_TAU = 0.9985
@@ -102,7 +102,10 @@ def _shares(rows: SparseRows, group: Int64[Tensor, " s"]) -> tuple[Int64[Tensor,
 def _matched(
     a: Int64[Tensor, " x"], b: Int64[Tensor, " y"], at: Tensor, bt: Tensor, width: int, pairs: int
 ) -> Float64[Tensor, " p"]:
-    """Return the sum of at * bt over equal keys of every pair; keys ascend, and pair i has keys from i * width on."""
+    """Return, for every pair, the sum of at * bt over the keys that `a` and `b` have in common.
+
+    Keys ascend, and pair i has the keys from i * width to (i + 1) * width - 1.
+    """
     place = torch.searchsorted(b, a).clamp(max=len(b) - 1)
     equal = b[place] == a
     products = at[equal].double() * bt[place[equal]].double()

@@ -32,7 +32,7 @@ _CHUNK_ELEMENTS = 2**22
 def independent_views(
     view_weights: SparseRows, means: Float[Tensor, "n 3"], centers: Float[Tensor, "v 3"], drift: float = DRIFT
 ) -> Float64[Tensor, " n"]:
-    """Return N_j, in 1..N_eff, or 0 without weight.
+    """Return N_j, the number of independent views of every Gaussian, in 1..N_eff, or 0 for a Gaussian without weight.
 
     Args:
         view_weights: W_jv, [N, views].

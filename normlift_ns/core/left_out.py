@@ -40,12 +40,12 @@ class LeftOut(NamedTuple):
     confirmed: int
     """Number of left-out regions that overlapping kept regions confirm."""
     agreement: float
-    """Mean cosine between the lift and the left-out regions, after a consensus among these regions; NaN without
-    regions."""
+    """Mean cosine between the feature of a left-out region in the kept views and its own feature after a consensus
+    among the left-out views; NaN without regions."""
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Entry for the manifest."""
+        """JSON-ready entry for the manifest of the lifted run."""
         agreement = None if self.agreement != self.agreement else self.agreement
         return {"recognized": self.recognized, "confirmed": self.confirmed, "agreement": agreement}
 
@@ -59,7 +59,9 @@ def leave_views_out(
     power: float = 1.0,
     least: float | None = None,
 ) -> LeftOut:
-    """Measure how well a lift of half of the views recognizes regions of the others, by the formulas above.
+    """Measure how well a lift of half of the views recognizes regions of the other views.
+
+    The formulas are in the module docstring.
 
     Args:
         sampled: evidence of the Gaussians from `sample_gaussians`.

@@ -207,7 +207,9 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
 
 
 def norm_of_reliability(scalars: Scalars, beta: float) -> Float64[Tensor, " n"]:
-    """Return ||f_j|| from R_j, the inverse of `reliability`. After a consensus, it is the norm before the consensus.
+    """Return ||f_j|| from R_j, the inverse of `reliability`.
+
+    After a consensus, R_j and therefore the result are those of the features before the consensus.
 
     Args:
         scalars: scalars of a lift with the paper's R.

@@ -17,7 +17,7 @@ from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.partition import PARTITION_BLOCK, Communicator, Partition
 
 _ROUNDING = 1e-6
-"""Relative rounding error of weights, norms and directions stored in float32, added to x_j."""
+"""Relative rounding error of weights, norms and directions stored in float32. `basis_of_rank` adds it to x_j."""
 
 
 def half_precision_error(dimension: int) -> float:
@@ -71,7 +71,9 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
 
 
 def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None = None) -> Basis | None:
-    """Return the basis of lowest rank that keeps the bound of every Gaussian within `tolerance`, or None.
+    """Return the basis of lowest rank that keeps the bound of every Gaussian within `tolerance`.
+
+    Return None if no rank does.
 
     The bound includes the rounding of coordinates to float16. All processes get the same basis.
     """
@@ -101,7 +103,8 @@ fast."""
 
 @dataclass(frozen=True)
 class StoredEvidence(TensorRecord):
-    """E and F themselves, which give exact directions. E can be reused with another encoder."""
+    """Storage form that keeps the evidence E and the features F. Directions are exact, and another encoder can reuse
+    E."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
@@ -153,7 +156,7 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
     """Return the directions of all Gaussians with evidence.
 
     Args:
-        basis: rows of the basis for coordinates, or None to store full directions.
+        basis: vectors of the basis as rows, to store coordinates in it, or None to store full directions.
         order: indices of all Gaussians from `spatial_order`.
     """
     coordinates, gaussians = encode_directions(lifted, basis, order.split(PARTITION_BLOCK))

@@ -19,7 +19,10 @@ from normlift_ns.options import check_number
 MAX_NEIGHBORS = 1024
 """Largest K. Memory grows with K times the number of Gaussians, and a vote compares all pairs of neighbors."""
 _MAX_UNCERTAIN = 1000
-"""Largest number of uncertain rows for which the GPU computes all distances. Above it, the CPU is faster."""
+"""Largest number of rows that the GPU repeats with all distances because it could not certify their neighbors.
+
+For more rows, the CPU is faster.
+"""
 _BLOCK = 2**14
 """Number of positions per query of the k-d tree."""
 _MAX_RANKED = 2**22

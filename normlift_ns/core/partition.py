@@ -14,15 +14,15 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 PARTITION_BLOCK = 2**13
-"""Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks. Matrix products then
-have the same shapes, and therefore the same rounding, for any number of processes."""
+"""Number of consecutive Gaussians on the Morton curve that form a block. Each process has whole blocks. Matrix products
+then have the same shapes, and therefore the same rounding, for any number of processes."""
 
 
 class Communicator(ABC):
     """Interface for communication between processes. All processes must call the same methods in the same order."""
 
     rank: int
-    """Rank of this process, in 0..size-1."""
+    """Rank of this process, in 0..world_size - 1."""
     world_size: int
     """Number of processes."""
 
@@ -66,7 +66,7 @@ class Partition:
 
     communicator: Communicator
     order: Int64[Tensor, " n"]
-    """Indices of all Gaussians in curve order."""
+    """Indices of all Gaussians in the order of the Morton curve (see `spatial_order`)."""
 
     @staticmethod
     def from_means(team: Communicator, means: Float[Tensor, "n 3"]) -> Partition:
@@ -100,12 +100,12 @@ class Partition:
 
     @cached_property
     def curve_rows(self) -> Int64[Tensor, " m"]:
-        """Rows of this process in curve order."""
+        """Row indices of the arrays of this process, in the order of the Morton curve."""
         first = sum(map(len, self.indices_by_rank[: self.communicator.rank]))
         return self.place[1][self.order[first : first + len(self)]].long()
 
     def blocks(self) -> Iterator[Int64[Tensor, " b"]]:
-        """Yield the rows of this process in curve order, one block at a time."""
+        """Yield the row indices of `curve_rows`, one block at a time."""
         return iter(self.curve_rows.split(PARTITION_BLOCK))
 
     def all_gather(self, rows: Tensor) -> Tensor:

@@ -63,7 +63,8 @@ def refine(
     Args:
         config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
         directions: u, unit rows or 0 of any floating-point type. Float64 rows are used in float64, others in float32.
-            If it is a function of indices, such as `Lifted.directions`, only one block is in memory at a time.
+            If `directions` is a function of indices, such as `Lifted.directions`, only one block is in memory at a
+            time.
         reliability: R in 0..1.
         own: `Lifted.scalars.own_evidence`, required by the posterior vote and ignored by the paper's vote.
         labeled: `labeled_share` of the evidence. Gaussians below `config.min_labeled` keep their direction (default:
@@ -292,7 +293,7 @@ def posterior_weights(
 def _within(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor
 ) -> tuple[Float[Tensor, "m k_plus_1"], Float64[Tensor, "m k_plus_1"]]:
-    """Return R and squared distances in units of sigma_d for N+, i itself first."""
+    """Return R and the squared distances in units of sigma_d of the members of N+, with i itself first."""
     r = _gather(reliability, torch.cat([rows[:, None], neighbors.index[rows]], dim=1))
     return r, torch.nn.functional.pad(neighbors.distance[rows].double() / width, (1, 0)) ** 2
 

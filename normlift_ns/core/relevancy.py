@@ -23,7 +23,7 @@ TEMPERATURE = 10.0
 PROMPT_BLOCK = 32
 """Number of prompts that are compared with all Gaussians at a time, which bounds the memory of a query."""
 _SAMPLED = 16
-"""Sampling step of `_largest`, which samples one of this number of values."""
+"""Sampling step of `_largest`, which takes every 16th value as a sample."""
 TOP_QUANTILE = 0.999
 """Quantile over Gaussians that defines the top relevancy of a prompt. Single outliers do not affect it."""
 _LARGEST_COSINE = 1.01
@@ -36,13 +36,16 @@ class RuleSettings(NamedTuple):
     """Formula and constants of a relevancy rule."""
 
     formula: Callable[[Any, Any, float], Any]
-    """Relevancy from cosines to prompts [..., Q] and to negatives [..., B], and the temperature."""
+    """Function that returns the relevancy [..., Q].
+
+    The arguments are the cosines to prompts [..., Q], the cosines to negatives [..., B], and the temperature.
+    """
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     needs_negatives: bool
     """True if the rule needs negative prompts. "contrast" needs null levels instead (see `core.null_level`)."""
     no_direction: float
-    """Relevancy of a Gaussian without a direction, which no threshold selects."""
+    """Relevancy of a Gaussian without a direction, which is never selected."""
     display_min: float
     """Lower end of the color scale. Renders show smaller relevancies in the same color."""
     presence_limit: float | None
@@ -159,7 +162,7 @@ def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: f
 def gaussian_relevancy(
     positive: Float[ArrayT, "n q"], negative: Float[ArrayT, "n b"], valid: Bool[ArrayT, " n"], rule: RelevancyRule
 ) -> Float[ArrayT, "n q"]:
-    """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get the smallest value of the rule.
+    """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get `no_direction` of the rule.
 
     Raises:
         ValueError: if the rule is unknown, or if it needs negatives and none are given.

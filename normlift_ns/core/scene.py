@@ -15,7 +15,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
 _TOLERANCE = 1e-5
-"""Relative tolerance of camera parameters. The absolute tolerance for values near zero is a tenth of it."""
+"""Relative tolerance at which two camera parameters count as equal. The absolute tolerance for values near zero is a
+tenth of it."""
 
 
 @check_arguments

@@ -15,7 +15,8 @@ from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
 
 CANCELLATION_RATIO = 1e-3
-"""Vector sums shorter than this share of their weight are recomputed in float64, because float32 digits cancel."""
+"""Vector sums shorter than this share of the sum of their weights are recomputed in float64, because float32 digits
+cancel."""
 MANY_ENTRIES = 4096
 """Sums of more vectors than this are computed in float64, because rounding errors of float32 would add up."""
 CHUNK_ELEMENTS = 2**24
@@ -182,7 +183,7 @@ class SparseRows(TensorRecord):
     def chunks(self, row_size: int) -> Iterator[tuple[int, SparseRows]]:
         """Yield consecutive blocks of rows as (first row, block).
 
-        Block rows x row_size is at most about 2**24 elements.
+        A dense array with `row_size` elements for each row of a block has at most about 2**24 elements.
         """
         step = max(1, CHUNK_ELEMENTS // max(1, row_size))
         for first in range(0, len(self), step):

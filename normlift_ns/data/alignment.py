@@ -23,7 +23,7 @@ MIN_MARGIN = 3.0
 """Minimum lead in dB over the PSNR of the images' mean color. Cameras in a wrong world have less. Cameras in the right
 world have at least 1 dB more than this minimum (`python -m research.worlds`)."""
 _MIN_VISIBLE = 0.001
-"""Minimum fraction of the Gaussians in the view that contains most of them."""
+"""Minimum fraction of all Gaussians that at least one view contains."""
 
 
 class Alignment(NamedTuple):
@@ -34,11 +34,11 @@ class Alignment(NamedTuple):
     worst: tuple[str, float]
     """Name and PSNR in dB of the image with the lowest PSNR."""
     visible_fraction: float
-    """Fraction of the Gaussians in the view that contains most of them, in 0..1."""
+    """Largest fraction of all Gaussians that one of the views contains, in 0..1."""
     mean_color_psnr: float
     """Mean PSNR in dB if each image is compared with its mean color instead of a render."""
     margin: float
-    """Median over the views of the PSNR of the render minus that of the mean color, in dB."""
+    """Median lead over the views, in dB: the PSNR of the render minus the PSNR of the image's mean color."""
     cause: str | None = None
     """Sentence about another lens or primitive that fits the images better; None if none was found."""
 
@@ -57,7 +57,8 @@ def measure_alignment(
         scene: Gaussians, cameras and images.
         settings: constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
-        explain: look for a better lens or primitive even if the PSNR or the margin is below the usual minimum.
+        explain: True to look for a better lens or primitive in any case. False to skip this search if the PSNR or the
+            margin is below the usual minimum.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """

@@ -347,7 +347,10 @@ class _ByteReader:
         self.offset += count
 
     def count(self) -> int:
-        """Read the number of entries that follow; raise InputError if they cannot fit, at 8 bytes or more per entry."""
+        """Read the number of entries that follow; raise InputError if the data are too short for them.
+
+        An entry has at least 8 bytes.
+        """
         number = self.unpack("Q")[0]
         if number > len(self.data) // 8:
             raise InputError(f"it declares {number:,} entries, but has only {len(self.data):,} bytes")

@@ -14,7 +14,10 @@ from normlift_ns.data.frames import Intrinsics
 from normlift_ns.errors import InputError
 
 KEPT_SHARE = 0.9
-"""Share of the pixels of an image that its pinhole camera shows, unless they lie beyond `MAX_ANGLE`."""
+"""Minimum share of the pixels of a fisheye image that its pinhole camera shows.
+
+The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
+"""
 MAX_ANGLE = math.radians(80)
 """Angle from the optical axis beyond which pixels are not kept. A pinhole camera cannot show directions near 90
 degrees."""
@@ -89,13 +92,15 @@ def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
 
 
 def _bent(angles: Float[np.ndarray, " n"], lens: Intrinsics) -> Float[np.ndarray, " n"]:
-    """Return the distances from the principal point, in focal lengths, at which a fisheye lens shows the angles."""
+    """Return the distances from the principal point, in focal lengths, of rays at the given angles to the optical
+    axis."""
     square = angles**2
     return angles * (1 + square * (lens.k1 + square * (lens.k2 + square * (lens.k3 + square * lens.k4))))
 
 
 def _last_angle(lens: Intrinsics) -> float:
-    """Return the angle up to which the distance from the principal point increases with the angle."""
+    """Return the angle to the optical axis, in radians, up to which the distance from the principal point increases
+    with the angle."""
     turns = np.diff(_bent(_ANGLES, lens)) <= 0
     return float(_ANGLES[turns.argmax()] if turns.any() else _ANGLES[-1])
 

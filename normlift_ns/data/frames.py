@@ -134,8 +134,10 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion that is too small to move any pixel. nerfstudio treats fisheye cameras without distortion as pinhole
-cameras."""
+"""Distortion parameter k1 that replaces 0 in fisheye cameras, and is too small to move any pixel.
+
+nerfstudio treats fisheye cameras without distortion as pinhole cameras.
+"""
 
 
 class Intrinsics(NamedTuple):

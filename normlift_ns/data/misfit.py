@@ -45,7 +45,7 @@ _PROBES = (
     *(Lens(y=shift) for shift in (-0.01, 0.01)),
     *(Lens(k1=change) for change in (-0.04, 0.04)),
 )
-"""Small changes. None of them fits better by 1 dB if the lens is right."""
+"""Small changes of the lens. If the lens is right, none of them improves the fit by 1 dB."""
 
 
 class _Pair(NamedTuple):
@@ -58,7 +58,11 @@ class _Pair(NamedTuple):
     center: tuple[float, float]
 
     def compare(self, lens: Lens) -> tuple[float, float]:
-        """Return the PSNR in dB of the render and of the mean color for another lens; -inf and 0 without overlap."""
+        """Compare the image as another lens shows it with the render and with its own mean color.
+
+        Returns:
+            The PSNR in dB of the render and that of the mean color, or -inf and 0 if the overlap is too small.
+        """
         height, width = self.image.shape[2:]
         (fx, fy), (cx, cy) = self.focal, self.center
         x, y = (torch.arange(width) + 0.5 - cx) / fx, ((torch.arange(height) + 0.5 - cy) / fy)[:, None]

@@ -59,7 +59,8 @@ class SplatScene:
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     alignment: Alignment | None = None
-    """Agreement with the images under the rules of gsplat 1.4; None unless the search for the world measured it."""
+    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world measured
+    it."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""
@@ -67,7 +68,7 @@ class SplatScene:
 
     @property
     def gaussians(self) -> GaussianScene:
-        """The N Gaussians, activated."""
+        """All N Gaussians, with activated scales and opacities."""
         return self._gaussians
 
     @cached_property

@@ -165,7 +165,7 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
 _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
-"""Formats that are detected regardless of the suffix. The exception is splat, which has no characteristic bytes."""
+"""Formats that need no suffix, because their first bytes identify them, and splat, which only its suffix identifies."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
 _JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}

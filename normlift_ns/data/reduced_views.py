@@ -16,24 +16,27 @@ from normlift_ns.rasterization.rasterize import render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
 _MAX_SIDE = 400
-"""Longer side in pixels."""
+"""Maximum length of the longer side of a reduced view, in pixels."""
 _MAX_DIVISOR_AS_TRAINED = 4.0
-"""Divisor of the image size below which an image is compared with a render in the trained mode, with the rasterizer's
-blur of 0.3 square pixels scaled down. With a larger divisor, this render would be too thick. An antialiased render is
-used instead, which preserves the mean of Gaussians smaller than a pixel."""
+"""Limit on the divisor of the image size for renders in the trained mode.
+
+Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. With a
+larger divisor, its Gaussians would be too wide. The render is then antialiased, which preserves the mean of Gaussians
+smaller than a pixel.
+"""
 _SMALL_EPS2D = 0.1
 """Variance in square pixels that the antialiased renders add to projected Gaussians."""
 
 
 class ReducedView(NamedTuple):
-    """A view at no more than 400 pixels."""
+    """A view with at most 400 pixels on the longer side."""
 
     view: View
     divisor: float
     """Divisor of the sides of the image, at least 1."""
 
     def reduced(self, side: int) -> ReducedView:
-        """Return the view at no more than `side` pixels, by averaging pixels."""
+        """Return the view with at most `side` pixels on the longer side, by averaging pixels."""
         camera = self.view.camera
         divisor = max(1.0, max(camera.width, camera.height) / side)
         width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
@@ -71,7 +74,7 @@ class ReducedView(NamedTuple):
 
 
 def sample_views(scene: Scene) -> list[ReducedView]:
-    """Return the first, the middle and the last training view at no more than 400 pixels.
+    """Return the first, the middle and the last training view, with at most 400 pixels on the longer side.
 
     Raises:
         FileNotFoundError, ValueError: if an image is missing or cannot be read, or the masks leave no pixels.

@@ -55,7 +55,7 @@ class SplatParameters:
     scales: Float[Tensor, "n 3"]
     """Logarithms of the standard deviations."""
     opacities: Float[Tensor, "n 1"]
-    """Logits."""
+    """Logits of the opacities."""
     features_dc: Float[Tensor, "n 3"]
     """Constant spherical harmonic of the colors."""
     features_rest: Float[Tensor, "n k 3"]

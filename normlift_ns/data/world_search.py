@@ -28,7 +28,7 @@ batch."""
 _MAX_SAMPLED = 2**20
 """Maximum number of Gaussians from which the points are sampled."""
 _SAME_DEPTH = 1.05
-"""Maximum distance of a visible point, relative to that of the nearest point in the same pixel."""
+"""Maximum depth of a visible point, relative to the depth of the nearest point in the same pixel."""
 _LIKELY, _MAX_LIKELY = 0.7, 4
 """Minimum agreement of worlds to render, relative to the best world, and maximum number of these worlds."""
 _SCALES = 1.12 ** np.arange(-61, 62)
@@ -39,14 +39,14 @@ _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
 """Longer side of the renders that refine a scale further, with the step between them in the logarithm of the scale;
 maximum number of these steps."""
 _MIN_START = 2.0
-"""Minimum lead in dB of a first render over the mean color of its image."""
+"""Minimum lead in dB of the PSNR of a first render over the PSNR of the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
 """Angle of the rotations with which a correct world fits worse, and longer side in pixels of the renders that check
 this."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
-"""Relative change below which a scale is rounded to two digits instead of five."""
+"""A scale is rounded to two digits if this changes it by less than this fraction, else to five digits."""
 
 
 class _Points(NamedTuple):

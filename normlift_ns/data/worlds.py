@@ -24,7 +24,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 _MIN_POINTS = 4
 _SAME = 1e-3
-"""Largest difference of the matrices of equal worlds."""
+"""Largest difference between corresponding numbers of two worlds that count as equal, relative to their size."""
 _Y_DOWN_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation that ns-process-data and nerfstudio's COLMAP data parser apply to the cameras of COLMAP."""
 _TURNS = {
@@ -44,7 +44,7 @@ class CandidateWorld(NamedTuple):
     """A world in which a splat may lie."""
 
     name: str
-    """Noun phrase for messages."""
+    """Noun phrase that names the world in messages."""
     world: WorldTransform
     """Map from the cameras' world to that of the splat."""
     opencv_cameras: bool = False
@@ -55,7 +55,7 @@ class CandidateWorld(NamedTuple):
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """`world` as one matrix."""
+        """Homogeneous 4 x 4 matrix of `world`."""
         return np.vstack([self.world.scale * self.world.transform, [0, 0, 0, 1]])
 
     def scaled(self, scale: float) -> CandidateWorld:

@@ -48,7 +48,8 @@ def view_image(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w 3"]:
 
 
 def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
-    """Return the true class of each pixel, as 1 + index into `room.names`, or 0 if it is at most half covered.
+    """Return the true class of each pixel, as 1 + index into `room.names`, or 0 for a pixel that is at most half
+    covered.
 
     The class of a pixel is the class with the largest sum of compositing weights. Floaters do not count.
     """

@@ -80,7 +80,7 @@ class Part(NamedTuple):
     """Function that returns factors [n, 3] or [n, 1] on the color of the class at points [n, 3]; None for a plain
     color."""
     gloss: float = 0.0
-    """Brightness of highlights."""
+    """Color value that is added where a highlight is brightest; 0 for a matte surface."""
 
 
 class Surface(NamedTuple):
@@ -211,17 +211,17 @@ def _faint(count: int, rng: np.random.Generator) -> Array:
 
 
 _SOFTNESS = 6.0
-"""Sharpness of the edges of shadows."""
+"""Sharpness of the edges of shadows. Larger values give harder edges."""
 _GLOSS_POWER = 32
 """Exponent of highlights. Larger values make highlights smaller."""
 
 
 _LAMP, _LAMP_COLOR = np.array([-0.8, 0.9, 2.6]), np.array([0.5, 0.48, 0.45])
-"""Position of the lamp, and color of its light on surfaces that face it."""
+"""Position of the lamp in meters, and color of its light on surfaces that face it."""
 _SKY_COLOR, _FLOOR_COLOR = np.array([0.62, 0.63, 0.65]), np.array([0.5, 0.49, 0.48])
 """Colors of the ambient light on surfaces that face upward and downward."""
 _GRID_STEP = 0.04
-"""Side of the grid cells in which distances are interpolated for shadows."""
+"""Side in meters of the grid cells in which distances are interpolated for shadows."""
 _CHUNKS = 16
 """Number of chunks into which points are divided. A few thousand points per chunk fit into processor caches."""
 _CONTACT_STRENGTH = 1.0
@@ -258,7 +258,10 @@ def _interpolated(scene: Distance, points: Array) -> Distance:
 
 
 def visibility(scene: Distance, start: Array, direction: Array, distance: Array) -> Array:
-    """Return the visible fraction of a soft lamp at each point, [n], from the closest miss of sphere tracing."""
+    """Return the fraction of a soft lamp that is visible from each point, [n].
+
+    Sphere tracing from the point to the lamp finds how closely the ray passes other surfaces.
+    """
     visible, traveled = np.ones(len(start)), np.full(len(start), 0.03)
     for _ in range(32):
         clearance = scene(start + traveled[:, None] * direction)

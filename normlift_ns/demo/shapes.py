@@ -20,12 +20,12 @@ ON_SURFACE = 1e-3
 _OVERLAP = 2.6
 """Standard deviation of a Gaussian relative to that of its patch. It is large enough to close gaps in the surface."""
 _SHELL = 0.02
-"""Largest distance in meters of points that are projected onto the surface."""
+"""Largest distance from the surface, in meters, at which points are projected onto it."""
 _MIN_SCALE = 1e-3
 """Smallest standard deviation of a Gaussian, in meters."""
 _CREASE = 0.03
-"""Weight of normals in patches, in meters. A difference of 60 degrees counts like this distance, so that patches
-end at edges."""
+"""Weight of normals in the division of a surface into patches, in meters. A difference of 60 degrees counts like this
+distance, so that patches end at edges."""
 
 
 class Surfels(NamedTuple):
@@ -178,7 +178,8 @@ def _patch_means(values: Array, patch: NDArray[np.int64], empty: Array) -> Array
 Point = tuple[float, float, float]
 
 _NEAR = 0.25
-"""Distance from the bounding sphere beyond which the sphere replaces the object, which makes lighting faster."""
+"""Distance in meters from the bounding sphere beyond which the sphere replaces the object, which makes lighting
+faster."""
 
 _DIMPLE = 0.38
 """Width of the dimple of a fruit, relative to its radius."""

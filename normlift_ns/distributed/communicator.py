@@ -29,7 +29,7 @@ from normlift_ns.io.file_lock import try_claim
 from normlift_ns.progress import ProgressCallback
 
 VIEW_STAGES = ("features", "evidence")
-"""Stages of a lift that count views."""
+"""Names of the stages of a lift whose progress is counted in views."""
 _STALE_SECONDS = 7 * 86400
 """Age in seconds at which a shared directory of killed processes is deleted."""
 
@@ -53,7 +53,7 @@ class TorchCommunicator(Communicator):
     """Number of previous calls of `claim_chunks`."""
 
     def all_gather(self, rows: Tensor) -> Tensor:
-        """See the base class."""
+        """Implement `Communicator.all_gather`."""
         counts = self._counts(len(rows))
         data = self._bytes(rows)
         width = data.shape[1:]
@@ -64,7 +64,7 @@ class TorchCommunicator(Communicator):
         return _like(torch.cat(parts), rows)
 
     def all_to_all(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        """See the base class."""
+        """Implement `Communicator.all_to_all`."""
         sent_counts = torch.tensor([len(part) for part in parts], device=self.device)
         counts = torch.empty_like(sent_counts)
         dist.all_to_all_single(counts, sent_counts)
@@ -74,20 +74,20 @@ class TorchCommunicator(Communicator):
         return list(_like(received, parts[0]).split(counts.tolist()))
 
     def all_reduce(self, values: Tensor) -> Tensor:
-        """See the base class."""
+        """Implement `Communicator.all_reduce`."""
         total = values.to(self.device, copy=True)
         dist.all_reduce(total)
         return total.to(values.device)
 
     def broadcast(self, values: Tensor) -> Tensor:
-        """See the base class."""
+        """Implement `Communicator.broadcast`."""
         data = self._bytes(values)
         if data.numel() > 0:
             dist.broadcast(data, 0)
         return _like(data, values).reshape(values.shape)
 
     def all_gather_object(self, value: Any) -> list[Any]:
-        """See the base class."""
+        """Implement `Communicator.all_gather_object`."""
         encoded = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
         text = bytes(self.all_gather(encoded).numpy())
         result = []
@@ -199,7 +199,10 @@ class CooEntries(NamedTuple):
 
 @dataclass(frozen=True)
 class EvidenceShard:
-    """Evidence of a few views, split by the process that owns the Gaussians, with rows of the owner's partition."""
+    """Evidence of a few views, split by the process that owns the Gaussians.
+
+    Row indices are those of the Gaussians in the partition of their owner.
+    """
 
     rows: list[CooEntries]
     """Labeled entries for each process."""
@@ -292,11 +295,11 @@ class Halo(NamedTuple):
     """Gaussians of a partition, followed by their neighbors in other processes."""
 
     lifted: Lifted
-    """Directions of all these Gaussians. The norm is the only valid scalar."""
+    """Lift with the directions of all Gaussians of the halo. The norm is its only valid scalar."""
     neighbors: Neighbors
-    """Neighbors of the partition's Gaussians, as rows of this object."""
+    """Neighbors of the partition's Gaussians, as row indices in `lifted`."""
     gaussians: Int64[Tensor, " all"]
-    """Index of each of these Gaussians in the scene."""
+    """Index in the scene of each Gaussian of the halo."""
 
 
 def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Halo:

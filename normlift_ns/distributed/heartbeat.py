@@ -45,7 +45,7 @@ class Heartbeat:
     rank: int
     size: int
     on_failure: Callable[[PeerFailure], None]
-    """Callback before a forced exit, which must return quickly."""
+    """Function that is called before a forced exit. It must return quickly."""
     failure: PeerFailure | None = None
     _waiting: bool = False
     _stop: Event = field(default_factory=Event)

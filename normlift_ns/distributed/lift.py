@@ -158,7 +158,7 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
 
 
 def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> tuple[Evidence, Float64[Tensor, " m"]]:
-    """Return the evidence of the Gaussians that all processes sample, by index, and their sampling probabilities.
+    """Return the evidence and the sampling probabilities of the Gaussians that all processes sample, in index order.
 
     Args:
         sample: Minimum number of Gaussians in every region; see `consensus`.

@@ -35,7 +35,9 @@ class NotCachedError(InputError):
 
 
 def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool] = lambda part: True) -> FeatureSource:
-    """Return a source that caches its expensive results in a folder; return a source without such results unchanged.
+    """Return a source that caches its expensive results in a folder.
+
+    A source without expensive results is returned unchanged.
 
     Args:
         compute: Function that returns True if the given regions or encoder may compute results that are not cached.
@@ -54,7 +56,7 @@ def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool
 
 @dataclass(frozen=True)
 class _Cached:
-    """Base class of caches, which have all attributes of `inner`."""
+    """Base class of caches. A cache also has all attributes of the object `inner` that it wraps."""
 
     inner: Any
     """Object that computes the results."""

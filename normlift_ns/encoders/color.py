@@ -46,7 +46,8 @@ _STRONG_CHROMA = 40.0
 """Chroma, in units of `shading_coordinates`, above which a color counts as strong."""
 _LEVELS = 7
 _LEVEL_POWER = 1.5
-"""Exponent of the levels. Values above 1 make the lattice denser for dark colors, whose coordinates change fastest."""
+"""Exponent of the sRGB levels of the anchors. Values above 1 make the lattice denser for dark colors, whose coordinates
+change fastest."""
 _OWN_SHARE = 0.2
 """Weight of a name's own color; the mean of its shades has the remaining weight. A smaller weight would move pure blue
 closer to purple than to blue."""
@@ -111,7 +112,9 @@ def _mean_lab(view: tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]) -
 
 
 def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, "colors 3"], Int64[np.ndarray, " p"]]:
-    """Return the CIELAB colors of the distinct colors of an image, and the row of every pixel in row-major order.
+    """Return the CIELAB values of the distinct colors of an image, and the row of the color of every pixel.
+
+    Pixels are in row-major order.
 
     An image has several pixels of each color, and the conversion takes most of the time of the encoder.
     """

@@ -184,7 +184,7 @@ def _batches(device: str) -> AdaptiveBatches:
 
 
 class _PendingView(NamedTuple):
-    """A view on the device whose regions are not all encoded yet."""
+    """A view with regions that are not all encoded yet. Its tensors are on the device of the network."""
 
     image: UInt8[Tensor, "h w 3"]
     labels: Int32[Tensor, "depth h w"]

@@ -22,7 +22,7 @@ _ENDINGS = (("ches", "ch"), ("shes", "sh"), ("ses", "s"), ("xes", "x"), ("zes", 
             ("s", ""))  # fmt: skip
 """Plural endings and the singular endings that replace them, as in WordNet."""
 _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|that|which)\b.*")
-"""Part of a phrase that follows its main noun."""
+"""Pattern of the part of a phrase that follows its main noun."""
 
 
 def find_classes(prompt: str) -> list[int]:

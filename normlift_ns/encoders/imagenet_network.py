@@ -97,7 +97,7 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Load the network from the content of a PyTorch weight file, in which names begin with underscores.
+    """Load the network from the content of a PyTorch weight file, whose parameter names begin with underscores.
 
     Batch normalizations are fused into the preceding convolutions, which halves the time on a CPU.
     """

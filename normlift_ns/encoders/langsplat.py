@@ -173,8 +173,10 @@ def shorten_list(values: Sequence[object]) -> str:
 LangSplatLevel = Literal["default", "s", "m", "l", "sum"]
 _NESTED = "language_features"
 _CROP_TOLERANCE = 0.02
-"""Relative difference below which different sizes indicate another crop, such as that of undistortion, instead of
-another resolution."""
+"""Largest relative difference between the sides of a map and of its image that indicates another crop.
+
+Undistortion causes such crops. Larger differences indicate another resolution.
+"""
 _MIN_SUM = 1e-6
 """Length below which a sum of unit vectors has no direction."""
 
@@ -337,7 +339,7 @@ def is_same_image(map_width: int, map_height: int, width: int, height: int) -> b
 
 
 def _sum_levels(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
-    """Return features that are the normalized sums of the table rows of each cell."""
+    """Return the features of a view, with the normalized sum of its table rows as the feature of each cell."""
     zero = table.new_zeros(1, table.shape[1])  # for the row -1
     sums = torch.cat([table, zero])[rows.long()].double().sum(dim=0)
     valid = torch.linalg.vector_norm(sums, dim=1) > _MIN_SUM
@@ -366,7 +368,7 @@ class FeatureExport(NamedTuple):
 
     folder: Path
     overwrite: bool
-    """Replace existing files whose content differs."""
+    """True to replace existing files whose content differs."""
 
     def write(self, source: FeatureSource, image: UInt8[Tensor, "h w 3"], name: str) -> None:
         """Write the files of an image; see `write_langsplat`."""

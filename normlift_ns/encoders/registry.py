@@ -76,13 +76,13 @@ class EncoderKind:
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: tuple[float, float] = (0.4, 0.8)
-    """Range of suggested thresholds between the median (0) and the top (1) of the relevancies."""
+    """Range of suggested thresholds, on a scale from 0 at the median relevancy to 1 at the top relevancy."""
     present_from: tuple[float, float] | None = None
     """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.engine`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False
-    """True if the encoder processes each image once and averages inside regions, so that regions cost as much as
+    """True if the encoder processes each image once and averages inside regions, so that regions take no more time than
     patches."""
     is_here: Callable[[], bool] = lambda: False
     """Function that returns True if the default weights and the packages of the encoder are on this machine. Otherwise,

@@ -116,7 +116,8 @@ def prompt_templates(template: str) -> Sequence[Callable[[str], str]]:
 
 
 _MAX_VECTOR_BYTES, _MAX_FILE_BYTES = 2**20, 2**30
-"""Limits on decompressed sizes in bytes, because a small archive can decompress to a very large size."""
+"""Limits on the decompressed sizes of one vector and of a whole file in bytes, because a small archive can decompress
+to a very large size."""
 _COMMENT_PREFIX = b"normlift_ns "
 """Prefix of the digest in the comment of archives that this package writes. NumPy's archives have no comment."""
 
@@ -266,7 +267,7 @@ CACHE_FORMAT = "normlift_ns.encoders/3"
 """Part of all cache keys. Increase its number if labels or features change for the same settings."""
 _ARRAY = "text"
 _MANY = 64
-"""Number of prompts above which they are cached as one list."""
+"""Largest number of prompts that are cached one by one. A longer list of prompts is cached as a whole."""
 
 
 def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Path:

@@ -51,7 +51,7 @@ BASELINES: dict[Baseline, str] = {
 TOP = 10
 """Number of Gaussians per ray that the baseline "drsplat" uses."""
 VISIBLE = 0.1
-"""Smallest weight of a view that the baseline "vala" uses, relative to the largest weight of the Gaussian in a view."""
+"""Smallest weight of a Gaussian in a view that the baseline "vala" uses, relative to its largest weight in any view."""
 _RAYS = 2**17
 """Number of rays to process at a time."""
 _BLOCK = 2**12
@@ -228,8 +228,9 @@ def iter_medians(
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
     """Yield (Gaussians, unit directions) as in VALA, block by block, with direction 0 without evidence.
 
-    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the other features
-    by cosine distance. It is computed by Weiszfeld iterations with weights E / (1 - cosine), renormalized to length 1.
+    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features
+    of the other views by cosine distance. It is computed by Weiszfeld iterations with weights E / (1 - cosine),
+    renormalized to length 1.
 
     Args:
         gaussians: Gaussians to compute (default: all).

@@ -69,7 +69,7 @@ class StudyImages(NamedTuple):
     names: list[str]
     cameras: list[Camera]
     reasons: list[LeftOutReason]
-    """Reason why an image was not lifted, for each of those images."""
+    """Reason why the image was not lifted, for each image after the lifted ones."""
     left_out: dict[LeftOutReason, int]
 
 
@@ -123,7 +123,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
 
 
 _HIDDEN_SHARE = 0.01
-"""Share of the total surface in Gaussians that are ignored because they are too small or too transparent."""
+"""Share of the total surface whose Gaussians are ignored, because they are the smallest or most transparent."""
 _MIN_SHARE = 0.001
 """Smallest share of the surface in a listed region."""
 _MAX_REGIONS = 20
@@ -141,13 +141,17 @@ class WeakRegion:
     box: dict[str, list[float]]
     """Corners "min" and "max" of the bounding box of the centers, in scene units."""
     share: float
-    """Share of the total surface in all images, in 0..1."""
+    """Share of the total surface of all Gaussians that lies in the region, in 0..1."""
     reliability: float
-    """Mean R_j(S) of `evaluation.coverage`, in 0..1, which gives little weight to views that hardly show a Gaussian."""
+    """Mean of R_j(S), the expected reliability with the lifted views, in 0..1.
+
+    Views that hardly show a Gaussian have little influence on it.
+    """
     lifted_reliability: float
-    """Mean R of the lift, in 0..1, which uses every view with any weight."""
+    """Mean of the reliability R of the lift, in 0..1. Every view counts in which a Gaussian has weight."""
     norm: float
-    """Mean ||f|| of Gaussians with evidence, in 0..1. It is low if views disagree, and similar views do not help."""
+    """Mean ||f|| of Gaussians with evidence, in 0..1. It is low if the views disagree; more views of the same
+    kind then do not help."""
     views: float
     """Mean number of lifted views that show a Gaussian with at least a tenth of its largest weight in an image."""
     unsupported: float
@@ -240,7 +244,7 @@ def _region(evidence: GaussianEvidence, rows: Int64[Tensor, " m"]) -> WeakRegion
 PIXELS = 20_000
 """Number of pixels per image for the rasterization of weights."""
 FAINT = 0.1
-"""Smallest weight of a view that shows a Gaussian, as a share of the largest weight of the Gaussian."""
+"""Smallest weight of a Gaussian in a view that shows it, as a share of its largest weight in any view."""
 
 _CHUNK = 2**24
 """Number of entries to process at a time."""
@@ -260,7 +264,7 @@ class ReliabilityModel:
     """Evidence of the lifted views for every Gaussian in float64, from which reliability is computed."""
 
     norm: Float64[Tensor, " n"]
-    """||f_j||, or its expected value without evidence."""
+    """||f_j||, or its expected value for Gaussians without evidence."""
     weight: Float64[Tensor, " n"]
     """sum_v W_jv over the lifted views."""
     squared: Float64[Tensor, " n"]
@@ -338,7 +342,7 @@ def model_of_lift(
 
 
 def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
-    """Return gain(v) of every view in addition to the lifted views."""
+    """Return gain(v) of every view, the increase of the mean reliability if it is lifted in addition."""
     before = model.reliability(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
@@ -410,7 +414,10 @@ MIN_SHOWN_SHARE = 0.3
 _MIN_DEPTH = 0.15
 """Smallest depth in front of a new camera, as a share of the median depth of the images."""
 _NEAR_SHARE = 0.05
-"""Share of the pixels of a new camera that may have a smaller depth."""
+"""Share of the pixels of a new camera that may have a depth below `_MIN_DEPTH`.
+
+It is also the margin of the depth test for free positions.
+"""
 _DEPTH_PIXELS = 5_000
 _DEPTH_VIEWS = 16
 
@@ -702,7 +709,7 @@ class Coverage:
     """
 
     reliability: float
-    """Mean R_j(S) of `evaluation.coverage` over all surfaces in the images, in 0..1."""
+    """Mean over all surfaces in the images of R_j(S), the expected reliability with the lifted views, in 0..1."""
     regions: list[WeakRegion]
     """Regions without reliable evidence, worst first."""
     photographs: list[SuggestedImage]

@@ -168,7 +168,10 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
 
 
 _BOX, _THRESHOLD, _HALF_WINDOW = 30, 0.4, 3
-"""Side of the box filter, threshold, and half the side of the majority window, as in LangSplat."""
+"""Side of the box filter in pixels, threshold, and half the side of the majority window in pixels, as in LangSplat.
+
+The threshold applies to 2 x - 1 for a relevancy x that is scaled to 0..1.
+"""
 
 
 class FrameScores(NamedTuple):

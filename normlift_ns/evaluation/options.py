@@ -22,7 +22,8 @@ LANGSPLAT_MASKINGS: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
 """Maskings that use LangSplat's relevancy."""
 AveragingOrder = Literal["frames", "pairs", "categories"]
 MASK_MARGIN = 0.02
-"""Default lead over every background word, from section "Mask thresholding" of the paper. SFS's code uses 0."""
+"""Default lead in cosine over every background word, from section "Mask thresholding" of the paper. SFS's code uses
+0."""
 
 
 MAX_SUGGESTED_POSES = 5

@@ -195,7 +195,7 @@ class EvaluatedRun:
         """Return the length of the composited feature vector of every pixel, for each camera.
 
         Args:
-            factor: factor of the directions before compositing.
+            factor: number that multiplies each direction before compositing.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -215,7 +215,10 @@ Rasterize = Callable[..., Evidence]
 
 
 def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
-    """Return `rasterize_evidence` for a scene, or for its Gaussians on another device if they are given."""
+    """Return `rasterize_evidence` with the Gaussians and the mode of a scene as fixed arguments.
+
+    `gaussians` replaces the Gaussians of the scene, for example by a copy on another device.
+    """
     gaussians = scene.gaussians if gaussians is None else gaussians
     return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)
 

@@ -14,7 +14,7 @@ _MIN_RANGE, _MIN_VARIANCE = 1e-12, 1e-10
 _MAX_QUANTILE_VALUES = 2**24
 """Largest number of values that torch.quantile accepts."""
 _EPSILON = 1e-12
-"""Lower bound of shares, so that means of empty sides are finite."""
+"""Lower bound on the share of pixels on a side of Otsu's split, so that the mean of an empty side is finite."""
 
 
 def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:

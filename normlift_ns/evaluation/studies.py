@@ -550,7 +550,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
 def study_timing(
     runs: Sequence[EvaluatedRun], device: str = "cpu", tell: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Return the time of every stage in seconds and the peak memory of every lift, from the manifests, and their means.
+    """Return the seconds of every stage and the peak memory of every lift from the manifests, and means over the lifts.
 
     On a GPU, also time SFS's method and that of this package on some views of each run.
 

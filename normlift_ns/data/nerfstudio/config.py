@@ -372,7 +372,7 @@ def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
 
 
 _NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
-"""One object per name, so that a dump refers to repeated names, as to repeated classes."""
+"""One object per name, so that a dump writes repeated names as YAML aliases, as it does for repeated classes."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent)
 _ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))

@@ -300,7 +300,7 @@ class SplatfactoModelConfig:
 
 @_mirror(f"{_OURS}.model", "NormLiftModel")
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """Options of the model of a lifted run: splatfacto with the path of the semantics."""
+    """Options of the model of a lifted run: those of splatfacto, and the path of the semantics."""
 
     semantics: Path | None = None
 

@@ -59,9 +59,9 @@ def normalize_poses(
 def compose_applied_transform(
     transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
 ) -> Float[Tensor, "3 4"]:
-    """Return a transform that starts from the original world of the capture.
+    """Return the composition of `applied` and `transform`, which starts from the original world of the capture.
 
-    `applied` was applied to the poses before they were stored; None if there was no such transform.
+    `applied` is the transform that was applied to the poses before they were stored, or None if there was none.
     """
     if applied is None:
         return transform
@@ -589,7 +589,7 @@ def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapIma
 def _pose(image: ColmapImage, flip: bool) -> Float[np.ndarray, "4 4"]:
     """Return the camera-to-world pose of an image in OpenGL convention.
 
-    With `flip`, the up direction of the first camera is along z.
+    With `flip`, the world is rotated as in nerfstudio, so that the -y axis of COLMAP becomes z.
     """
     w, x, y, z = image.rotation
     rotation = np.array(

@@ -28,7 +28,10 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import view_colors
 
 _NUM_DISTORTION = {"PERSPECTIVE": 6, "FISHEYE": 4}
-"""Minimum number of distortion parameters of a distorted camera, in the order k1, k2, k3, k4, p1, p2, by type."""
+"""Minimum number of distortion parameters of a distorted camera, by camera type.
+
+The parameters are k1, k2, k3, k4, p1 and p2, in this order.
+"""
 
 
 class TrainedViews(SplitViews):
