@@ -41,7 +41,7 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
     """Split every text of an option with `split_prompts`.
 
     Raises:
-        ValueError: there are texts, but no prompts in them.
+        ValueError: There are texts, but no prompts in them.
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
@@ -193,7 +193,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 
 
 QUERIES_FILE = "queries.safetensors"
-"""Name of the file in the folder of the field. It has the embeddings as tensors, and all else as JSON metadata."""
+"""Name of the file in the folder of the field. It has the embeddings as tensors, and everything else as metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
