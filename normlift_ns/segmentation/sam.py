@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
 Images are resized as in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to 8
-bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height and this
-is less work, Pillow 13 can start with the columns. Pixel values then differ by at most one.
+bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height, Pillow
+13 can start with the columns to save work. Pixel values then differ by at most one.
 """
 
 from __future__ import annotations
