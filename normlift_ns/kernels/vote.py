@@ -6,10 +6,10 @@ h h + h l + l h, give cosines with 22 bits. Most votes need only the first produ
 Let e be the largest |l| of a Gaussian and its neighbors. Assume that all products and sums are exact except for
 rounding errors of 2**-23 relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with
 t = 2.02 e + (D + 16) 2**-23. The derivative of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let
-f = exp(t / gamma) - 1. An error t of the cosine then changes a sigmoid g by at most f g (1 - g). Let A be the weighted
-sum of g, and W the sum of the weights. By Jensen's inequality, the error of A is at most f A (1 - A / W). The rounding
-of sums adds at most 3e-5. If these error intervals determine the winner, the vote is finished. Otherwise, the kernel adds
-the other products and compares again.
+f = exp(t / gamma) - 1. An error t of the cosine then changes a sigmoid g by at most f g (1 - g). Let A be the
+weighted sum of g, and W the sum of the weights. By Jensen's inequality, the error of A is at most f A (1 - A / W).
+The rounding of sums adds at most 3e-5. If these error intervals determine the winner, the vote is finished.
+Otherwise, the kernel adds the other products and compares again.
 """
 
 from __future__ import annotations
