@@ -279,7 +279,7 @@ class ServedRun:
     def view_of(
         self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
     ) -> PageView:
-        """Return a camera that looks at an object or a point from a position without occlusion.
+        """Return a camera that looks at an object or a point from a position with little occlusion, if there is one.
 
         Args:
             view: Current camera; None for that of the first training image.
