@@ -275,7 +275,7 @@ class Finding:
 
     @property
     def mean_reliability(self) -> float | None:
-        """Weighted mean of R over the selected Gaussians."""
+        """Weighted mean of the reliability R over the selected Gaussians."""
         return self._selection.mean_reliability
 
     @property
@@ -311,7 +311,7 @@ class SelectionStats(NamedTuple):
     extent: list[float] | None
     """Size of the box that contains the central 90 % of the selected centers along each axis."""
     mean_reliability: float | None
-    """Weighted mean of R over the selected Gaussians."""
+    """Weighted mean of the reliability R over the selected Gaussians."""
 
     @staticmethod
     def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:

@@ -162,7 +162,7 @@ class SegmentationResult(NamedTuple):
     found: Bool[Tensor, "q v"]
     """True for images in which SAM 3 found the prompt."""
     min_reliability: float = 0.0
-    """Minimum R of a selected Gaussian, in 0..1."""
+    """Minimum reliability R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
         """Return the mask of sufficiently reliable Gaussians with more than half of their weight inside the masks."""
@@ -216,7 +216,7 @@ def query_sam3(
         find_masks: Function that returns SAM 3's mask of each prompt in an image.
         texts: Prompts.
         views: Maximum number of views.
-        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
         settings: Constants of the rasterizer.
         device: Device of the rasterizer.
     Raises:
