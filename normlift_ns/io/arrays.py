@@ -193,7 +193,7 @@ def check_array(
 
     Args:
         name: Name of the array, for the error message.
-        low, high: Bounds of its values, both inclusive. NaN and infinity are always out of range.
+        low, high: Bounds of its values, both inclusive. NaN is always out of range.
     Raises:
         ValueError: The array differs. The message gives the actual and the expected properties.
 

@@ -21,13 +21,19 @@ from normlift_ns.kernels.projection_2dgs import SPLAT_2D
 
 _BLOCK = 32
 _ROUNDING = tl.constexpr(2.0**-20)
-"""Relative float32 rounding error of the squares in an exponent, at most 12 half units in the last place."""
-_REACH_MARGIN = tl.constexpr(1e-3)
-"""Margin of the largest relevant exponent, for rounding of the exponential and of the float64 computation here."""
-_NEEDLE = tl.constexpr(1e-6)
-"""Limit for the ratio of a determinant to the product of its diagonal.
+"""Bound on the relative float32 rounding error of a dx^2 and c dy^2 in the exponent of alpha.
 
-Below this limit, the determinant is too inaccurate to cull a splat.
+The error is at most 12 half units in the last place.
+"""
+_REACH_MARGIN = tl.constexpr(1e-3)
+"""Margin added to the exponent log(opacity / min_alpha), at which alpha falls to its threshold.
+
+It covers the rounding of the exponential in gsplat and of the float64 computation here.
+"""
+_NEEDLE = tl.constexpr(1e-6)
+"""Smallest ratio of the determinant of a conic to the product of its diagonal entries for which a splat is culled.
+
+Below this ratio, the determinant is too inaccurate.
 """
 _FAR = tl.constexpr(1e30)
 
@@ -200,7 +206,7 @@ def build_cell_lists(
 UNROLL = 4
 """Number of splats between two checks whether all pixels of a cell are finished."""
 _MOST_SLOTS = 2**26
-"""Largest number of slots in a chunk, of 8 or 12 bytes each."""
+"""Largest number of slots in a chunk. A slot holds one sum and its key, and takes 8 or 12 bytes."""
 _COPIED = 128
 """Number of sums that a program of `_pack` copies in one step."""
 _PLACES = 512
@@ -219,7 +225,7 @@ class RegionSums(NamedTuple):
     """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """Keys row * columns + label + 1, in which row is the row of the splat."""
+    """Keys row * columns + label + 1. The row is that of the splat in `ProjectedSplats`."""
     weight: Float32[Tensor, " m"]
 
 
@@ -239,7 +245,7 @@ def _unpack_floats(pair):
 
 @triton.jit
 def load_splat(splats, m, valid, IS_2D: tl.constexpr):
-    """Return u, v, opacity and nine numbers of the shape of a splat; an invalid splat has opacity 0.
+    """Return u, v, opacity and nine numbers that describe the shape of a splat; an invalid splat has opacity 0.
 
     For a 2D Gaussian, the nine numbers are its transform. For a 3D Gaussian, the first three are half of xx, half of yy
     and xy of its conic, and the others repeat xy.
@@ -281,7 +287,7 @@ def _exponent_2d(u, v, u0, u1, u2, v0, v1, v2, w0, w1, w2, px, py):
 def blend(
     u, v, opacity, a, b, c, d, e, f, g, h, i, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D: tl.constexpr
 ):  # fmt: skip
-    """Return A_ij of one splat and the transmittance behind the splat in all pixels; 0 for finished pixels."""
+    """Return A_ij of one splat and the transmittance behind it in all pixels; both are 0 for finished pixels."""
     sigma = _exponent(u, v, a, b, c, px, py)
     if IS_2D:
         sigma = _exponent_2d(u, v, a, b, c, d, e, f, g, h, i, px, py)

@@ -105,7 +105,7 @@ def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
     dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Compute one row per program. Repeat a sum in float64 if it cancels or has many entries."""
+    """Compute one row per program. Repeat a sum in float64 if its terms nearly cancel or are many."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     if stop - start <= 1:  # no vector sum is needed, because rows of the table are unit vectors
@@ -176,7 +176,7 @@ def row_norms(
         weight: Weights of the entries.
         column_view: View of every column, non-decreasing.
         table: Unit rows F.
-        min_share: Ratio of the norm of a sum to its weight below which the sum is repeated in float64.
+        min_share: Ratio of the norm of a sum to the sum of its weights, below which it is repeated in float64.
         max_entries: Number of entries above which a sum is repeated in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
@@ -234,7 +234,7 @@ def unit_sums(
         column: Columns of the entries.
         weight: Weights of the entries.
         table: Unit rows F.
-        norms: Norm of every row of E.
+        norms: Norm of sum_s E_js F_s for every row j of E.
         dtype: Precision of the result.
         min_share: As in `row_norms`.
         max_entries: As in `row_norms`.

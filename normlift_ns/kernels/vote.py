@@ -3,12 +3,13 @@
 Float32 rows u are split into u = h + l, with 11 bits each. Three products at the fastest rate of tensor cores,
 h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
 
-Let e be the largest |l| in the group. Assume that all products and sums are exact except for rounding errors of 2**-23
-relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. The derivative
-of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let f = exp(t / gamma) - 1. An error t of the cosine
-then changes a sigmoid g by at most f g (1 - g). Let A be the weighted sum of g, and W the sum of the weights. By
-Jensen's inequality, the error of A is at most f A (1 - A / W). The rounding of sums adds at most 3e-5. If these error
-intervals determine the winner, the vote is finished. Otherwise, it adds the remaining products and compares again.
+Let e be the largest |l| of a Gaussian and its neighbors. Assume that all products and sums are exact except for
+rounding errors of 2**-23 relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with
+t = 2.02 e + (D + 16) 2**-23. The derivative of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let
+f = exp(t / gamma) - 1. An error t of the cosine then changes a sigmoid g by at most f g (1 - g). Let A be the
+weighted sum of g, and W the sum of the weights. By Jensen's inequality, the error of A is at most f A (1 - A / W).
+The rounding of sums adds at most 3e-5. If these error intervals determine the winner, the vote is finished.
+Otherwise, the kernel adds the other products and compares again.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def _winner(score, member, slot, valid, i, delta):
 
 @triton.jit
 def _certain(agreed, r, weight, slot, valid, spread, delta):
-    """Return True if all scores within their error intervals (see above) have the same winner, and False for NaN."""
+    """Return True if the winner is the same for all scores in their error intervals (see above); False for NaN."""
     share = agreed / tl.sum(weight, axis=0)  # A / W
     score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
@@ -188,7 +189,7 @@ def vote(
         tau: Threshold of the sigmoid.
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
-        delta: Support by which a neighbor must exceed the Gaussian itself.
+        delta: Amount by which the support of a neighbor must exceed that of the Gaussian itself.
         own: Number of views that agree on each Gaussian's own direction, or None for the paper's vote.
         prior: Weight of the neighbors in a posterior vote, as a number of views.
         precision: Precision of the products of float32 directions. "halves" uses two halves of 11 bits each.

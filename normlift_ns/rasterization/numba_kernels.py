@@ -93,7 +93,7 @@ def interleaved_index(position, count, threads):  # pragma: no cover (compiled)
 
 
 _REACH_MARGIN = 1e-2
-"""Margin of the exponent at which alpha falls below min_alpha, so that rounding does not drop pixels."""
+"""Margin added to the exponent at which alpha falls below min_alpha, so that rounding does not drop pixels."""
 _ROUNDINGS = 4
 """Bound on the rounding error of an exponent, in units of machine epsilon times (a dx^2 + c dy^2)."""
 

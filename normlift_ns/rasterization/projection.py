@@ -40,7 +40,7 @@ class ProjectedGaussians(NamedTuple):
     """Rows of the scene."""
     means2d: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
-    """Inverse covariance in square pixels: xx, xy, yy."""
+    """Entries xx, xy and yy of the inverse covariance, in 1 / pixels^2."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
     """Half width and half height of the rectangle that selects tiles, in whole pixels."""
@@ -60,7 +60,7 @@ class PreparedGaussians2D(NamedTuple):
     gaussian: Int64[Tensor, " m"]
     """Rows of the scene."""
     means: Float[Tensor, "m 3"]
-    """Centers in the precision of the scene, which decides the drawing order."""
+    """Centers in the precision of the scene, because rounding would change the drawing order."""
     axes: Float64[Tensor, "m 3 2"]
     """The two axes in the plane of each Gaussian, as long as its standard deviations."""
     opacities: Float[Tensor, " m"]
@@ -77,7 +77,7 @@ class ProjectedGaussians2D(NamedTuple):
     """Matrices from (a, b, 1), with a and b in standard deviations along the axes, to homogeneous pixels."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
-    """Half width and height of the square that selects the tiles, in whole pixels."""
+    """Half width and half height of the square that selects the tiles, in whole pixels."""
 
     def exponents(
         self, members: Int64[Tensor, " k"], x: Float[Tensor, " w"], y: Float[Tensor, " h"]

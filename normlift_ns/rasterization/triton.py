@@ -27,7 +27,7 @@ With many Gaussians, smaller cells are faster, because the pixels of a cell have
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest number of views in a batch times Gaussians, and largest number of views in a batch.
+"""Largest product of the numbers of views in a batch and of Gaussians, and largest number of views in a batch.
 
 A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """

@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
 Images are resized as in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to 8
-bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height and this
-is less work, Pillow 13 can start with the columns. Pixel values then differ by at most one.
+bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height, Pillow
+13 can start with the columns to save work. Pixel values then differ by at most one.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _per_head(attention: Any, projection: Any) -> Tensor:
 
 
 def _image_scores(keys: Tensor, positions: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return a function that computes the products [P, K, N] of directions [P, K, C] and the positioned image.
+    """Return a function that computes the products [P, K, N] of vectors [P, K, C] and the image with its positions.
 
     Args:
         keys: Embedding of the image, [N, C] or [P, N, C].
@@ -231,7 +231,7 @@ class _Upscaling(NamedTuple):
     weights: tuple[Tensor, Tensor]
     """Matrices [4 O, C], which map a position with C channels to 2 x 2 positions with O channels in row-major order."""
     biases: tuple[Tensor, Tensor]
-    """Biases [O]."""
+    """Bias [O] of each convolution."""
     norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], mask_channels: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:

@@ -14,8 +14,8 @@ from normlift_ns.session.state import State
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
 """Coloring of the scene. overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy.
-prompts: the same at full strength. heat: relevancy of all Gaussians in a colormap. reliability: R from 0 to 1. rgb:
-trained colors. pca: three principal components of the features as RGB."""
+prompts: the same at full strength. heat: relevancy of all Gaussians in a colormap. reliability: R in a colormap from
+0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 NOT_DRAWN = 255
 """Code of Gaussians that are not drawn."""

@@ -141,7 +141,11 @@ class ServedRun:
 
     @cached_property
     def frame(self) -> tuple[list[float], list[float], float]:
-        """Mean up direction of the cameras, center of the scene, and a radius that contains 80 % of it."""
+        """Mean up direction of the cameras, center of the scene, and radius of the scene.
+
+        The center is the median position of the cameras and the drawn Gaussians. The cube around it whose half side is
+        the radius contains 80 % of them.
+        """
         poses = [camera.world_to_camera.double().cpu().numpy() for camera in self.run.scene.train.cameras]
         up = -np.mean([pose[1, :3] for pose in poses], axis=0) if len(poses) > 0 else np.zeros(3)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
@@ -275,7 +279,7 @@ class ServedRun:
     def view_of(
         self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
     ) -> PageView:
-        """Return a camera that looks at an object or a point from a position without occlusion.
+        """Return a camera that looks at an object or a point from a position with little occlusion, if there is one.
 
         Args:
             view: Current camera; None for that of the first training image.
