@@ -276,11 +276,16 @@ def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str 
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
-def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
-    """Report the warning of `compare_with_images`, unless the request disables the comparison."""
+def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_rendering: Callable[[], None]) -> None:
+    """Report the warning of `compare_with_images`, unless the request disables the comparison.
+
+    Args:
+        wait_for_rendering: function that waits for the kernels of renders.
+    """
     if not prepared.request.check_alignment:
         return
     with stages("check") as step:
+        wait_for_rendering()
         warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
         step()
     if warning is not None:

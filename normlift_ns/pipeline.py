@@ -8,7 +8,7 @@ in several processes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -33,7 +33,7 @@ from normlift_ns.core.consensus import (
 from normlift_ns.core.evidence import Entries, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
@@ -55,7 +55,7 @@ from normlift_ns.evidence_collection import (
 from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
-from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
+from normlift_ns.rasterization.rasterize import resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
@@ -65,7 +65,7 @@ _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of them."""
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
-_WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
+_WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
 
 
 class LiftResult(NamedTuple):
@@ -87,7 +87,7 @@ def lift_scene(
     encoder: Mapping[str, Any],
     export: FeatureExport | None = None,
     report: ProgressCallback = lambda stage, done, total: None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[Callable[[], None]], None] = lambda wait_for_rendering: None,
 ) -> LiftResult:
     """Lift 2D features onto the Gaussians of a trained scene.
 
@@ -97,7 +97,8 @@ def lift_scene(
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
         export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
-        check: function that raises if the scene must not be lifted. It runs while kernels are compiled.
+        check: function that raises if the scene must not be lifted. Its argument is a function that waits for the
+            kernels of renders, which are compiled meanwhile.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
@@ -105,9 +106,10 @@ def lift_scene(
     stages, facts = StageTimer(report), {}
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
     options, means = collection.options, collection.gaussians.means
-    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
-    check()
-    views = collection.collect(stages, wait_for_kernels)
+    collection.start_preparing_regions()
+    kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
+    check(kernels.wait_for_rendering)
+    views = collection.collect(stages, kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
@@ -465,61 +467,116 @@ def with_cost(field: SemanticField, stages: StageTimer, device: str) -> Semantic
     return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
 
 
+class KernelWarmUp:
+    """Threads that compile or load the kernels of a lift before their first use.
+
+    Errors in the threads are suppressed, because the lift itself raises them again.
+
+    Args:
+        rendering: calls that compile the kernels of renders.
+        early: calls that compile the other kernels that do not depend on the features.
+        lift: calls that compile the remaining kernels, as a function of the dimension of the features.
+    """
+
+    def __init__(
+        self,
+        rendering: Iterable[Callable[[], None]] = (),
+        early: Iterable[Callable[[], None]] = (),
+        lift: Callable[[int], Iterable[Callable[[], None]]] = lambda dimension: (),
+    ) -> None:
+        self._rendering, self._early = [_start_quietly(x) for x in rendering], [_start_quietly(x) for x in early]
+        self._lift: list[Thread] = []
+        self._lift_calls = lift
+
+    def start_lift(self, dimension: int) -> None:
+        """Start to compile the kernels that depend on the dimension of the features, unless this has been done."""
+        if len(self._lift) == 0:
+            self._lift = [_start_quietly(call) for call in self._lift_calls(dimension)]
+
+    def wait_for_rendering(self) -> None:
+        """Wait for the kernels of renders."""
+        for thread in self._rendering:
+            thread.join()
+
+    def wait_for_evidence(self) -> None:
+        """Wait for all kernels that do not depend on the features."""
+        for thread in (*self._rendering, *self._early):
+            thread.join()
+
+    def wait(self) -> None:
+        """Wait for all kernels whose compilation has been started."""
+        for thread in (*self._rendering, *self._early, *self._lift):
+            thread.join()
+
+
+def _start_quietly(call: Callable[[], None]) -> Thread:
+    """Run a function in a thread, and suppress its errors."""
+
+    def run() -> None:
+        with suppress(Exception), torch.no_grad():
+            call()
+
+    thread = Thread(target=run, name="kernel warm-up", daemon=True)
+    thread.start()
+    return thread
+
+
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
-) -> Callable[[], None]:
-    """Start to compile or load kernels in the background, and return a function that waits for them."""
+) -> KernelWarmUp:
+    """Start to compile or load the kernels of a lift in the background."""
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
-        return compile_kernels(config.dtype).join
+        return KernelWarmUp(early=[lambda: compile_kernels(config.dtype).join()])
     if config.backend != "triton" or len(scene.train) == 0:
-        return lambda: None
-    threads = warm_up_kernels(gaussians, scene.train.cameras[0], options, config)
+        return KernelWarmUp()
+    from normlift_ns.rasterization.triton import kernel_calls  # noqa: PLC0415 (needs triton)
 
-    def wait() -> None:
-        for thread in threads:
-            thread.join()
-
-    return wait
+    rendering, sums = kernel_calls(gaussians, scene.train.cameras[0], **config.options)
+    early, lift = lift_calls(gaussians.means, options)
+    return KernelWarmUp(rendering, [*sums, *early], lift)
 
 
-def warm_up_kernels(
-    gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig
-) -> list[Thread]:
-    """Compile or load kernels in threads that each run a stage of the lift on some Gaussians and discard the result.
+def lift_calls(
+    means: Float[Tensor, "n 3"], options: LiftOptions
+) -> tuple[list[Callable[[], None]], Callable[[int], list[Callable[[], None]]]]:
+    """Return calls that run stages of a lift on some Gaussians and discard the results, to compile their kernels.
 
-    The threads suppress errors, because the lift itself raises them again.
+    Returns:
+        Calls for consensus and neighbors, and a function that returns those for lift and vote of a feature dimension.
     """
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
-    sample = gaussians.select(slice(_WARM_UP_GAUSSIANS))
-    means, regions = sample.means, _WARM_UP_REGIONS
-    features = torch.eye(regions, _WARM_UP_DIMENSION, dtype=config.dtype, device=means.device)
+    means, regions = means[:_WARM_UP_GAUSSIANS], _WARM_UP_REGIONS
+    n, device = len(means), means.device
+    votes = options.refine and n > options.vote.k
 
-    def rasterize() -> None:
-        rasterize_evidence(sample, [camera], [labels], num_regions=[regions], **config.options)
+    def evidence() -> Evidence:
+        gaussian = torch.arange(n, dtype=torch.int32, device=device)
+        entries = Entries(gaussian, gaussian % regions + 1, torch.ones(n, device=device), (regions,))
+        return Evidence.from_entries([entries], n)
 
-    def lift_sample() -> None:
-        gaussian = torch.arange(len(sample), dtype=torch.int32, device=means.device)
-        entries = Entries(gaussian, gaussian % regions + 1, means.new_ones(len(sample), dtype=config.dtype), (regions,))
-        evidence = Evidence.from_entries([entries], len(sample))
+    def agree() -> None:
         if options.consensus:
-            consensus(evidence, features)
-        lift(evidence, features, beta=options.reliability_beta, unlabeled=options.unlabeled).directions()
+            consensus(evidence(), torch.eye(regions, device=device))
 
-    def vote() -> None:
-        if options.refine and len(sample) > options.vote.k:
-            rows, ones = features[torch.arange(len(sample)) % regions], means.new_ones(len(sample))
-            refine(means, rows, ones, options.vote, own=ones, neighbors=nearest_neighbors(means, options.vote.k))
+    def find_neighbors() -> None:
+        if votes:
+            nearest_neighbors(means, options.vote.k)
 
-    def run(stage: Callable[[], None]) -> None:
-        with suppress(Exception), torch.no_grad():  # as the docstring says
-            stage()
+    def of_dimension(dimension: int) -> list[Callable[[], None]]:
+        features = torch.zeros(regions, dimension, device=device)
+        features[:, 0] = 1
 
-    threads = [
-        Thread(target=run, args=(x,), name="kernel warm-up", daemon=True) for x in (rasterize, lift_sample, vote)
-    ]
-    for thread in threads:
-        thread.start()
-    return threads
+        def lift_sample() -> None:
+            lifted = lift(evidence(), features, beta=options.reliability_beta, unlabeled=options.unlabeled)
+            lifted.directions()
+            lifted.evidence.rows.matmul(features[:, :1])
+
+        def vote() -> None:
+            if votes:
+                rows, ones = features[torch.arange(n, device=device) % regions], torch.ones(n, device=device)
+                refine(means, rows, ones, options.vote, own=ones, neighbors=nearest_neighbors(means, options.vote.k))
+
+        return [lift_sample, vote]
+
+    return [agree, find_neighbors], of_dimension

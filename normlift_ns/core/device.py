@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import islice
@@ -79,7 +80,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 
 
 def init_cuda(device: str) -> None:
-    """Initialize CUDA in a background thread, because it takes about a second.
+    """Initialize CUDA, and the cache of Triton, in background threads, because both take about a second.
 
     Errors are ignored here. They occur again at the first use of the GPU.
     """
@@ -88,8 +89,12 @@ def init_cuda(device: str) -> None:
         with suppress(Exception):
             torch.empty(1, device=device)
 
-    if device.startswith("cuda"):
-        Thread(target=start, name="init-cuda", daemon=True).start()
+    def hash_triton() -> None:  # keys of the cache contain a hash of Triton's own files
+        with suppress(Exception):
+            import_module("triton.runtime.cache").triton_key()
+
+    for work in (start, hash_triton) if device.startswith("cuda") else ():
+        Thread(target=work, name="init-cuda", daemon=True).start()
 
 
 def choose_device(device: str) -> str:

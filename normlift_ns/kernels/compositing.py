@@ -68,7 +68,7 @@ class CellLists(NamedTuple):
     """Rows of the splats in `ProjectedSplats`."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["entries", "views"])
 def _pairs(
     splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
     tiles_across, tiles_down, cells_across, cells_down,
@@ -315,7 +315,7 @@ def _number_labels(
     tl.store(counts + cell, count)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_cell", "first_slot", "columns"])
 def _sum_regions(
     splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
@@ -377,7 +377,7 @@ def _sum_regions(
     tl.store(out_used + cell - first_cell, slot - first)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["base", "first_slot"])
 def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
     """Move the used slots of a cell directly behind those of the previous cells."""
     cell = tl.program_id(0).to(tl.int64)
@@ -454,7 +454,7 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
     ]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "columns", "views"])
 def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count

@@ -96,6 +96,9 @@ class RegionDefaults:
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
+    def prepare(self) -> None:
+        """Load what segments images, in a background thread before the first image."""
+
 
 @dataclass(frozen=True)
 class Superpixels(RegionDefaults):
@@ -111,10 +114,15 @@ class Superpixels(RegionDefaults):
         return {"kind": "superpixel", "count": self.count, "compactness": _COMPACTNESS}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
-        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
+        from normlift_ns.segmentation.slic import slic  # noqa: PLC0415 (takes a second; other regions do not need it)
 
-        segments = slic(image.numpy(), n_segments=self.count, compactness=_COMPACTNESS, start_label=0)
+        segments = slic(image.numpy(), self.count, _COMPACTNESS)
         return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
+
+    def prepare(self) -> None:
+        from normlift_ns.segmentation.slic import compile_kernels  # noqa: PLC0415 (as above)
+
+        compile_kernels()
 
 
 @dataclass(frozen=True)
