@@ -30,6 +30,7 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     with_original_reliability,
 )
+from normlift_ns.core.device import load_triton
 from normlift_ns.core.evidence import Entries, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
@@ -476,6 +477,7 @@ class KernelWarmUp:
         rendering: calls that compile the kernels of renders.
         early: calls that compile the other kernels that do not depend on the features.
         lift: calls that compile the remaining kernels, as a function of the dimension of the features.
+        load: function that each thread calls first.
     """
 
     def __init__(
@@ -483,15 +485,25 @@ class KernelWarmUp:
         rendering: Iterable[Callable[[], None]] = (),
         early: Iterable[Callable[[], None]] = (),
         lift: Callable[[int], Iterable[Callable[[], None]]] = lambda dimension: (),
+        load: Callable[[], None] = lambda: None,
     ) -> None:
-        self._rendering, self._early = [_start_quietly(x) for x in rendering], [_start_quietly(x) for x in early]
-        self._lift: list[Thread] = []
-        self._lift_calls = lift
+        self._lift_calls, self._load, self._lift = lift, load, list[Thread]()
+        self._rendering, self._early = ([self._start(call) for call in calls] for calls in (rendering, early))
+
+    def _start(self, call: Callable[[], None]) -> Thread:
+        def run() -> None:
+            with suppress(Exception), torch.no_grad():
+                self._load()
+                call()
+
+        thread = Thread(target=run, name="kernel warm-up", daemon=True)
+        thread.start()
+        return thread
 
     def start_lift(self, dimension: int) -> None:
         """Start to compile the kernels that depend on the dimension of the features, unless this has been done."""
         if len(self._lift) == 0:
-            self._lift = [_start_quietly(call) for call in self._lift_calls(dimension)]
+            self._lift = [self._start(call) for call in self._lift_calls(dimension)]
 
     def wait_for_rendering(self) -> None:
         """Wait for the kernels of renders."""
@@ -509,18 +521,6 @@ class KernelWarmUp:
             thread.join()
 
 
-def _start_quietly(call: Callable[[], None]) -> Thread:
-    """Run a function in a thread, and suppress its errors."""
-
-    def run() -> None:
-        with suppress(Exception), torch.no_grad():
-            call()
-
-    thread = Thread(target=run, name="kernel warm-up", daemon=True)
-    thread.start()
-    return thread
-
-
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
 ) -> KernelWarmUp:
@@ -528,14 +528,14 @@ def start_kernel_warm_up(
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
-        return KernelWarmUp(early=[lambda: compile_kernels(config.dtype).join()])
+        return KernelWarmUp(early=[compile_kernels(config.dtype).join])
     if config.backend != "triton" or len(scene.train) == 0:
         return KernelWarmUp()
     from normlift_ns.rasterization.triton import kernel_calls  # noqa: PLC0415 (needs triton)
 
     rendering, sums = kernel_calls(gaussians, scene.train.cameras[0], **config.options)
     early, lift = lift_calls(gaussians.means, options)
-    return KernelWarmUp(rendering, [*sums, *early], lift)
+    return KernelWarmUp(rendering, [*sums, *early], lift, load_triton)
 
 
 def lift_calls(
@@ -570,7 +570,7 @@ def lift_calls(
         def lift_sample() -> None:
             lifted = lift(evidence(), features, beta=options.reliability_beta, unlabeled=options.unlabeled)
             lifted.directions()
-            lifted.evidence.rows.matmul(features[:, :1])
+            lifted.evidence.rows.matmul(features[:, :1].double())  # as `basis_of_rank` does
 
         def vote() -> None:
             if votes:

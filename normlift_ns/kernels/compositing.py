@@ -27,6 +27,8 @@ _REACH_MARGIN = tl.constexpr(1e-3)
 _NEEDLE = tl.constexpr(1e-6)
 """Ratio of a determinant to the product of its diagonal below which it is too inaccurate to cull a splat."""
 _FAR = tl.constexpr(1e30)
+_SIZES = ("width", "height", "tiles_across", "tiles_down", "cells_across", "cells_down")
+"""Arguments of kernels that are compiled once for images of all sizes."""
 
 
 class CellGrid(NamedTuple):
@@ -68,7 +70,7 @@ class CellLists(NamedTuple):
     """Rows of the splats in `ProjectedSplats`."""
 
 
-@triton.jit(do_not_specialize=["entries", "views"])
+@triton.jit(do_not_specialize=["entries", "views", *_SIZES])
 def _pairs(
     splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
     tiles_across, tiles_down, cells_across, cells_down,
@@ -495,7 +497,7 @@ _CHANNELS = 8
 """Largest number of channels per program. More channels need more programs, which compute the weights again."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _composite(
     splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,

@@ -21,6 +21,7 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.guard import open_regular
+from normlift_ns.io.memory import free_memory
 
 _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
 """Formats of training images. Pillow passes some other formats to external programs, such as PostScript to
@@ -80,8 +81,11 @@ _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
 _COMPACTNESS = 10.0
 """Weight of spatial distance relative to color distance in superpixels. Larger values produce squarer regions."""
-_WORKERS = min(8, os.cpu_count() or 1)
-"""Number of images to segment concurrently. Superpixels need many times the memory of their image."""
+_IMAGE_BYTES = 2**31
+"""Memory that superpixels of an image of 12 megapixels take."""
+_FREE = min(free_memory().values(), default=8 * _IMAGE_BYTES)
+_WORKERS = max(1, min(16, os.cpu_count() or 1, _FREE // _IMAGE_BYTES))
+"""Number of images to segment concurrently."""
 
 
 class RegionDefaults:
