@@ -148,12 +148,14 @@ class EvidenceCollection:
         """Load what segments images in the background. Errors are suppressed, because the first image raises them."""
         prepare = getattr(getattr(self._cached_source, "regions", None), "prepare", None)
 
+        if prepare is None:
+            return
+
         def work() -> None:
             with suppress(Exception):
                 prepare()
 
-        if prepare is not None:
-            Thread(target=work, name="prepare regions", daemon=True).start()
+        Thread(target=work, name="prepare regions", daemon=True).start()
 
     def collect(self, stages: StageTimer, kernels: Kernels) -> ViewObservations:
         """Collect evidence, features and levels from all views.
